@@ -42,13 +42,13 @@ from tofuse.corrections.multipath import Multipath
 from tofuse.evaluation.surface import Surface, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
-from tofuse.fusion.kept import KeptViews
 from tofuse.fusion.layout import Layout
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
+from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.view_store import StoredViews
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
@@ -215,7 +215,7 @@ def within(path: Path, count: int, memory_mb: int) -> None:
     """Fuse the frames of a file within so much memory, and print what that took."""
     options = Fusion(memory_mb=memory_mb)
     store: Spill[RangeView] = Spill(memory_mb * 500_000)
-    views = KeptViews(store)
+    views = StoredViews(store)
     poses = []
     with threads(1), path.open("rb") as file:
         for _ in range(count):

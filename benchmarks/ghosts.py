@@ -30,16 +30,16 @@ from tofuse.arrays import Bool, Float64
 from tofuse.evaluation.surface import Surface, distances
 from tofuse.evaluation.trajectory import align
 from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.tsdf import fuse_surface
-from tofuse.fusion.views import RangeView
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan, write
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import from_method
-from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.preparation import Preparation
-from tofuse.pipeline.reconstruct import fitted, reconstruct
+from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
@@ -162,7 +162,7 @@ def measured(walk: Walk, recording: Recording) -> Places:
 def at_true_poses(recording: Recording) -> Mesh:
     """What the default method makes of the recording if its poses are known."""
     assert recording.reference is not None
-    config = learnt(fitted(from_method("default"), recording), recording)
+    config = adapted(from_method("default"), recording)
     preparation, views = Preparation(config), []
     for frame, T in zip(recording, recording.reference, strict=True):
         ready = preparation.ready(frame, T, None, None)

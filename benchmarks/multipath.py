@@ -37,9 +37,9 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import record
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.render import render
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config
-from tofuse.pipeline.learn import learnt
-from tofuse.pipeline.reconstruct import fitted, reconstruct
+from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
@@ -225,7 +225,7 @@ def surfaces_of(frame: RangeFrame, trusted: Bool) -> list[Bool]:
 
 def decided(config: Config, recording: Recording) -> Multipath | None:
     """The compensation as it is after its trial; None where the configuration has none."""
-    config = learnt(fitted(config, recording), recording, 1)
+    config = adapted(config, recording, 1)
     return next((item for item in config.corrections if isinstance(item, Multipath)), None)
 
 

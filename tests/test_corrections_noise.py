@@ -11,8 +11,8 @@ import tofuse
 from tofuse.corrections.noise import Noise
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
+from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.config import changed, from_method
-from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.noise import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
@@ -60,7 +60,7 @@ def test_what_a_frame_brings_of_its_own_is_kept():
 
 def test_the_default_method_takes_the_model_beside_the_recording(tmp_path):
     MINE.save(tmp_path / "noise.json")
-    config = fitted(from_method("default"), recording(tmp_path))
+    config = with_recording_defaults(from_method("default"), recording(tmp_path))
     assert model_of(config) == MINE
     # It survives run.json.
     assert model_of(changed(config, {}, where="test")) == MINE
@@ -71,17 +71,17 @@ def test_the_default_method_takes_the_model_beside_the_recording(tmp_path):
 def test_a_family_that_is_known_tells_and_one_that_is_not_does_not(tmp_path):
     lidar = Pinhole(256, 192, 200.0, 200.0, 127.5, 95.5)
     known = recording(tmp_path, lidar, confidence=True)
-    assert model_of(fitted(from_method("default"), known)) == NOISE["iphone"]
+    assert model_of(with_recording_defaults(from_method("default"), known)) == NOISE["iphone"]
     # Of that size, but with light: not an iPhone.
     lit = recording(tmp_path, lidar, confidence=True, amplitude=True)
-    assert model_of(fitted(from_method("default"), lit)) is None
-    assert model_of(fitted(from_method("default"), recording(tmp_path))) is None
+    assert model_of(with_recording_defaults(from_method("default"), lit)) is None
+    assert model_of(with_recording_defaults(from_method("default"), recording(tmp_path))) is None
 
 
 def test_a_model_that_is_configured_wins(tmp_path):
     NOISE["kinect1"].save(tmp_path / "noise.json")
     config = replace(from_method("default"), corrections=(Noise(MINE),))
-    assert model_of(fitted(config, recording(tmp_path))) == MINE
+    assert model_of(with_recording_defaults(config, recording(tmp_path))) == MINE
 
 
 def test_a_broken_model_is_refused_before_work_starts(tmp_path):

@@ -14,9 +14,9 @@ from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.layout import Layout
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
-from tofuse.fusion.stitching import Piece, stitched
-from tofuse.fusion.tsdf import Volume, _backs, fuse_surface
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.range_view import RangeView
+from tofuse.fusion.stitching import Piece, stitch
+from tofuse.fusion.tsdf import Volume, _free_space_limits, fuse_surface
 from tofuse.kernels import tsdf
 from tofuse.kernels.blocks import EDGE, block_key, block_of
 from tofuse.kernels.threads import threads
@@ -124,7 +124,7 @@ def test_views_that_are_passed_over_would_have_told_nothing(room, which) -> None
         near = [np.where(f < 6, f, np.inf) for f in floor]
         views = [RangeView.of(frame_of(f, k, sigma=0.03)) for k, f in enumerate(near)]
     layout = Layout.of(views, poses, 0.01 if which == "ball" else 0.03, Fusion())
-    frusta = Frusta.of(views, poses, _backs(layout.reach_m))
+    frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
     passed = 0
     for region in layout.regions(40):
         edge = EDGE * layout.voxel_m
@@ -143,7 +143,7 @@ def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
     rng = np.random.default_rng(11)
     T = look([0.2, -0.1, 0.3], [0.6, 0.2, 2.3])
     view = RangeView.of(frame_of(rng.uniform(0.8, 2.0, (72, 88)), sigma=0.01))
-    frusta = Frusta.of([view], T[None], _backs(0.05))
+    frusta = Frusta.of([view], T[None], _free_space_limits(0.05))
     told = 0
     for _ in range(200):
         i, j, k = (int(n) for n in rng.integers(-14, 15, 3))
@@ -160,7 +160,7 @@ def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
 
 def test_a_view_that_shows_nothing_touches_nothing() -> None:
     empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
-    frusta = Frusta.of([empty], EYE[None], _backs(0.05))
+    frusta = Frusta.of([empty], EYE[None], _free_space_limits(0.05))
     assert not frusta.touching(np.full(3, -9.0), np.full(3, 9.0)).any()
     assert fuse_surface([empty], EYE[None], Fusion(memory_mb=1)).faces.shape == (0, 3)
 
@@ -181,9 +181,9 @@ def test_an_island_is_told_by_all_its_parts() -> None:
         largest = max(largest, len(piece))
         pieces.put(piece)
     assert len(pieces) > 5
-    mesh = stitched(pieces, len(layout.keys), 2 * largest)
+    mesh = stitch(pieces, len(layout.keys), 2 * largest)
     assert len(mesh) > 3 * largest
-    assert len(stitched(pieces, len(layout.keys), 2 * len(mesh))) == 0
+    assert len(stitch(pieces, len(layout.keys), 2 * len(mesh))) == 0
 
 
 def test_progress_is_told_for_each_view_once(room) -> None:

@@ -18,7 +18,7 @@ from tofuse.fusion import atlas as atlas_module
 from tofuse.fusion.atlas import MARGIN, plain_atlas, unwrap
 from tofuse.fusion.colors import UNSEEN
 from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.texture import LitView, baked, exposures, textured
+from tofuse.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.atlas import UNOWNED, draw_triangles
@@ -151,7 +151,7 @@ def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
 def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
     mesh = sheet(25, 17, 0.05)
     gains = np.array([1.0, 1.3, 0.8])
-    views = [LitView.of(look(T, g)) for T, g in zip(POSES, gains, strict=True)]
+    views = [TextureView.of(look(T, g)) for T, g in zip(POSES, gains, strict=True)]
     found = exposures(mesh, views, POSES)
     expected = np.exp(np.log(gains).mean()) / gains
     np.testing.assert_allclose(found, np.tile(expected[:, None], 3), rtol=0.01)
@@ -175,7 +175,7 @@ def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
 
 def test_amplitude_is_made_albedo_and_then_grey() -> None:
     mesh = sheet(25, 17, 0.05)
-    views = [LitView.of(look(T, g, lamp=True)) for T, g in zip(POSES, (1, 2, 1), strict=True)]
+    views = [TextureView.of(look(T, g, lamp=True)) for T, g in zip(POSES, (1, 2, 1), strict=True)]
     found = exposures(mesh, views, POSES)
     np.testing.assert_allclose(found[:, 0] / found[0, 0], [1, 0.5, 1], rtol=0.02)
     made = textured(mesh, views, POSES, 128)
@@ -185,7 +185,7 @@ def test_amplitude_is_made_albedo_and_then_grey() -> None:
 
 def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
     mesh = sheet(25, 17, 0.05)
-    view = LitView.of(look(np.eye(4), 1.0, hidden=0.2))
+    view = TextureView.of(look(np.eye(4), 1.0, hidden=0.2))
     made = textured(mesh, [view], POSES[:1], 256)
     corners = made.atlas.places[made.atlas.faces].mean(1).round().astype(int)
     x = mesh.vertices[made.atlas.vertices[made.atlas.faces]].mean(1)[:, 0]
@@ -199,7 +199,7 @@ def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
 
 
 def test_frames_without_light_give_no_view() -> None:
-    assert LitView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
+    assert TextureView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
 
 
 def test_what_has_no_colour_darkens_nothing() -> None:
@@ -234,7 +234,7 @@ def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
 def test_textures_come_back_from_files(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     mesh = sheet(5, 4, 0.2)
-    made = textured(mesh, [LitView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
+    made = textured(mesh, [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
     atlas, image = made.atlas, png_bytes(made.image)
     points, normals = mesh.vertices[atlas.vertices], mesh.normals[atlas.vertices]
     for write, name in ((write_glb, "m.glb"), (write_obj, "m.obj")):

@@ -12,9 +12,9 @@ from tofuse.files.spill import Spill
 from tofuse.fusion import layout
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
+from tofuse.fusion.range_view import DECODED, RangeView, with_camera_correction
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.fusion.upright import upright
-from tofuse.fusion.views import DECODED, RangeView, without_camera_errors
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths
 from tofuse.kernels import tsdf
@@ -463,7 +463,7 @@ def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
     frame = frame_of(rng.uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
     view = RangeView.of(frame)
-    found = list(without_camera_errors([view, view], errors))
+    found = list(with_camera_correction([view, view], errors))
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
     assert found[0].projection is found[1].projection

@@ -114,14 +114,14 @@ def test_the_one_that_looks_most_alike_is_found(around) -> None:
     keyframes, poses = around
     for k, T in enumerate(poses):
         near = surface(seen(T @ se3.exp([0.02, 0, 0, 0, 0.05, 0]), 9))
-        assert keyframes.alike(near, 9).view.index == k
+        assert keyframes.most_similar(near, 9).view.index == k
         # Of its own component none is asked for.
-        other = keyframes.alike(near, k // 3)
+        other = keyframes.most_similar(near, k // 3)
         assert other.component != k // 3
     only = KeyframeMap(0.2, 0.1)
-    assert only.alike(VIEW, 0) is None
+    assert only.most_similar(VIEW, 0) is None
     only.add(along(0.0, 0, 2))
-    assert only.alike(VIEW, 2) is None
+    assert only.most_similar(VIEW, 2) is None
 
 
 # The budget of searches

@@ -14,7 +14,7 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.odometry import attempts, keyframe_map
+from tofuse.odometry import hypotheses, keyframe_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
@@ -145,13 +145,13 @@ def test_a_frame_that_fits_nothing_costs_only_so_many_alignments(corner, elsewhe
     for frame in corner.frames:
         tracker.push(frame)
     tried = []
-    align = attempts.align
+    align = hypotheses.align
 
     def counted(view, targets, *rest, **more):
         tried.append(targets[0].view.index)
         return align(view, targets, *rest, **more)
 
-    monkeypatch.setattr(attempts, "align", counted)
+    monkeypatch.setattr(hypotheses, "align", counted)
     assert tracker.push(replace(elsewhere[0], index=8, timestamp=2.0)).component == 1
     # However many keyframes there are.
     assert len(set(tried)) <= 2
@@ -163,7 +163,7 @@ def test_what_is_out_of_the_ordinary_is_reported(room):
     frames[BAD] = scaled(frames[BAD], 0)
     steps = run(frames)
     assert steps[0].reason == ""
-    assert "nothing predicted it" in steps[1].reason
+    assert "no prediction" in steps[1].reason
     assert steps[2].reason == ""
     dark = [replace(f, amplitude_image=np.zeros_like(f.amplitude_image)) for f in room.frames]
     assert all("albedo took no part" in step.reason for step in run(dark)[1:3])
@@ -172,13 +172,13 @@ def test_what_is_out_of_the_ordinary_is_reported(room):
 def test_the_last_motion_goes_on(room, monkeypatch):
     """There an alignment begins; what the data leaves open goes on as it did on the mean."""
     asked = []
-    align = attempts.align
+    align = hypotheses.align
 
     def watched(view, targets, predicted, options, *, start=None, **more):
         asked.append((view.index, start, np.array(predicted)))
         return align(view, targets, predicted, options, start=start, **more)
 
-    monkeypatch.setattr(attempts, "align", watched)
+    monkeypatch.setattr(hypotheses, "align", watched)
     coarse = replace(Keyframes().alignment, levels=Keyframes().alignment.levels[:1])
     frames = in_order(room.frames[:4])
     T = [step.T_component_camera for step in run(frames, Keyframes(alignment=coarse))]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Moment, Motion, is_small, jumps
+from tofuse.odometry.motion import Moment, MotionModel, is_small, jumps
 
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
@@ -28,10 +28,10 @@ def walk(count, start=None, step=STEP):
 
 
 def followed(poses, when=counted):
-    motion = Motion()
+    motion = MotionModel()
     for k, T in enumerate(poses):
-        assert not motion.surprise(T, when(k))
-        motion.follow(T, when(k))
+        assert not motion.gate_violation(T, when(k))
+        motion.update(T, when(k))
     return motion
 
 
@@ -42,59 +42,59 @@ def elsewhere(T, metres=0.3, angle=0.0):
 @pytest.mark.parametrize("when", [counted, timed(15.0)])
 def test_the_last_motion_goes_on_over_frames_without_a_pose(when) -> None:
     poses = walk(9)
-    motion = Motion()
-    assert motion.expected(when(0)) is None
-    motion.follow(poses[0], when(0))
-    assert motion.expected(when(1)) is None
+    motion = MotionModel()
+    assert motion.predicted_pose(when(0)) is None
+    motion.update(poses[0], when(0))
+    assert motion.predicted_pose(when(1)) is None
     for k in range(1, 5):
-        motion.follow(poses[k], when(k))
-    np.testing.assert_allclose(motion.expected(when(5)), poses[5], atol=1e-12)
-    np.testing.assert_allclose(motion.expected(when(7)), poses[7], atol=1e-12)
-    assert not motion.surprise(poses[7], when(7))
-    motion.follow(poses[7], when(7))
-    np.testing.assert_allclose(motion.expected(when(8)), poses[8], atol=1e-12)
+        motion.update(poses[k], when(k))
+    np.testing.assert_allclose(motion.predicted_pose(when(5)), poses[5], atol=1e-12)
+    np.testing.assert_allclose(motion.predicted_pose(when(7)), poses[7], atol=1e-12)
+    assert not motion.gate_violation(poses[7], when(7))
+    motion.update(poses[7], when(7))
+    np.testing.assert_allclose(motion.predicted_pose(when(8)), poses[8], atol=1e-12)
 
 
 def test_uneven_times_are_no_surprise() -> None:
     """A camera moves evenly; frames are missing, and come late."""
     rng = np.random.default_rng(2)
     twist = np.array([0.6, 0, 0.2, 0, 0.9, 0.3])  # per second
-    motion, t = Motion(), 0.0
+    motion, t = MotionModel(), 0.0
     for k in range(30):
         t += rng.uniform(0.03, 0.15)
         T, now = se3.exp(t * twist), Moment(k, t)
-        assert not motion.surprise(T, now)
+        assert not motion.gate_violation(T, now)
         if k > 1:
-            np.testing.assert_allclose(motion.expected(now), T, atol=1e-9)
-        motion.follow(T, now)
+            np.testing.assert_allclose(motion.predicted_pose(now), T, atol=1e-9)
+        motion.update(T, now)
 
 
 def test_the_mean_motion_goes_on_more_steadily() -> None:
     rng = np.random.default_rng(5)
     true = walk(40)
     noise = np.array([0.004] * 3 + [0.005] * 3)
-    motion, last, mean = Motion(), [], []
-    assert motion.steadily(counted(0)) is None
+    motion, last, mean = MotionModel(), [], []
+    assert motion.smoothed_pose(counted(0)) is None
     for k, T in enumerate(true):
-        motion.follow(T @ se3.exp(noise * rng.standard_normal(6)), counted(k))
+        motion.update(T @ se3.exp(noise * rng.standard_normal(6)), counted(k))
         if k >= 8:
             back, then = se3.inverse(true[k] @ STEP), counted(k + 1)
-            last.append(se3.log(back @ motion.expected(then)) / noise)
-            mean.append(se3.log(back @ motion.steadily(then)) / noise)
+            last.append(se3.log(back @ motion.predicted_pose(then)) / noise)
+            mean.append(se3.log(back @ motion.smoothed_pose(then)) / noise)
     last, mean = (np.sqrt(np.mean(np.square(off))) for off in (last, mean))
     # Of both ends of one motion, and of the newest place, beside hardly more than the latter.
     assert 1.9 < last < 2.6
     assert mean < 0.65 * last
     motion.interrupt()
-    assert motion.steadily(counted(40)) is None
+    assert motion.smoothed_pose(counted(40)) is None
 
 
 def test_a_jump_hardly_counts_in_the_mean() -> None:
     poses = walk(9)
     motion = followed(poses[:8])
     there = elsewhere(poses[8], 0.5, 0.6)
-    motion.follow(there, counted(8))
-    off = se3.log(se3.inverse(there @ STEP) @ motion.steadily(counted(9)))
+    motion.update(there, counted(8))
+    off = se3.log(se3.inverse(there @ STEP) @ motion.smoothed_pose(counted(9)))
     assert 0.0 < np.linalg.norm(off[:3]) < 0.02
     assert np.linalg.norm(off[3:]) < np.radians(1.3)
 
@@ -104,48 +104,48 @@ def test_a_jump_hardly_counts_in_the_mean() -> None:
 def test_a_place_out_of_nowhere_is_a_surprise(metres, angle, when) -> None:
     poses = walk(9)
     motion = followed(poses[:7], when)
-    words = motion.surprise(elsewhere(poses[7], metres, angle), when(7))
+    words = motion.gate_violation(elsewhere(poses[7], metres, angle), when(7))
     assert f"{metres:.2f} m and {np.degrees(angle):.0f} degrees" in words
     # What was expected is still expected after it.
-    assert not motion.surprise(elsewhere(poses[8], 0.02), when(8))
+    assert not motion.gate_violation(elsewhere(poses[8], 0.02), when(8))
 
 
 def test_a_surprise_differs_by_more_than_is_allowed() -> None:
     poses = walk(8)
     motion = followed(poses[:7])
-    far, angle = motion.allowed(counted(7))
-    assert not motion.surprise(elsewhere(poses[7], 0.99 * far), counted(7))
-    assert motion.surprise(elsewhere(poses[7], 1.01 * far), counted(7))
-    assert not motion.surprise(elsewhere(poses[7], 0.0, 0.99 * angle), counted(7))
-    assert motion.surprise(elsewhere(poses[7], 0.0, 1.01 * angle), counted(7))
+    far, angle = motion.gate(counted(7))
+    assert not motion.gate_violation(elsewhere(poses[7], 0.99 * far), counted(7))
+    assert motion.gate_violation(elsewhere(poses[7], 1.01 * far), counted(7))
+    assert not motion.gate_violation(elsewhere(poses[7], 0.0, 0.99 * angle), counted(7))
+    assert motion.gate_violation(elsewhere(poses[7], 0.0, 1.01 * angle), counted(7))
 
 
 def test_what_goes_on_from_a_jump_is_expected() -> None:
     poses = walk(12)
     motion = followed(poses[:6])
     jumped = [elsewhere(poses[5], 0.5) @ se3.inverse(poses[5]) @ T for T in poses]
-    assert motion.surprise(jumped[6], counted(6))
+    assert motion.gate_violation(jumped[6], counted(6))
     motion.interrupt()
     for k in (6, 7, 8, 9):
-        assert not motion.surprise(jumped[k], counted(k))
-        motion.follow(jumped[k], counted(k))
-    np.testing.assert_allclose(motion.expected(counted(10)), jumped[10], atol=1e-12)
+        assert not motion.gate_violation(jumped[k], counted(k))
+        motion.update(jumped[k], counted(k))
+    np.testing.assert_allclose(motion.predicted_pose(counted(10)), jumped[10], atol=1e-12)
 
 
 def test_after_a_long_loss_of_unknown_time_the_camera_may_be_anywhere() -> None:
     motion = followed(walk(6))
     far = elsewhere(np.eye(4), 5.0, 2.0)
-    assert motion.surprise(far, counted(6))
-    assert not motion.surprise(far, counted(12))
-    assert np.isinf(motion.allowed(counted(12))).all()
+    assert motion.gate_violation(far, counted(6))
+    assert not motion.gate_violation(far, counted(12))
+    assert np.isinf(motion.gate(counted(12))).all()
 
 
 def test_after_an_interruption_it_may_be_anywhere() -> None:
     motion = followed(walk(6))
     motion.interrupt()
-    assert motion.expected(counted(6)) is None
-    assert np.isinf(motion.allowed(counted(6))).all()
-    assert not motion.surprise(elsewhere(np.eye(4), 5.0, 2.0), counted(6))
+    assert motion.predicted_pose(counted(6)) is None
+    assert np.isinf(motion.gate(counted(6))).all()
+    assert not motion.gate_violation(elsewhere(np.eye(4), 5.0, 2.0), counted(6))
 
 
 def test_a_restless_camera_may_be_restless() -> None:
@@ -178,21 +178,21 @@ def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, usua
     poses = walk(8)
     when = counted if seconds is None else timed(1 / seconds)
     motion = followed(poses[:7], when)
-    words = motion.surprise(elsewhere(poses[7], 0.2), when(7))
+    words = motion.gate_violation(elsewhere(poses[7], 0.2), when(7))
     assert (words == "") == usual
 
 
 def test_after_the_longest_time_not_everything_is_believed() -> None:
     poses, when = walk(8), timed(1 / 60.0)
     motion = followed(poses[:7], when)
-    assert motion.surprise(elsewhere(poses[7], 1.5), when(7))
+    assert motion.gate_violation(elsewhere(poses[7], 1.5), when(7))
 
 
 def test_over_a_lost_frame_the_motion_may_change_more() -> None:
     poses, when = walk(9), timed(1 / 0.25)
     motion = followed(poses[:7], when)
-    assert motion.surprise(elsewhere(poses[7], 0.2), when(7))
-    assert not motion.surprise(elsewhere(poses[8], 0.2), when(8))
+    assert motion.gate_violation(elsewhere(poses[7], 0.2), when(7))
+    assert not motion.gate_violation(elsewhere(poses[8], 0.2), when(8))
 
 
 def test_frames_that_are_only_counted_have_no_time() -> None:
@@ -223,15 +223,15 @@ def test_small_motions() -> None:
 def test_in_another_component_the_velocity_is_a_guess() -> None:
     poses = walk(10)
     motion = followed(poses[:6])
-    motion.restart()
-    motion.follow(np.eye(4), counted(6))
+    motion.change_frame()
+    motion.update(np.eye(4), counted(6))
     step = se3.inverse(poses[5]) @ poses[6]
-    np.testing.assert_allclose(motion.expected(counted(7)), step, atol=1e-12)
-    assert motion.is_guess
-    assert motion.deviation(elsewhere(np.eye(4), 2.0, 1.0), counted(7)) == 0
+    np.testing.assert_allclose(motion.predicted_pose(counted(7)), step, atol=1e-12)
+    assert motion.velocity_is_inherited
+    assert motion.normalised_deviation(elsewhere(np.eye(4), 2.0, 1.0), counted(7)) == 0
     # Once a motion was seen in it, this is what is expected.
-    motion.follow(step, counted(7))
-    assert not motion.is_guess
+    motion.update(step, counted(7))
+    assert not motion.velocity_is_inherited
 
 
 @pytest.mark.parametrize(
@@ -240,18 +240,20 @@ def test_in_another_component_the_velocity_is_a_guess() -> None:
 def test_a_hand_moves_a_camera_only_so_fast(metres, angle, possible) -> None:
     when = timed(10.0)
     motion = followed(walk(3), when)
-    assert motion.is_possible(elsewhere(walk(3)[2], metres, angle), when(3)) is possible
+    assert motion.is_feasible(elsewhere(walk(3)[2], metres, angle), when(3)) is possible
 
 
 def test_deviations_are_multiples_of_what_is_usual() -> None:
     rng = np.random.default_rng(2)
     poses = [T @ se3.exp(np.array([*rng.normal(0, 0.01, 3), 0, 0, 0])) for T in walk(12)]
     motion = followed(poses[:11])
-    expected = motion.expected(counted(11))
-    usual = motion.deviation(elsewhere(expected, 0.02), counted(11))
+    expected = motion.predicted_pose(counted(11))
+    usual = motion.normalised_deviation(elsewhere(expected, 0.02), counted(11))
     assert 0 < usual < 2
-    assert motion.deviation(elsewhere(expected, 0.2), counted(11)) == pytest.approx(10 * usual)
-    assert Motion().deviation(np.eye(4), counted(0)) == 0
+    assert motion.normalised_deviation(elsewhere(expected, 0.2), counted(11)) == pytest.approx(
+        10 * usual
+    )
+    assert MotionModel().normalised_deviation(np.eye(4), counted(0)) == 0
 
 
 def turning(count):
@@ -268,23 +270,23 @@ def test_odometry_says_how_the_camera_turned_once_it_has_proved_right(drift, pro
     shaken = [T @ se3.exp(np.array([0, 0, 0, *rng.normal(0, 0.01, 3)])) for T in poses]
     world = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
     sensed = [world @ T @ se3.exp([0, 0, 0, 0, drift * k, 0]) for k, T in enumerate(shaken)]
-    motion = Motion()
+    motion = MotionModel()
     for k in range(11):
-        motion.sense(sensed[k])
-        motion.follow(shaken[k], counted(k))
-    assert motion.surprise(shaken[11], counted(11))
-    motion.sense(sensed[11])
-    assert (not motion.surprise(shaken[11], counted(11))) is proven
+        motion.set_odometry(sensed[k])
+        motion.update(shaken[k], counted(k))
+    assert motion.gate_violation(shaken[11], counted(11))
+    motion.set_odometry(sensed[11])
+    assert (not motion.gate_violation(shaken[11], counted(11))) is proven
     if proven:
-        off = se3.inverse(motion.expected(counted(11))) @ shaken[11]
+        off = se3.inverse(motion.predicted_pose(counted(11))) @ shaken[11]
         assert se3.angle(off) < 1e-9
 
 
 def test_odometry_that_is_missing_for_a_frame_says_nothing() -> None:
     poses = walk(13)
-    motion = Motion()
+    motion = MotionModel()
     for k in range(12):
-        motion.sense(None if k == 11 else poses[k])
-        motion.follow(poses[k], counted(k))
-    motion.sense(se3.exp(np.array([0, 0, 0, 0, 1.0, 0])))
-    np.testing.assert_allclose(motion.expected(counted(12)), poses[12], atol=1e-12)
+        motion.set_odometry(None if k == 11 else poses[k])
+        motion.update(poses[k], counted(k))
+    motion.set_odometry(se3.exp(np.array([0, 0, 0, 0, 1.0, 0])))
+    np.testing.assert_allclose(motion.predicted_pose(counted(12)), poses[12], atol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.prediction import Prediction, runs
+from tofuse.odometry.prediction import Prediction, degenerate_runs
 
 NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
 
@@ -30,9 +30,9 @@ def around_a_mean(rng, n):
 
 
 def test_runs_of_degenerate_frames() -> None:
-    assert runs([NONE, SOME, SOME, NONE, SOME]).tolist() == [0, 1, 2, 0, 1]
-    assert runs([SOME, SOME]).tolist() == [1, 2]
-    assert runs([]).tolist() == []
+    assert degenerate_runs([NONE, SOME, SOME, NONE, SOME]).tolist() == [0, 1, 2, 0, 1]
+    assert degenerate_runs([SOME, SOME]).tolist() == [1, 2]
+    assert degenerate_runs([]).tolist() == []
 
 
 @pytest.mark.parametrize("n", [3, 20])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import pytest
 
 from tofuse import parts
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.pipeline.config import Config, changed, from_method, methods
 
@@ -139,3 +141,34 @@ def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> 
             {"filters": [{"part": "median"}, {"part": "neighbour_share", "k": "x"}]},
             where="c.toml",
         )
+
+
+@dataclass(frozen=True)
+class _Limits(Bounded):
+    count: Annotated[int, Bounds(1)] = 1
+    fraction: Annotated[float, Bounds(0, 1)] = 0.5
+    length_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    probability: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"count": 0}, "count is 0, not 1 or more"),
+        ({"fraction": 1.5}, "fraction is 1.5, not 0 to 1"),
+        ({"fraction": math.nan}, "fraction is nan, not 0 to 1"),
+        ({"length_m": 0.0}, "length_m is 0.0, not above 0"),
+        ({"length_m": math.inf}, "length_m is inf, not above 0"),
+        ({"probability": 1.0}, "probability is 1.0, not between 0 and 1"),
+    ],
+)
+def test_numbers_outside_of_declared_bounds_are_refused(wrong, message) -> None:
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        _Limits(**wrong)
+    with pytest.raises(InputError, match=message):
+        parts.from_dict(_Limits, wrong, where="test.toml")
+
+
+def test_numbers_within_declared_bounds_are_accepted() -> None:
+    assert _Limits(fraction=1.0, length_m=2.0).length_m == 2.0
+    assert parts.from_dict(_Limits, {"length_m": 3}, where="test.toml") == _Limits(length_m=3.0)

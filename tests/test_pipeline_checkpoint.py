@@ -354,7 +354,7 @@ def test_a_state_that_was_changed_ends_in_one_line(turned_box: Path, tmp_path, c
         capfd.readouterr()
         assert main(words) == 2
         said = capfd.readouterr().err
-        assert said.startswith(f"tofuse: {folder}: what a stopped run left can't be gone on from")
+        assert said.startswith(f"tofuse: {folder}: can't resume from the checkpoint")
         assert said.count("\n") == 1
         assert not folder.exists()
         assert not (out / "run.json").exists()
@@ -365,7 +365,7 @@ def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:
     kept = Checkpoints(tmp_path, "a", notes.append)
     kept.save("tracking", [1])
     kept.save("loops", [lambda: 1])
-    assert "can't keep" in notes[0]
+    assert "can't save" in notes[0]
     assert os.listdir(tmp_path) == []
     kept.save("fusion", [1])
     assert os.listdir(tmp_path) == []
@@ -470,7 +470,7 @@ def test_killed_again_and_again_gives_the_same_bytes(
     assert (out / STAGING).is_dir()
     status, said = killed(out, *words)
     assert status == 0
-    assert "goes on after frame 4" in said
+    assert "resumes after frame 4" in said
     assert {p.name for p in out.iterdir()} == {p.name for p in whole.iterdir()}
     for name in SAME:
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name

@@ -136,7 +136,7 @@ def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after)
         mapper.push(frame)
     # As checkpoints do, which load types of the package only.
     copy = decode(*encode(mapper))
-    copy.go_on(1, Silent())
+    copy.resume(1, Silent())
     for frame in frames[after:]:
         copy.push(frame)
     again = copy.finish()

@@ -11,9 +11,9 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.falloff import estimate_falloff
-from tofuse.pipeline.learn import learnt
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
@@ -59,12 +59,12 @@ def test_it_is_found_whatever_it_is(frames, exponent):
 
 
 def test_it_becomes_part_of_the_configuration_once(frames):
-    config = learnt(from_method("default"), recording(frames, 5.0), threads=1)
+    config = adapted(from_method("default"), recording(frames, 5.0), threads=1)
     assert config.odometry.surface.falloff == pytest.approx(5.0, abs=0.6)
     # What is given is taken.
     surface = replace(config.odometry.surface, falloff=1.0)
     given = replace(config, odometry=replace(config.odometry, surface=surface))
-    assert learnt(given, recording(frames, 5.0), threads=1).odometry.surface.falloff == 1.0
+    assert adapted(given, recording(frames, 5.0), threads=1).odometry.surface.falloff == 1.0
 
 
 def test_a_recording_without_amplitude_or_motion_shows_none(frames):
@@ -72,7 +72,7 @@ def test_a_recording_without_amplitude_or_motion_shows_none(frames):
     assert estimate_falloff(recording(still, 4.0), lambda f: f, SurfaceOptions()) == 0.0
     dark = [replace(frame, amplitude_image=None) for frame in frames]
     source = ArraySource(tuple(dark))
-    config = learnt(from_method("default"), Recording.of(source, "made", "arrays"), threads=1)
+    config = adapted(from_method("default"), Recording.of(source, "made", "arrays"), threads=1)
     assert config.odometry.surface.falloff == 0.0
 
 

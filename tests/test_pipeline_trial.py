@@ -12,8 +12,8 @@ import tofuse
 from tofuse.corrections.multipath import Multipath
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config, from_method
-from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.trial import Trial, trial
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -42,7 +42,7 @@ def multipath_of(config: Config) -> Multipath:
 
 def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Recording) -> None:
     listener = Listener()
-    config = learnt(from_method("default"), straight, 1, listener)
+    config = adapted(from_method("default"), straight, 1, listener)
     part = multipath_of(config)
     assert part.disabled
     assert not part.trial
@@ -54,14 +54,14 @@ def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Record
     assert corrector.apply(frame) is frame
     assert corrector.is_independent(frame)
     # What has been decided is not tried again.
-    assert learnt(config, straight, 1) == config
+    assert adapted(config, straight, 1) == config
 
 
 def test_compensation_stays_where_there_is_indirect_light() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
     recording = simulate_recording("empty-room", every=6, frames=40, effects=effects)
     listener = Listener()
-    config = learnt(from_method("default"), recording, 1, listener)
+    config = adapted(from_method("default"), recording, 1, listener)
     part = multipath_of(config)
     assert part.applied
     assert part.seen is not None
@@ -72,13 +72,13 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
         math.hypot(Multipath().relative_sigma, error / strength)
     )
     assert not listener.notes
-    assert learnt(config, recording, 1) == config
+    assert adapted(config, recording, 1) == config
 
 
 def test_too_little_to_tell_leaves_the_data_as_they_are(straight: Recording) -> None:
     listener = Listener()
     few = straight.select(end=5)
-    config = learnt(from_method("default"), few, 1, listener)
+    config = adapted(from_method("default"), few, 1, listener)
     assert multipath_of(config) == Multipath(trial=False, applied=False)
     assert [n for n in listener.notes if "too few views" in n]
     result = tofuse.reconstruct(few, config)
@@ -90,7 +90,7 @@ def test_too_little_to_tell_leaves_the_data_as_they_are(straight: Recording) -> 
 def test_what_is_given_or_asked_for_is_not_tried(straight: Recording) -> None:
     for part in (Multipath(gain=3000.0), Multipath(trial=False), Multipath(applied=False)):
         config = replace(from_method("default"), corrections=(part,))
-        assert learnt(config, straight, 1).corrections == config.corrections
+        assert adapted(config, straight, 1).corrections == config.corrections
 
 
 def bent(by: float, at: float = 8.0) -> object:
@@ -167,5 +167,5 @@ def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
             assert isinstance(frame, RangeFrame)
             return replace(frame, amplitude_image=None)
 
-    config = learnt(from_method("default"), replace(straight, source=Dark()), 1)
+    config = adapted(from_method("default"), replace(straight, source=Dark()), 1)
     assert multipath_of(config) == Multipath(trial=False)

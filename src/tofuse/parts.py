@@ -10,8 +10,7 @@ A part is registered by the decorator::
     @dataclass(frozen=True)
     class Median: ...
 
-`discover` imports every module of a package, so adding a method touches one file.
-"""
+`discover` imports every module of a package, so adding a method touches one file."""
 
 from __future__ import annotations
 

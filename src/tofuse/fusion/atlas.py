@@ -1,4 +1,4 @@
-"""Where each triangle of a surface lies in its texture."""
+"""The texture atlas of a surface: where each triangle is in the texture."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tofuse.arrays import Float32, Int32, Intp
 from tofuse.fusion.mesh import Mesh
 
 MARGIN = 1.4  # texels around each triangle that are painted too
-_PADDING = 3  # texels between pieces
-_LEAST_CELL = 6
-_AT_ONCE = 1000  # triangles that the library divides into pieces together
+_PADDING = 3  # texels between charts
+_MIN_CELL, _MAX_CELL = 6, 16  # texels per cell of the plain atlas
+_BATCH = 1000  # triangles that the library divides into charts together
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Atlas:
     Attributes
     ----------
     vertices
-        (N,) rows of the mesh's vertices; one that lies in several pieces is there more than once.
+        (N,) rows of the mesh's vertices; one in several charts occurs more than once.
     faces
         (M, 3) rows of `vertices`.
     places
@@ -44,7 +44,7 @@ class Atlas:
 
 
 def unwrap(mesh: Mesh, size: int) -> Atlas:
-    """Lay a mesh out flat: in large pieces by the library of the extra `texture`, else plainly."""
+    """Parametrise a mesh: in large charts by the library of the extra `texture`, else plainly."""
     try:
         import xatlas
     except ImportError:
@@ -55,12 +55,12 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
 def plain_atlas(mesh: Mesh, size: int) -> Atlas:
     """Give each triangle half of a square cell, its longest edge along the diagonal.
 
-    The texture is no larger than gives every cell 16 texels, and cells are never smaller than 6:
-    a mesh of very many triangles gets a larger one than asked for.
+    Cells have 6 to 16 texels: a mesh of few triangles gets a smaller texture than `size`, one of
+    very many a larger one.
     """
     count = len(mesh.faces)
     columns = max(1, int(np.ceil(np.sqrt((count + 1) // 2))))
-    cell = int(np.clip(size // columns, _LEAST_CELL, 16))
+    cell = int(np.clip(size // columns, _MIN_CELL, _MAX_CELL))
     size = columns * cell
     p = mesh.vertices[mesh.faces].astype(float)
     edges = np.linalg.norm(p[:, [2, 0, 1]] - p[:, [1, 2, 0]], axis=2)  # opposite each corner
@@ -74,7 +74,7 @@ def plain_atlas(mesh: Mesh, size: int) -> Atlas:
     corners = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower)
     places = (at[:, None] + corners).reshape(-1, 2).astype(np.float32)
     rows = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    back = np.argsort(order, axis=1)  # the corners as the mesh has them
+    back = np.argsort(order, axis=1)  # the corners in the order of the mesh
     rows = np.take_along_axis(rows, back, 1)
     return Atlas(faces.reshape(-1).astype(np.int32), rows, places, size)
 
@@ -111,16 +111,16 @@ def _by_xatlas(xatlas: Any, mesh: Mesh, size: int) -> Atlas:
 
 
 def _parts(mesh: Mesh) -> list[Intp]:
-    """Faces (K,) of each part of the mesh: halved across its longest side until it is small.
+    """Return the faces (K,) of each part of the mesh, halved across its longest side until small.
 
-    The library tries every two neighbouring pieces of what it gets at once, which for 60,000
-    triangles takes ten times as long as for as many in parts. The cuts add 6 % more pieces.
+    The library compares all pairs of neighbouring charts, which for 60,000 triangles takes ten
+    times as long as in parts. The cuts add 6 % more charts.
     """
     middles = mesh.vertices[mesh.faces].mean(1)
     small, large = [], [np.arange(len(mesh.faces))]
     while large:
         faces = large.pop()
-        if len(faces) <= _AT_ONCE:
+        if len(faces) <= _BATCH:
             small.append(faces)
             continue
         axis = int(np.ptp(middles[faces], axis=0).argmax())

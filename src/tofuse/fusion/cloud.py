@@ -34,11 +34,11 @@ class Cloud:
     color
         (N, 3) uint8 RGB (amplitude as grey where there is no colour), or None.
     views
-        (N,) int32, how many frames saw each point.
+        (N,) int32, number of frames that saw each point.
     offset
         (3,) float64.
     sigma
-        (N,) float32, how well each point is known along its normal, m; or None.
+        (N,) float32 standard deviation of each point along its normal, m; or None.
     """
 
     points: Float32
@@ -79,11 +79,11 @@ class Cloud:
 
 
 def choose_voxel(frame: CloudFrame) -> float:
-    """Return a voxel edge in m that fits a cloud: 2 mm to 10 cm."""
+    """Return a voxel edge in m for the point spacing of a cloud: 2 mm to 10 cm."""
     points = frame.points
     if len(points) == 0:
         return 0.01
-    # A surface of N points: the spacing is about the root of the area over N.
+    # The spacing of N points on a surface is about the root of the area over N.
     extent = np.sort(np.ptp(points.astype(float), axis=0))
     size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
@@ -91,7 +91,7 @@ def choose_voxel(frame: CloudFrame) -> float:
 
 @dataclass
 class CloudBuilder:
-    """Adds views one after another; memory grows with the surface, not with the frames."""
+    """Averages views in voxels; memory grows with the surface, not with the number of frames."""
 
     config: Fusion
     voxel_m: float
@@ -112,16 +112,16 @@ class CloudBuilder:
         rows[:, 3:6] = towards / distance
         rows[:, 6] = 1
         if frame.color is not None:
-            # Black means that the colour camera didn't see the point.
+            # Black: the colour camera didn't see the point.
             rows[:, 7:10] = frame.color
             rows[:, 10] = frame.color.any(1)
         elif frame.amplitude is not None:
-            # Light falls off with the square of the range: this is nearly the surface's albedo.
+            # Compensated for the falloff with the squared range: proportional to the albedo.
             rows[:, 11] = _raw_amplitude(frame) * distance[:, 0] ** 2
             rows[:, 12] = 1
         keys = _voxel_keys(world, self.voxel_m)
         keys, sums = _sum_by_key(keys, rows)
-        sums[:, :] /= sums[:, 6:7]  # one vote a frame, however many pixels fell into the voxel
+        sums[:, :] /= sums[:, 6:7]  # equal weight for each frame, whatever its pixels in the voxel
         self._keys.append(keys)
         self._sums.append(sums)
         self._rows += len(keys)
@@ -131,7 +131,7 @@ class CloudBuilder:
     def _merge(self) -> None:
         keys, sums = _sum_by_key(np.concatenate(self._keys), np.concatenate(self._sums))
         self._keys, self._sums = [keys], [sums]
-        # Grow the buffer with the model, or a large model would be merged at every frame.
+        # The buffer grows with the model, or a large model would be merged at every frame.
         self._rows = 0 if len(keys) > _BUFFER_ROWS // 2 else len(keys)
 
     def finish(self, *, normals: bool = True) -> Cloud:
@@ -159,12 +159,12 @@ def empty_cloud() -> Cloud:
     return Cloud(np.zeros((0, 3), np.float32), None, None, np.zeros(0, np.int32), np.zeros(3))
 
 
-def as_cloud(frame: Frame, most: int) -> CloudFrame:
-    """Return the view as a cloud of at most `most` points, taken at an even stride.
+def as_cloud(frame: Frame, max_points: int) -> CloudFrame:
+    """Return the view as a cloud of at most `max_points` points, taken at an even stride.
 
-    Its amplitude falls with the square of the range, whatever the view's own counts.
+    Its amplitude is not range-compensated, whatever that of the view is.
     """
-    part = slice(None, None, max(1, -(-len(frame) // most)))
+    part = slice(None, None, max(1, -(-len(frame) // max_points)))
     amplitude = None if frame.amplitude is None else _raw_amplitude(frame)
 
     def cut(values: NDArray[Any] | None) -> Any:
@@ -183,7 +183,7 @@ def as_cloud(frame: Frame, most: int) -> CloudFrame:
 
 
 def _raw_amplitude(frame: Frame) -> Float32:
-    """Return the amplitude (N,) as the light that arrived, which falls with the range squared."""
+    """Return the amplitude (N,) without range compensation."""
     amplitude = frame.amplitude
     assert amplitude is not None
     if isinstance(frame, RangeFrame) and frame.amplitude_kind == "range_compensated":
@@ -218,13 +218,13 @@ def _colors(sums: Float64) -> UInt8 | None:
 
 
 def grey_of(albedo: Float64) -> UInt8:
-    """Colours (N, 3) as grey, of albedos (N,) in any unit."""
+    """Return grey colours (N, 3) of albedos (N,) in any unit."""
     if len(albedo) == 0:
         return np.zeros((0, 3), np.uint8)
     low, high = np.percentile(albedo, [1, 99])
     # Gamma 1/2.2: albedo is linear, screens are not.
-    share = ((albedo - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
-    return np.repeat(np.round(255 * share).astype(np.uint8)[:, None], 3, axis=1)
+    grey = ((albedo - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
+    return np.repeat(np.round(255 * grey).astype(np.uint8)[:, None], 3, axis=1)
 
 
 def _normals(points: Float64, towards: Float64, neighbours: int) -> Float32 | None:

@@ -1,4 +1,4 @@
-"""Colours of a model for who looks at it: where no image showed one, they are black."""
+"""Colours of a model for display; black marks points without a colour in any image."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from tofuse.arrays import Bool, UInt8
 
-# Where no image showed a colour.
+# Displayed colour of points without one.
 UNSEEN = (142, 142, 142)
 
 
 def has_color(colors: UInt8) -> Bool:
-    """Say which colours (N, 3) an image showed."""
+    """Return which of the colours (N, 3) are known, (N,)."""
     return np.asarray(colors.any(1), np.bool_)
 
 
 def seen_colors(colors: UInt8) -> UInt8:
-    """Return colours (N, 3) with a neutral grey where no image showed one."""
+    """Return colours (N, 3) with a neutral grey for unknown ones."""
     out = colors.copy()
     out[~has_color(colors)] = UNSEEN
     return out

@@ -1,9 +1,9 @@
-"""A surface in levels of detail, cut into tiles: what is far away needs few triangles.
+"""Levels of detail of a surface, cut into tiles, for display at any distance.
 
-Level 0 is the surface. Each further one puts the vertices in cubes twice as large together (see
-`Mesh.simplified`), all over the surface at once, and only then is it cut. So tiles of one level
-share the vertices at their borders, and there are no cracks between them. Tiles grow with the
-cubes: eight of a level lie in one of the next.
+Level 0 is the surface. Each further one merges the vertices in cubes twice as large (see
+`Mesh.simplified`), of the whole surface, and only then is it cut. So tiles of one level share the
+vertices at their borders, without cracks between them. Tiles grow with the cubes: eight of a level
+are in one of the next.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from tofuse.fusion.mesh import Mesh
 
 Place = tuple[int, int, int]
 
-# Edge of a tile in edges of its triangles: some 128^2 cells, of two triangles, for each surface
-# that passes it; 1 to 2 MB.
-_ACROSS = 128
+# Edge of a tile in edges of its triangles: some 128^2 cells of two triangles for each surface
+# through it; 1 to 2 MB.
+_TRIANGLES_PER_EDGE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,11 @@ class Level:
     number
         0 is the surface itself.
     error_m
-        Edge of the cubes whose vertices are put together, m: how far off the level may be. 0 for
-        the surface itself.
+        Edge of the cubes whose vertices are merged, m, which bounds the error; 0 for level 0.
     mesh
-        All of it.
+        The whole level.
     order, places, ends
-        Faces (M,) by their tiles, of each tile where it is, in tiles, and where its faces end.
+        (M,) faces sorted by tile; place of each tile, in tiles; (T,) end of its faces.
     """
 
     number: int
@@ -48,21 +47,21 @@ class Level:
     ends: Int64
 
     def tiles(self) -> Iterator[tuple[Place, Mesh]]:
-        """Each tile, with vertices of its own."""
+        """Yield each tile, with vertices of its own."""
         starts = np.concatenate([[0], self.ends])[:-1]
         for place, start, end in zip(self.places, starts, self.ends, strict=True):
             yield place, _part(self.mesh, self.order[start:end])
 
 
 def levels(mesh: Mesh) -> Iterator[Level]:
-    """Give the levels of a surface with faces, the finest first; the last one is a single tile."""
+    """Yield the levels of a surface with faces, the finest first; the last is a single tile."""
     origin = mesh.vertices.min(0).astype(float)
     size = float(np.ptp(mesh.vertices, axis=0).max())
-    # No finer than single precision holds, should all triangles be slivers.
+    # No finer than single precision, even if all triangles are slivers.
     edge = max(mesh.spacing, 1e-6 * size, 1e-9)
     number, error = 0, 0.0
     while True:
-        level = _cut(number, error, mesh, origin, _ACROSS * edge * 2**number)
+        level = _cut(number, error, mesh, origin, _TRIANGLES_PER_EDGE * edge * 2**number)
         yield level
         if len(level.places) <= 1:
             return
@@ -72,13 +71,13 @@ def levels(mesh: Mesh) -> Iterator[Level]:
 
 
 def _cut(number: int, error_m: float, mesh: Mesh, origin: Float64, size: float) -> Level:
-    """Put each face into the tile of its middle."""
+    """Assign each face to the tile of its centroid."""
     key, extents = np.zeros(len(mesh.faces), np.int64), []
     for axis in range(3):
         along = mesh.vertices[:, axis].astype(float)
         a, b, c = mesh.faces.T
         middle = (along[a] + along[b] + along[c]) / 3
-        # What moved out by being put together stays with its neighbours.
+        # Faces that merging moved outside stay with their neighbours.
         place = np.maximum(np.floor((middle - origin[axis]) / size), 0).astype(np.int64)
         extents.append(int(place.max(initial=0)) + 1)
         key = key * extents[-1] + place
@@ -95,7 +94,7 @@ def _cut(number: int, error_m: float, mesh: Mesh, origin: Float64, size: float) 
 
 
 def _part(mesh: Mesh, faces: Int64) -> Mesh:
-    """Some faces, with the vertices that they have."""
+    """Return some faces with their vertices."""
     used, place = np.unique(mesh.faces[faces], return_inverse=True)
     return replace(
         mesh,

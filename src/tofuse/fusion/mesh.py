@@ -1,4 +1,4 @@
-"""A surface of triangles, and what is done with one."""
+"""A surface of triangles: islands, holes, decimation."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
 from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
 
-# A place is held at its middle by so much of what the planes around it hold.
-_HELD = 0.02
-# So many triangles tell how large all are.
-_MEASURED = 100_000
-# Two vertices of which one faces away from the other are on different sides of something.
+# Damping of a merged vertex towards the centroid, relative to the planes around it.
+_DAMPING = 0.02
+# Triangles from which the mean size is estimated.
+_MAX_SAMPLED = 100_000
+# Vertices with a smaller cosine between their normals are on different sides of a thin sheet.
 _BEHIND = -0.3
 
 
@@ -39,10 +39,10 @@ class Mesh:
     color
         (N, 3) uint8 RGB (albedo as grey where there is no colour), or None.
     sigma
-        (N,) float32, how well the vertex is known along its normal as the views' noise tells, m;
-        with the errors of their poses once these are known (`pose_errors`).
+        (N,) float32 standard deviation of each vertex along its normal, m, from the noise of the
+        views; and from the errors of their poses once these are estimated (`pose_errors`).
     views
-        (N,) int32, how many views saw it.
+        (N,) int32, number of views that saw it.
     offset
         (3,) float64.
     """
@@ -84,7 +84,7 @@ class Mesh:
         return Cloud(self.vertices, self.normals, self.color, self.views, self.offset, self.sigma)
 
     def rows(self, faces: Bool) -> Mesh:
-        """Return the mesh of the faces (M,) that are True, without vertices that no face has."""
+        """Return the mesh of the faces (M,) that are True, without unused vertices."""
         kept = self.faces[faces]
         used = np.zeros(len(self), bool)
         used[kept.ravel()] = True
@@ -101,26 +101,26 @@ class Mesh:
 
     @property
     def spacing(self) -> float:
-        """Edge of the squares that two triangles of the mean area make, m."""
-        some = self.faces[:: max(1, -(-len(self.faces) // _MEASURED))]
+        """Edge of a square of two triangles of the mean area, m."""
+        some = self.faces[:: max(1, -(-len(self.faces) // _MAX_SAMPLED))]
         a, b, c = (self.vertices[some[:, k]] for k in range(3))
         across = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return float(np.sqrt(across.mean(dtype=float))) if len(some) else 0.0
 
-    def without_islands(self, least: int) -> Mesh:
-        """Return the mesh without its connected pieces of fewer than `least` vertices."""
+    def without_islands(self, min_vertices: int) -> Mesh:
+        """Return the mesh without connected pieces of fewer than `min_vertices` vertices."""
         if len(self.faces) == 0:
             return self.rows(np.zeros(0, bool))
         piece = np.arange(len(self), dtype=np.int32)
         union_faces(self.faces, piece)
         flatten_groups(piece)
-        return self.rows((np.bincount(piece)[piece] >= least)[self.faces[:, 0]])
+        return self.rows((np.bincount(piece)[piece] >= min_vertices)[self.faces[:, 0]])
 
-    def without_holes(self, longest_m: float) -> Mesh:
-        """Return the mesh with the holes closed whose border is no longer than `longest_m`.
+    def without_holes(self, max_border_m: float) -> Mesh:
+        """Return the mesh with the holes closed whose border is no longer than `max_border_m`.
 
-        Each gets a new vertex in its middle, which no view saw, and whose `sigma` is the hole's
-        radius. Borders around a piece of surface are no holes.
+        Each gets a new vertex at its centroid, with 0 views, and a `sigma` of the hole's radius.
+        Outer borders are no holes.
         """
         ends = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
         border = ends[~np.isin(ends @ [len(self), 1], ends @ [1, len(self)])]
@@ -131,7 +131,7 @@ class Mesh:
             length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
             middle = p.mean(0)
             fan = np.cross(np.roll(p, -1, 0) - middle, p - middle).sum(0)
-            if length > longest_m or fan @ self.normals[rim].sum(0) <= 0:
+            if length > max_border_m or fan @ self.normals[rim].sum(0) <= 0:
                 continue
             new = np.full(len(rim), len(self) + len(vertices))
             faces.append(np.stack([np.roll(rim, -1), rim, new], -1))
@@ -158,10 +158,10 @@ class Mesh:
         )
 
     def decimated(self, faces: int) -> Mesh:
-        """Return the mesh simplified to about `faces` triangles at most."""
+        """Return the mesh simplified to at most `faces` triangles, or nearly as many."""
         if len(self.faces) <= faces:
             return self
-        some = self.faces[:: -(-len(self.faces) // _MEASURED)]
+        some = self.faces[:: -(-len(self.faces) // _MAX_SAMPLED)]
         a, b, c = (self.vertices[some[:, k]] for k in range(3))
         across = np.cross(b - a, c - a)
         area = 0.5 * float(np.linalg.norm(across, axis=1).mean(dtype=float)) * len(self.faces)
@@ -171,20 +171,14 @@ class Mesh:
             left = self._regrouped(group)
             if len(left) <= faces:
                 return self._merged(group, count, left, cell)
-            # Somewhat more than a flat surface would ask for, as it is not.
+            # A larger step than for a flat surface.
             cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
 
     def simplified(self, cell_m: float) -> Mesh:
-        """Return the mesh simplified by clustering vertices in the cells of a grid.
+        """Return the mesh with the vertices in each cube of a grid merged, per side of a sheet.
 
-        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
-        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
-        that edges and corners stay sharp.
-
-        Parameters
-        ----------
-        cell_m
-            Edge of a cell, m.
+        Vertex clustering (Rossignac and Borrel 1993), placed by least squares on the planes of the
+        triangles around (Lindstrom 2000): edges and corners stay sharp.
         """
         if len(self) == 0:
             return self
@@ -192,7 +186,7 @@ class Mesh:
         return self._merged(group, count, self._regrouped(group), cell_m)
 
     def _groups(self, cell_m: float) -> tuple[Intp, Intp]:
-        """Which vertices (N,) are put together, and how many are in each group (G,)."""
+        """Return the group of each vertex (N,), and the size of each group (G,)."""
         key = np.zeros(len(self), np.int64)
         for along in self.vertices.T:  # one axis at a time takes a third of the memory
             cell = np.floor(along.astype(float) / cell_m).astype(np.int64)
@@ -203,14 +197,14 @@ class Mesh:
         order = np.argsort(key[first])
         place = np.empty(len(order), np.intp)
         place[order] = np.arange(len(order))
-        # The two sides of a thin sheet stay two.
+        # The sides of a thin sheet stay separate.
         behind = np.einsum("ni,ni->n", self.normals, self.normals[first[number]]) < _BEHIND
         side = 2 * place[number] + behind
         count = np.bincount(side, minlength=2 * len(order))
         return (np.cumsum(count > 0) - 1)[side], count[count > 0]
 
     def _regrouped(self, group: Intp) -> Int32:
-        """The faces between groups that are left of those between vertices."""
+        """Return the faces between groups, without degenerate ones."""
         a, b, c = (group[self.faces[:, k]] for k in range(3))
         left = (a != b) & (b != c) & (c != a)
         return np.stack([a[left], b[left], c[left]], -1).astype(np.int32)
@@ -240,7 +234,7 @@ class Mesh:
         return merged.rows(np.ones(len(faces), bool))
 
     def _mean_color(self, group: Intp, groups: int) -> UInt8 | None:
-        """Mean (G, 3) of the colours that images showed; black where none of a group has one."""
+        """Return the mean (G, 3) of the known colours of each group; black without any."""
         if self.color is None:
             return None
         known = has_color(self.color)
@@ -249,21 +243,23 @@ class Mesh:
         return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
 
     def _near_planes(self, group: Intp, middles: Float64, cell_m: float) -> Float64:
-        """Where each group's place (G, 3) is nearest to the planes of its triangles.
+        """Return the place (G, 3) of each group by least squares on the planes of its triangles.
 
-        Directions that these don't hold stay at the middle, and no place is beyond half a cell.
+        Unconstrained directions stay at the centroid (G, 3); the step is at most half a cell.
         """
         A = np.zeros((len(middles), 3, 3))
         b = np.zeros((len(middles), 3))
         plane_sums(self.vertices, self.faces, group, middles, A, b)
         A += np.triu(A, 1).transpose(0, 2, 1)
         trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
-        step = np.linalg.solve(A + _HELD * trace[:, None, None] * np.eye(3), b[..., None])[..., 0]
+        step = np.linalg.solve(A + _DAMPING * trace[:, None, None] * np.eye(3), b[..., None])[
+            ..., 0
+        ]
         return middles + step.clip(-0.5 * cell_m, 0.5 * cell_m)
 
 
 def _loops(edges: Int64) -> list[Int64]:
-    """Loops of directed edges (K, 2); where several pass one vertex, they are told apart there."""
+    """Return the loops of directed edges (K, 2); several through one vertex are separated."""
     follow: dict[int, list[int]] = {}
     for a, b in edges.tolist():
         follow.setdefault(a, []).append(b)

@@ -1,4 +1,4 @@
-"""The model: what is kept of each view until poses are final, and what is made of it then."""
+"""The model: stored views, fused once poses are final."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
-from tofuse.fusion.kept import KeptClouds, KeptViews
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
+from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.view_store import StoredClouds, StoredViews
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView
 
-_SKETCHED, _SKETCHED_PIXELS = 60, 6000  # views in a sketch, and about so many pixels of each
+_SKETCH_VIEWS, _SKETCH_PIXELS = 60, 6000  # views in a sketch, and approximate pixels of each
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a run makes of its views.
+    """The model of a run.
 
     Attributes
     ----------
     cloud
-        Of range images the vertices of the surface, or if there is none, the means of voxels;
-        of clouds the means of voxels.
+        For range images the vertices of the surface, or without a surface the means of voxels; for
+        clouds the means of voxels.
     mesh
-        None for clouds: without a camera nothing is known of the space in front of a point.
+        None for clouds: without a camera free space is unknown.
     """
 
     cloud: Cloud
@@ -42,40 +42,41 @@ class Model:
 
 
 class ModelBuilder:
-    """Keeps views, small, and fuses them at the poses they get in the end.
+    """Stores reduced views, and fuses them at their final poses.
 
     Parameters
     ----------
     options
-        How.
+        How views are fused.
     spill
-        Where views are kept; unless given, half as many bytes of them as there may be of voxels
-        stay in memory.
+        The store of views; by default half of the memory for voxels, the rest on disk.
     """
 
     def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
         self._options = options
         if spill is None:
             spill = Spill(options.memory_mb * 500_000)
-        self._ranges = KeptViews(spill)
-        self._clouds = KeptClouds(spill)
+        self._ranges = StoredViews(spill)
+        self._clouds = StoredClouds(spill)
         self._bytes = 0
         self._voxel_m = 0.01  # of clouds
 
-    def add(self, frame: Frame, surface: PreparedView | None, most_points: int) -> None:
-        """Keep a (filtered) view.
+    def add(self, frame: Frame, surface: PreparedView | None, max_points: int) -> None:
+        """Store a (filtered) view.
 
         Parameters
         ----------
+        frame
+            The filtered view.
         surface
-            The same image made ready for tracking, where that has been done.
-        most_points
-            So many points are kept of a cloud.
+            The same image prepared for tracking, if it was.
+        max_points
+            Maximum number of points of a cloud.
         """
         if isinstance(frame, CloudFrame):
             if not len(self._clouds):
                 self._voxel_m = self._options.voxel_m or choose_voxel(frame)
-            self._clouds.add(as_cloud(frame, most_points))
+            self._clouds.add(as_cloud(frame, max_points))
             return
         view = RangeView.of(frame, surface)
         self._ranges.add(view)
@@ -83,12 +84,12 @@ class ModelBuilder:
 
     @property
     def views(self) -> int:
-        """How many views are kept."""
+        """Number of stored views."""
         return len(self._ranges) + len(self._clouds)
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the images of these views take, in memory or on disk."""
+        """Size of the images of these views, in memory or on disk."""
         return self._bytes
 
     def fuse(
@@ -102,11 +103,11 @@ class ModelBuilder:
         Parameters
         ----------
         poses
-            T_world_camera (4, 4) by index of the frame; views of other frames are left out.
+            T_world_camera (4, 4) by frame index; views of other frames are left out.
         advance
             Called after each view.
         errors
-            Of the camera, which are taken out; see `Refinement.errors`.
+            Errors of the camera to correct; see `Refinement.errors`.
         """
         if len(self._clouds) or not len(self._ranges):
             clouds = (
@@ -118,7 +119,7 @@ class ModelBuilder:
         wrong = any(errors.values())
         if wrong:
             views = views.corrected(errors)
-        at = np.array([poses[each.index] for each in views.about], float)
+        at = np.array([poses[each.index] for each in views.summaries], float)
         mesh = fuse_surface(views, at, self._options, advance)
         if len(mesh):
             model = Model(mesh.cloud(), self._finished(mesh))
@@ -126,26 +127,26 @@ class ModelBuilder:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)
         if wrong:
-            views.forget()
+            views.drop()
         return model
 
     def _finished(self, mesh: Mesh) -> Mesh:
-        """The surface without its small holes, and with as many triangles as asked for."""
+        """Return the surface with small holes closed, and decimated."""
         if self._options.holes_m:
             mesh = mesh.without_holes(self._options.holes_m)
         return mesh.decimated(self._options.faces) if self._options.faces else mesh
 
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
-        """Return points of the model at other poses, to be looked at: without normals for images.
+        """Return a cloud at other poses for display, without normals for images.
 
-        Of many images some are taken, evenly, and of each some pixels.
+        It is made of some evenly spaced images, and of some pixels of each.
         """
         if len(self._clouds):
             return self._average(self._clouds.of(poses), poses, self._voxel_m)
         ranges = self._ranges.of(poses)
-        some = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCHED)))
+        some = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCH_VIEWS)))
         voxel = self._range_voxel
-        sketched = (ranges[k].as_cloud(_SKETCHED_PIXELS) for k in some)
+        sketched = (ranges[k].as_cloud(_SKETCH_PIXELS) for k in some)
         return self._average(sketched, poses, voxel, normals=False)
 
     @property

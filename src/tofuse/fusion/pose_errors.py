@@ -1,4 +1,4 @@
-"""What errors of the poses do to the surface: the part of its accuracy that noise does not tell."""
+"""Errors of the surface due to errors of the poses, in addition to the noise of the views."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import RangeFrame
 
-# It varies slowly over the surface: cells of this share of the model's diagonal are asked.
+# It varies slowly over the surface: size of its cells, as a fraction of the model's diagonal.
 _CELL = 0.01
-# A view sees a cell if its depth there differs by less than this share and one cell.
-_SAME = 0.05
+# A view sees a cell if its depth there differs by less than this fraction and one cell.
+_SAME_DEPTH = 0.05
 # Standard deviation in m where a view's pose is not constrained.
 UNKNOWN_M = 10.0
 
@@ -25,15 +25,17 @@ UNKNOWN_M = 10.0
 def with_pose_errors(
     model: Model, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
 ) -> Model:
-    """Return the model, with errors of the poses in the `sigma` of its points.
+    """Return the model with errors of the poses in the `sigma` of its points.
 
     Parameters
     ----------
+    model
+        The model, with the noise of the views in `sigma`.
     frames
         Images that see the model.
     poses, covariances
-        (F, 4, 4) T_world_camera of them and (F, 6, 6) of its right perturbation, NaN where the pose
-        is not constrained.
+        (F, 4, 4) T_world_camera of these and (F, 6, 6) of its right perturbation, NaN if the pose
+        is unconstrained.
     """
     cloud, mesh = model.cloud, model.mesh
     if cloud.sigma is None or not len(cloud) or not len(frames):
@@ -54,7 +56,7 @@ def with_pose_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cubes that hold points: their edge, a point of each (M, 3), and the cell of every point (N,).
+    """Non-empty cubes: their edge, a point of each (M, 3), and the cell of every point (N,).
 
     Points are relative to `offset`.
     """
@@ -77,12 +79,12 @@ class _Cells:
 def _sigma(
     cells: _Cells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
 ) -> Float64 | None:
-    """(M,) of each cell, by the view that knows it best; None if no view sees any."""
+    """Return sigma (M,) of each cell by the view with the smallest; None if no view sees any."""
     world = cells.points + cells.offset
     best = np.full(len(world), np.inf)
     for frame, T, C in zip(frames, poses, covariances, strict=True):
         at = se3.transform(se3.inverse(T), world)
-        seen = _seen(frame, at, cells.size)
+        seen = _visible(frame, at, cells.size)
         if np.isfinite(C).all():
             variance = _variance(at[seen], C)
         else:
@@ -91,34 +93,32 @@ def _sigma(
     known = np.isfinite(best)
     if not known.any():
         return None
-    # What no compared image shows is as good as what is beside it.
+    # Cells that no image shows take the value of the nearest one.
     nearest, _ = KdTree(world[known]).nearest(world[~known])
     best[~known] = best[known][nearest]
     return np.asarray(np.sqrt(best), np.float64)
 
 
-def _seen(frame: RangeFrame, points: Float64, size: float) -> Bool:
-    """(N,) which points (N, 3) of the camera's frame an image measured."""
+def _visible(frame: RangeFrame, points: Float64, size: float) -> Bool:
+    """Return which points (N, 3) in the camera's frame an image measured, (N,)."""
     pixel = np.nan_to_num(np.rint(frame.camera.project(points)), nan=-1.0, posinf=-1, neginf=-1)
     limits = (frame.camera.width, frame.camera.height)
     inside = ((pixel >= 0) & (pixel < limits)).all(1) & (points[:, 2] > 0)
     column, row = np.where(inside[:, None], pixel, 0).astype(np.intp).T
     z = frame.z[row, column].astype(np.float64)
-    near = np.abs(z - points[:, 2]) < _SAME * points[:, 2] + size
+    near = np.abs(z - points[:, 2]) < _SAME_DEPTH * points[:, 2] + size
     return np.asarray(inside & (z > 0) & near)
 
 
 def _variance(points: Float64, C: Float64) -> Float64:
-    """(N,) variance of points (N, 3) of a camera along any axis, by that of its pose (6, 6), m^2.
+    """Return the variance (N,) of points (N, 3) in the camera's frame due to that of its pose, m^2.
 
-    The mean of the three axes: a perturbation moves a point p by t + r x p.
+    The mean of the three axes, as a perturbation moves a point p by t + r x p; C is (6, 6).
     """
-    moved, turned, mixed = C[:3, :3], C[3:, 3:], C[:3, 3:]
+    C_tt, C_rr, C_tr = C[:3, :3], C[3:, 3:], C[:3, 3:]
     squared = (points**2).sum(1)
     # E |r x p|^2, and E t . (r x p) = p . E (t x r).
-    by_turn = squared * np.trace(turned) - np.einsum("ni,ij,nj->n", points, turned, points)
-    skew = np.array(
-        [mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]]
-    )
-    variance = (np.trace(moved) + by_turn + 2 * points @ skew) / 3
+    by_rotation = squared * np.trace(C_rr) - np.einsum("ni,ij,nj->n", points, C_rr, points)
+    skew = np.array([C_tr[1, 2] - C_tr[2, 1], C_tr[2, 0] - C_tr[0, 2], C_tr[0, 1] - C_tr[1, 0]])
+    variance = (np.trace(C_tt) + by_rotation + 2 * points @ skew) / 3
     return np.asarray(np.maximum(variance, 0.0), np.float64)

@@ -1,8 +1,8 @@
-"""Pieces of a surface, made of regions of its blocks, put together.
+"""Stitching of the pieces of a surface that were extracted from regions of its blocks.
 
-A vertex is named by its cell: the number of the block among all, and that of the voxel in it. It is
-made by the region that owns the block; others that have faces to it know it by name. So nothing is
-compared by distance, and nothing is there twice.
+A vertex is identified by its cell: the number of the block among all, and that of the voxel in it.
+The region that owns the block creates it; faces of other regions refer to it by name. So nothing is
+matched by distance, and nothing is duplicated.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class Piece:
     Attributes
     ----------
     names
-        (K,) of vertices: V of its own, ascending, and then others that its faces go to.
+        (K,) of vertices: V of its own, ascending, then others that its faces refer to.
     points, normals, tints, sigma, views
         Of its own vertices, V rows; see `Mesh`, and `colored`.
     faces
         (M, 3) rows of `names`.
     blocks, counts
-        (B,) numbers of its own blocks, ascending, and how many faces each has, in this order.
+        (B,) numbers of its own blocks, ascending, and the number of faces of each, in this order.
     """
 
     names: Int64
@@ -49,18 +49,22 @@ class Piece:
 
     @property
     def own_names(self) -> Int64:
-        """Of its own vertices."""
+        """Names of its own vertices."""
         return self.names[: len(self)]
 
 
-def stitched(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
-    """Put together the pieces of all of so many blocks, without islands.
+def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
+    """Stitch the pieces of all blocks, without islands.
 
-    Vertices come in the order of their names, faces in that of their blocks: as if all blocks had
-    been one region. Pieces are read one at a time, so that little is there beside the result.
+    Vertices are in the order of their names, faces in that of their blocks, as for a single region.
+    Pieces are read one at a time, so that little memory is needed besides the result.
 
     Parameters
     ----------
+    pieces
+        A piece of each region.
+    blocks
+        Number of all blocks.
     island
         Connected surfaces of fewer vertices are left out.
     """
@@ -77,7 +81,7 @@ def stitched(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         used[faces] = True
         union_faces(faces, group)
     flatten_groups(group)
-    color = colored(tints)  # by those of islands as well: they tell how light the scene is
+    color = colored(tints)  # with those of islands, for the range of brightness
     del tints
     used &= np.bincount(group, minlength=len(names))[group] >= island
     del group
@@ -116,12 +120,12 @@ def stitched(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
 
 
 def _places(piece: Piece, names: Int64) -> Int32:
-    """Where the vertices of a piece are among all, by their names."""
+    """Return the rows of the vertices of a piece among all, by their names."""
     return np.searchsorted(names, piece.names).astype(np.int32)
 
 
 def colored(tints: Float32) -> UInt8 | None:
-    """Colours (N, 3) of light (N, C): RGB of three channels, grey of the root of the albedo."""
+    """Return colours (N, 3) of tints (N, C): three channels are RGB, one the root of the albedo."""
     channels = tints.shape[1]
     if channels == 3:
         return np.round(tints).clip(0, 255).astype(np.uint8)

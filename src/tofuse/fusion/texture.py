@@ -1,4 +1,4 @@
-"""The texture of a surface, from the views that see each place best."""
+"""The texture of a surface, blended from the views that see each place best."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.prepared_view import Projection
 
-# How far a surface may be from what a view sees there: m, and as a share of the depth.
-_SLACK, _SLACK_SHARE = 0.02, 0.02
-_BORDER = 0.08  # of the image's height
-# How much more the best view counts: places that two see equally well get the mean of both.
+# Depth tolerance of the visibility test: m, plus a fraction of the depth.
+_TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02
+_BORDER = 0.08  # margin that is blended out, as a fraction of the image's height
+# Exponent of the weights, by which the best view dominates.
 _POWER = 4.0
 _CHUNKS = 16
 _SAMPLED = 20_000  # vertices at which exposures are compared
 _TEXELS_AT_ONCE = 1 << 14
-_ROBUST, _ROUNDS = 0.15, 4  # of the logarithm of light
-_MOST_GAIN = 1.0
-# A tenth of what is seen at least, so that black does not weigh without limit.
-_DARK = 0.02
-# Of a texture that keeps the colours of vertices: texels for each, vertices that a texel looks at.
-_TEXELS_A_VERTEX, _NEAR, _LEAST_SIZE = 2.0, 4, 64
+# Robust limit of residuals of the logarithm of the intensity, and iterations.
+_ROBUST, _ROUNDS = 0.15, 4
+_MAX_LOG_GAIN = 1.0
+# Smallest intensity that is compared, as a fraction of the brightest.
+_MIN_INTENSITY = 0.02
+# For colours of vertices: texels per vertex, vertices that a texel interpolates, smallest size.
+_TEXELS_PER_VERTEX, _NEAR, _MIN_SIZE = 2.0, 4, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +52,9 @@ class Textured:
     image
         (H, W, 3) uint8 RGB.
     gains
-        (V, C) factor by which each view's light was multiplied.
+        (V, C) exposure factor of each view.
     seen
-        Share of the texture that views saw; the rest has the colours of the vertices.
+        Fraction of the texture that views saw; the rest has the colours of the vertices.
     """
 
     mesh: Mesh
@@ -64,8 +65,8 @@ class Textured:
 
 
 @dataclass(frozen=True, eq=False)
-class LitView:
-    """What of a view colours a surface.
+class TextureView:
+    """A view as it textures a surface.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ class LitView:
     light
         (H, W, 3) RGB, or (H, W, 1) albedo in counts times m^2; negative where unknown.
     projection
-        Where points land.
+        Projection of points into the image.
     """
 
     z: Float32
@@ -82,8 +83,8 @@ class LitView:
     projection: Projection
 
     @classmethod
-    def of(cls, frame: RangeFrame) -> LitView | None:
-        """Take the colour of a view, or its amplitude; None where it has neither."""
+    def of(cls, frame: RangeFrame) -> TextureView | None:
+        """Take the colour of a frame, or its amplitude; None if it has neither."""
         z = np.asarray(frame.z, np.float32)
         projection = Projection.of(frame.camera, 1)
         if frame.color_image is not None:
@@ -100,18 +101,18 @@ class LitView:
         return cls(z, np.ascontiguousarray(light[..., None]), projection)
 
 
-def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) -> Textured:
-    """Paint a surface with what views see of it.
+def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int) -> Textured:
+    """Texture a surface with the views.
 
-    Each place gets the mean of the views that see it, of which those that are near and see it
-    straight count by far the most. Exposures are made the same beforehand.
+    Each texel is the weighted mean of the views that see it; near views with a small angle of
+    incidence dominate. Exposures are equalised beforehand.
 
     Parameters
     ----------
     mesh
         With faces.
     views
-        With colour, or with amplitude, one at least.
+        With colour or with amplitude, at least one.
     poses
         (V, 4, 4) T_world_camera.
     size
@@ -124,7 +125,7 @@ def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) ->
     sums = np.zeros((len(points), channels), np.float32)
     weights = np.zeros(len(points), np.float32)
     for view, T, gain in zip(views, poses, gains, strict=True):
-        _see(view, T, points, normals, sums, weights, gain)
+        _accumulate(view, T, points, normals, sums, weights, gain)
     seen = weights > 0
     light = sums[seen] / weights[seen, None]
     if channels == 3:
@@ -137,29 +138,29 @@ def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) ->
     if mesh.color is not None:
         own = sheet.at_texels(seen_colors(mesh.color), ~seen)
         colors[~seen] = np.round(own.clip(0, 255)).astype(np.uint8)
-    share = float(seen.mean()) if len(seen) else 0.0
-    return Textured(mesh, sheet.atlas, sheet.filled(colors), gains, share)
+    fraction = float(seen.mean()) if len(seen) else 0.0
+    return Textured(mesh, sheet.atlas, sheet.filled(colors), gains, fraction)
 
 
 def baked(mesh: Mesh, faces: int, size: int) -> Textured:
-    """Simplify a surface, and keep the colours of all its vertices in a texture.
+    """Decimate a surface, and bake the colours of all its vertices into a texture.
 
-    Of the triangles fewer are needed than of the colours. Each texel gets the mean of the four
-    vertices nearest to it, those on the other side of a thin sheet left out, the nearer counting
-    more. Programs disagree about what colours of vertices mean, and none about a texture.
+    Each texel is the distance-weighted mean of the four nearest vertices on the same side of the
+    surface. A texture keeps more colours than a decimated surface has vertices, and unlike colours
+    of vertices all programs display it equally.
 
     Parameters
     ----------
     mesh
         With faces and colours.
     faces
-        Triangles at most.
+        Maximum number of triangles.
     size
-        Edge of the texture at most, in texels; smaller where there are fewer vertices.
+        Maximum edge of the texture, in texels; smaller for fewer vertices.
     """
     assert mesh.color is not None
     small = mesh.decimated(faces)
-    size = int(np.clip(np.ceil(np.sqrt(_TEXELS_A_VERTEX * len(mesh))), _LEAST_SIZE, size))
+    size = int(np.clip(np.ceil(np.sqrt(_TEXELS_PER_VERTEX * len(mesh))), _MIN_SIZE, size))
     sheet = _Sheet.of(small, size)
     if small is mesh:
         colors = sheet.at_texels(seen_colors(mesh.color))
@@ -180,14 +181,14 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """The texels of a mesh that lie on its triangles.
+    """The texels on the triangles of a mesh.
 
     Attributes
     ----------
     painted
         (size, size) which texels; there are K.
     points, normals
-        (K, 3) what they show.
+        (K, 3) of the surface at these texels.
     """
 
     atlas: Atlas
@@ -206,27 +207,27 @@ class _Sheet:
         painted = owner != UNOWNED
         corners = atlas.vertices[atlas.faces[owner[painted]]]
         shares = places[painted]
-        points = _between(mesh.vertices, corners, shares)
-        normals = _between(mesh.normals, corners, shares)
+        points = _interpolated(mesh.vertices, corners, shares)
+        normals = _interpolated(mesh.normals, corners, shares)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
         return cls(atlas, painted, corners, shares, points, normals)
 
     def at_texels(self, values: NDArray[np.generic], where: Bool | None = None) -> Float32:
-        """Values (K, C) between those of the vertices (N, C); of some of the texels (K,)."""
+        """Interpolate values of the vertices (N, C) at the texels (K, C), or at some of them."""
         if where is None:
-            return _between(values, self.corners, self.shares)
-        return _between(values, self.corners[where], self.shares[where])
+            return _interpolated(values, self.corners, self.shares)
+        return _interpolated(values, self.corners[where], self.shares[where])
 
     def filled(self, colors: UInt8) -> UInt8:
-        """Image (size, size, 3) of the colours (K, 3), nothing left open."""
+        """Return the image (size, size, 3) of the colours (K, 3), without empty texels."""
         image = np.zeros((*self.painted.shape, 3), np.uint8)
         image[self.painted] = colors
-        return _spread(image, self.painted)
+        return _dilate_colors(image, self.painted)
 
 
-def _between(values: NDArray[np.generic], corners: Int32, shares: Float32) -> Float32:
+def _interpolated(values: NDArray[np.generic], corners: Int32, shares: Float32) -> Float32:
     out = np.empty((len(corners), values.shape[1]), np.float32)
-    # Piece by piece: what the system has to find memory for anew takes longer than the sums.
+    # In chunks, as allocating large temporaries takes longer than the sums.
     for start in range(0, len(out), _TEXELS_AT_ONCE):
         rows = slice(start, start + _TEXELS_AT_ONCE)
         b, c = shares[rows].T[:, :, None]
@@ -235,12 +236,11 @@ def _between(values: NDArray[np.generic], corners: Int32, shares: Float32) -> Fl
     return out
 
 
-def exposures(mesh: Mesh, views: Sequence[LitView], poses: Float64) -> Float64:
-    """Factors (V, C) by which the views' light is best multiplied, so that they agree.
+def exposures(mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> Float64:
+    """Return exposure factors (V, C) of the views at their poses (V, 4, 4).
 
-    Of every two views that see a place, the logarithms of the light there should differ by that of
-    their factors; the least squares of all differences, those beyond a limit counting less. The
-    mean of the logarithms is 0.
+    Robust least squares of the differences between the log intensities of every two views that see
+    a place. The mean of the logarithms of the factors is 0.
     """
     step = max(1, len(mesh) // _SAMPLED)
     points = np.ascontiguousarray(mesh.vertices[::step])
@@ -254,24 +254,26 @@ def exposures(mesh: Mesh, views: Sequence[LitView], poses: Float64) -> Float64:
             np.zeros((len(points), channels), np.float32),
             np.zeros(len(points), np.float32),
         )
-        _see(view, T, points, normals, sums, weight, np.ones(channels))
+        _accumulate(view, T, points, normals, sums, weight, np.ones(channels))
         seen = weight > 0
         light = sums[seen] / weight[seen, None]
-        # What is nearly black or white tells little.
-        usable = (light > _DARK * top).all(1) & ((light < 250).all(1) if channels == 3 else True)
-        logs[k, seen] = np.log(np.maximum(light, _DARK * top))
+        # Nearly black or saturated intensities are not compared.
+        usable = (light > _MIN_INTENSITY * top).all(1) & (
+            (light < 250).all(1) if channels == 3 else True
+        )
+        logs[k, seen] = np.log(np.maximum(light, _MIN_INTENSITY * top))
         weights[k, seen] = usable
     return np.stack([_gains(logs[..., c], weights) for c in range(channels)], -1)
 
 
 def _gains(logs: Float64, weights: Float64) -> Float64:
-    """Factors (V,) for the logarithms (V, N) of light, where weights (V, N) are not 0."""
+    """Return factors (V,) for log intensities (V, N) with weights (V, N)."""
     gain = np.zeros(len(logs))
     w = weights
     for _ in range(_ROUNDS):
         total = np.maximum(w.sum(0), 1e-9)
         mean = (w * logs).sum(0) / total
-        # The places' own light eliminated: normal equations of the views alone.
+        # Normal equations of the views, with the intensities of the places eliminated.
         A = np.diag(w.sum(1)) - (w / total) @ w.T
         b = (w * (mean - logs)).sum(1)
         A += np.eye(len(A)) * (1e-3 * max(np.trace(A) / len(A), 1.0)) + 1e-3
@@ -280,11 +282,11 @@ def _gains(logs: Float64, weights: Float64) -> Float64:
         fitted = logs + gain[:, None]
         rest = np.abs(fitted - (w * fitted).sum(0) / total)
         w = weights * np.minimum(1, _ROBUST / np.maximum(rest, 1e-9))
-    return np.asarray(np.exp(gain.clip(-_MOST_GAIN, _MOST_GAIN)), np.float64)
+    return np.asarray(np.exp(gain.clip(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)), np.float64)
 
 
-def _see(
-    view: LitView,
+def _accumulate(
+    view: TextureView,
     T_world_camera: Float64,
     points: Float32,
     normals: Float32,
@@ -298,16 +300,16 @@ def _see(
     projection = view.projection
     run_chunks(
         lambda a, b: add_view(
-            points, normals, T, view.z, light, projection.lookup, projection.frame, _SLACK,
-            _SLACK_SHARE, border, _POWER, sums, weights, a, b,
+            points, normals, T, view.z, light, projection.lookup, projection.frame, _TOLERANCE_M,
+            _TOLERANCE_FRACTION, border, _POWER, sums, weights, a, b,
         ),
         len(points),
         _CHUNKS,
     )  # fmt: skip
 
 
-def _spread(image: UInt8, painted: Bool) -> UInt8:
-    """Fill what nobody owns with the nearest colour, so that smaller copies don't darken."""
+def _dilate_colors(image: UInt8, painted: Bool) -> UInt8:
+    """Fill empty texels with the nearest colour, so that mipmaps don't darken."""
     if painted.all() or not painted.any():
         return image
     _, label = cv2.distanceTransformWithLabels(

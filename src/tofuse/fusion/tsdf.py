@@ -1,4 +1,4 @@
-"""The surface of many range images: signed distances in sparse blocks, and their zero."""
+"""TSDF fusion: truncated signed distances in sparse blocks, and their zero surface."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from tofuse.arrays import Bool, Float32, Float64, Int32, Int64, UInt16
 from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
-from tofuse.fusion.kept import Views, about
-from tofuse.fusion.layout import OF_CUBES, REACH_SIGMAS, Layout, Region, near
+from tofuse.fusion.layout import CUBE_SPACING, REACH_SIGMAS, Layout, Region, cubes_near
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
-from tofuse.fusion.stitching import Piece, colored, stitched
-from tofuse.fusion.views import DECODED, RangeView
+from tofuse.fusion.range_view import DECODED, RangeView
+from tofuse.fusion.stitching import Piece, colored, stitch
+from tofuse.fusion.view_store import Views, summaries
 from tofuse.geometry import se3
 from tofuse.kernels.blocks import EDGE, VOXELS, index_of, mark_eighths, neighbours_of
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
@@ -25,44 +25,45 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import apply_free_space, integrate, unpack_view
 
 _CHUNKS = 16
-_AT_ONCE = 16  # views
-# Pixels by which a camera that keeps lines straight may bend them, from one node to the next.
+_BATCH = 16  # views
+# Largest second difference, in pixels, of the lookup of a distortion-free camera.
 _STRAIGHT = 1e-3
-# And within how many nodes any other one bends them little.
+# Number of nodes within which the lookup of any other camera is linear.
 _LINEAR_NODES = 2.0
-_KNOWN = 2.0  # voxels: the largest standard deviation of a surface
+_MAX_SIGMA_VOXELS = 2.0  # the largest standard deviation of a surface, voxels
 
 
 def fitting_voxel(views: Views) -> float:
-    """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
-    seen = [each for each in about(views) if each.depth > 0]
+    """Return a voxel edge in m for the sensor and the scene: 2 mm to 10 cm."""
+    seen = [each for each in summaries(views) if each.depth > 0]
     if not seen:
         return 0.01
     depth = float(np.median([each.depth for each in seen]))
-    # Depth noise grows with depth: finer voxels than this would hold little but noise.
+    # Depth noise grows with depth: finer voxels would represent mostly noise.
     size = max(float(np.median([each.pitch for each in seen])), 0.004) * depth
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 
 
 @dataclass(eq=False)
 class Volume:
-    """Signed distances to the surfaces that views saw, in blocks near these surfaces.
+    """Truncated signed distances to the surfaces of views, in blocks near these surfaces.
 
-    Each view is added to the blocks it sees. Blocks are shared out among threads, and each is
-    changed by one of them. What a block gets does not depend on which others are held beside it.
+    Each view is integrated into the blocks that it sees. Blocks are distributed among threads, and
+    each is changed by one of them. The values of a block do not depend on which others are in the
+    volume.
 
     Attributes
     ----------
     voxel_m, reach_m
-        Edge of a voxel, and the largest distance that is told.
+        Edge of a voxel, and the truncation distance.
     keys
         (B,) the blocks: those of a region, ascending, then the layer around it.
     numbers, own
-        (B,) their numbers among all blocks, and how many are the region's.
+        (B,) their numbers among all blocks, and the number of the region's own.
     distance, weight, seen, color, free
         See `tofuse.kernels.tsdf.integrate`.
-    turns, added
-        Every how-many-th view says what it saw through, and how many have been added.
+    free_space_stride, added
+        Stride of views for free space far from surfaces, and the number of views added.
     """
 
     voxel_m: float
@@ -75,23 +76,23 @@ class Volume:
     seen: UInt16
     color: Float32
     free: Float32
-    turns: int = 1
+    free_space_stride: int = 1
     added: int = 0
 
     @cached_property
     def index(self) -> tuple[Int64, Int32]:
-        """Where the row of a block is found by its key."""
+        """Hash table of the rows of blocks by their keys."""
         return index_of(self.keys)
 
     @classmethod
     def around(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Volume:
-        """Lay out all blocks near the surfaces of views at their poses (N, 4, 4), all empty."""
+        """Return the empty volume of all blocks near the surfaces of views at poses (N, 4, 4)."""
         layout = Layout.of(views, poses, voxel_m, options)
         return cls.of(layout, layout.whole())
 
     @classmethod
     def of(cls, layout: Layout, region: Region) -> Volume:
-        """Hold a region of a layout, empty."""
+        """Return the empty volume of a region of a layout."""
         blocks = len(region.rows)
         return cls(
             layout.voxel_m,
@@ -104,7 +105,7 @@ class Volume:
             np.zeros((blocks, VOXELS), np.uint16),
             np.zeros((blocks, VOXELS, layout.channels), np.float32),
             np.zeros((blocks, 8), np.float32),
-            layout.turns,
+            layout.free_space_stride,
         )
 
     def add(
@@ -114,9 +115,9 @@ class Volume:
         advance: Callable[[], None] | None = None,
         touching: Bool | None = None,
     ) -> None:
-        """Add views at their poses (N, 4, 4), in order; `advance` is called for each.
+        """Integrate views at their poses (N, 4, 4), in order; `advance` is called for each.
 
-        Those that are not `touching` (N,) any block are passed over.
+        Those that are not `touching` (N,) any block are skipped.
         """
         batch: list[RangeView] = []
         numbers: list[int] = []
@@ -131,7 +132,7 @@ class Volume:
         for k in range(len(views)):
             if touching is None or touching[k]:
                 view = views[k]
-                if batch and (len(batch) == _AT_ONCE or view.projection is not batch[0].projection):
+                if batch and (len(batch) == _BATCH or view.projection is not batch[0].projection):
                     flush()
                 batch.append(view)
                 numbers.append(self.added + k)
@@ -141,7 +142,7 @@ class Volume:
         self.added += len(views)
 
     def _add(self, views: Views, poses: Float64, numbers: Int64) -> None:
-        """Add a few views of one camera at once: a block is then fetched once for all of them.
+        """Integrate a batch of views of one camera, which loads each block once for all of them.
 
         `numbers` (N,) are theirs among all views.
         """
@@ -155,7 +156,7 @@ class Volume:
         cells = np.empty((count, *grid, 3), np.float32)
         coarse = np.empty((count, *-(-grid // 4), 3), np.float32)
         channels = self.color.shape[2]
-        backs = _backs(self.reach_m)
+        free_space_limits = _free_space_limits(self.reach_m)
         light = np.zeros((count, rows * columns, channels), np.float32)
 
         def open_views(a: int, b: int) -> None:
@@ -170,17 +171,17 @@ class Volume:
                     projection.rays,
                     projection.frame,
                     self.reach_m,
-                    backs,
+                    free_space_limits,
                     heights[s],
                     codes[s],
                     cells[s],
                     coarse[s],
                 )
-                if self.turns > 1:
+                if self.free_space_stride > 1:
                     number = int(numbers[s])
-                    cubes = near(view, poses[s], edge, self.reach_m, OF_CUBES, number, 2)
+                    cubes = cubes_near(view, poses[s], edge, self.reach_m, CUBE_SPACING, number, 2)
                     mark_eighths(cubes, *self.index, close[s])
-                # Albedo says nothing where the others have colour.
+                # Albedo is ignored if other views have colour.
                 if view.light is not None and channels == view.channels:
                     light[s] = view.light.reshape(-1, channels)
 
@@ -199,9 +200,9 @@ class Volume:
                 heights,
                 codes,
                 DECODED,
-                backs,
+                free_space_limits,
                 close,
-                self.turns,
+                self.free_space_stride,
                 light,
                 (rows, columns),
                 projection.lookup,
@@ -223,10 +224,10 @@ class Volume:
         )
 
     def surface(self, min_views: int = 1) -> Mesh:
-        """Return where the distances change sign, between voxels that views saw.
+        """Return the zero surface of the distances, between voxels that views saw.
 
-        What is not known to within a few voxels is left out: there noise makes the surface. Of a
-        region's surface what is made of its own blocks is a `piece`.
+        Vertices with a standard deviation above a few voxels are left out, as there the surface is
+        noise. The surface of a region's own blocks is a `piece`.
         """
         net = self._net(min_views)
         return Mesh(
@@ -240,7 +241,7 @@ class Volume:
         )
 
     def piece(self, min_views: int = 1) -> Piece:
-        """Return the surface of the region's own blocks, to be stitched to those of others."""
+        """Return the surface of the region's own blocks, to be stitch to those of others."""
         net = self._net(min_views)
         block, voxel = np.nonzero(net.cells >= 0)
         names = self.numbers[block] * VOXELS + voxel
@@ -262,7 +263,7 @@ class Volume:
         )
 
     def _net(self, min_views: int) -> _Net:
-        """Vertices of all cells, and the triangles of the region's own blocks."""
+        """Return vertices of all cells, and the triangles of the region's own blocks."""
         blocks = len(self.keys)
         run_chunks(
             lambda a, b: apply_free_space(
@@ -281,7 +282,7 @@ class Volume:
                 self.distance,
                 self.weight,
                 self.seen,
-                1 / (_KNOWN * self.voxel_m) ** 2,
+                1 / (_MAX_SIGMA_VOXELS * self.voxel_m) ** 2,
                 min_views,
                 cells,
                 counts,
@@ -331,7 +332,7 @@ class Volume:
         starts: Int64,
         points: Float64,
     ) -> tuple[Int32, Int64]:
-        """Triangles of the own blocks, and how many each block has."""
+        """Return the triangles of the own blocks, and their number per block."""
         counts = np.zeros(self.own, np.int64)
 
         def run(firsts: Int64, faces: Int32, fill: bool) -> Int32:
@@ -361,7 +362,7 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class _Net:
-    """What surface nets make of a volume: columns of vertices (V,), and faces (M, 3)."""
+    """The surface net of a volume: columns of vertices (V,), and faces (M, 3)."""
 
     points: Float64
     normals: Float32
@@ -373,18 +374,18 @@ class _Net:
     cells: Int32  # (B, VOXELS) number of the vertex within its block, or -1
 
 
-def _backs(reach: float) -> Float32:
-    """(256,) how far behind its surface a pixel matters, m, by the code of its weight.
+def _free_space_limits(reach: float) -> Float32:
+    """Return the distance behind its surface up to which a pixel is integrated, m, by weight code.
 
-    It has to be surely behind. If a noisy pixel were not heard there, any other one that errs to
-    the back would make a surface of its own.
+    (256,) several sigmas: else any noisy pixel that errs to the back would create a surface of its
+    own.
     """
     sigma = 1 / np.sqrt(np.maximum(DECODED, np.float32(1e-12)))
     return np.where(DECODED > 0, np.maximum(REACH_SIGMAS * sigma, reach), reach).astype(np.float32)
 
 
 def _straight_nodes(lookup: Float32) -> float:
-    """Within how many nodes of a lookup a linear function will do."""
+    """Return the number of nodes within which a lookup is linear."""
     bends = [np.abs(np.diff(lookup, 2, axis)) for axis in (0, 1)]
     if max(bend.max() for bend in bends) < _STRAIGHT:
         return float(np.inf)
@@ -402,16 +403,18 @@ def fuse_surface(
     Parameters
     ----------
     views
-        All of one camera or several.
+        Of one camera or several.
     poses
         (N, 4, 4) T_world_camera.
+    options
+        How they are fused.
     advance
         Called after each view.
 
     Returns
     -------
-    The surface without its islands; no faces where the views show none. Where its voxels take more
-    memory than `options` allow, it is made region by region, with the same result.
+    The surface without islands; without faces if the views show none. If its voxels exceed the
+    memory of the options, it is made region by region, with the same result.
     """
     options = options or Fusion()
     layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views), options)
@@ -433,8 +436,8 @@ def _by_regions(
     options: Fusion,
     advance: Callable[[], None] | None,
 ) -> Mesh:
-    """The surface, one region after the other: the same to the byte as of all of it at once."""
-    frusta = Frusta.of(views, poses, _backs(layout.reach_m))
+    """Fuse the surface region by region: the same to the byte as of a single region."""
+    frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
     block_m = EDGE * layout.voxel_m
     done = 0
 
@@ -447,11 +450,11 @@ def _by_regions(
     store: Spill[Piece] = Spill(0)
     with closing(store) as pieces:
         for region in regions:
-            # One more block, as blocks are looked at as balls around them.
+            # One more block, as blocks are tested by their bounding spheres.
             low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
             touching = frusta.touching(block_m * low, block_m * high)
             volume = Volume.of(layout, region)
             volume.add(views, poses, step, touching)
             pieces.put(volume.piece(options.min_views))
             del volume
-        return stitched(pieces, len(layout.keys), options.island)
+        return stitch(pieces, len(layout.keys), options.island)

@@ -1,4 +1,4 @@
-"""Which way up a model is."""
+"""The upright orientation of a model."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.fusion.mesh import Mesh
 
-# Vertices that take part, and of them the planes that are tried.
-_POINTS, _TRIED = 4000, 150
+# Number of sampled vertices, and of candidate planes through them.
+_POINTS, _CANDIDATES = 4000, 150
 _MAX_TILT, _ANGLE = np.radians(25.0), np.radians(12.0)
-# A floor holds so much of the vertices, and so much at most lies below it.
-_LEAST_SHARE, _MOST_BELOW = 0.04, 0.02
-# Directions that are tried for up, some 3 degrees apart; normals and cameras that judge them.
-_DIRECTIONS, _JUDGING, _CAMERAS = 4000, 1000, 100
-# How far those who hold a camera roll it, look up and look down, one sigma: what they look at is
-# mostly below their eyes. What one camera says against a direction at most.
+# Minimum fraction of the vertices on the floor, and maximum fraction below it.
+_MIN_FRACTION, _MAX_BELOW = 0.04, 0.02
+# Candidates for up, some 3 degrees apart; normals and cameras that they are scored by.
+_DIRECTIONS, _MAX_NORMALS, _MAX_CAMERAS = 4000, 1000, 100
+# Standard deviations of the roll of a handheld camera, and of its pitch upwards and downwards: most
+# objects are below eye level. Minimum log-likelihood of one camera.
 _ROLL, _UP, _DOWN, _OUTLIER = np.radians(15.0), np.radians(40.0), np.radians(60.0), -5.0
-_ALIKE = np.radians(30.0)  # apart, cameras are hardly held alike, one sigma
-# One camera in twenty lies on its side or hangs upside down, all of the time.
-_LEVEL, _TURNED = 0.0, np.log(0.05)
-# How near to level or plumb surfaces are that people made, one sigma, and how much it counts if
-# all are, against what the cameras say.
-_PLUMB, _STRUCTURE = np.radians(7.0), 4.0
+_SIMILAR = np.radians(30.0)  # correlation angle between orientations of cameras
+# Log priors: one camera in twenty is permanently on its side or upside down.
+_LEVEL, _ROLLED = 0.0, np.log(0.05)
+# Standard deviation of man-made surfaces from horizontal or vertical, and the weight of their score
+# relative to the cameras.
+_STRUCTURE_ANGLE, _STRUCTURE_WEIGHT = np.radians(7.0), 4.0
 
 
 def T_up_world(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
-    """Return the motion (4, 4) of `upright`, which is a rotation about the world's origin."""
+    """Return the rotation of `upright` about the world's origin, as (4, 4)."""
     T = np.eye(4)
     T[:3, :3] = upright(mesh, poses, up)
     return T
@@ -35,16 +35,18 @@ def T_up_world(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> 
 def upright(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
     """Return the rotation (3, 3) from the world into axes x right, y up, z towards the viewer.
 
-    Up is the normal of the floor, where there is one: the largest plane that faces about upwards
-    and has hardly anything below it. Without one it is what gravity says, and without gravity what
-    `likely_up` says. The first camera looks along -z.
+    Up is the normal of the floor: the largest plane that faces roughly upwards and has hardly
+    anything below it. Without a floor it is measured up, and without that `likely_up`. The first
+    camera looks along -z.
 
     Parameters
     ----------
+    mesh
+        The surface; None without one.
     poses
-        (N, 4, 4) T_world_camera, NaN where there is none.
+        (N, 4, 4) T_world_camera, NaN for frames without a pose.
     up
-        (3,) against gravity, in the world, as an accelerometer measured it; None without one.
+        (3,) against gravity, in the world, by an accelerometer; None without one.
     """
     known = poses[np.isfinite(poses).all((1, 2))]
     if len(known) == 0:
@@ -53,7 +55,7 @@ def upright(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Flo
     floor = None if mesh is None else _floor(mesh, up)
     y = up if floor is None else floor
     back = -known[0, :3, 2]
-    if np.linalg.norm(np.cross(y, back)) < 0.1:  # it looks straight down, or up
+    if np.linalg.norm(np.cross(y, back)) < 0.1:  # it looks straight down or up
         back = known[0, :3, 1]
     x = np.cross(y, back)
     x /= np.linalg.norm(x)
@@ -61,36 +63,38 @@ def upright(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Flo
 
 
 def likely_up(mesh: Mesh | None, poses: Float64) -> Float64:
-    """Return the unit vector (3,) that is most probably up, of all directions in the world.
+    """Return the unit vector (3,) in the world that is most probably up.
 
-    Who holds a camera keeps its horizon level, and looks down or up (the first is how panoramas are
-    straightened: Brown and Lowe 2007, section 5); a camera may also lie on its side or hang upside
-    down all of the time. What people made is level or plumb, and what is level is mostly seen from
-    above: things lie on floors and tables.
+    Handheld cameras have a level horizon (by which panoramas are straightened: Brown and Lowe 2007,
+    section 5) and varying pitch; some are permanently on their side or upside down. Man-made
+    surfaces are horizontal or vertical, and horizontal ones are mostly seen from above, as floors
+    and tables.
 
     Parameters
     ----------
+    mesh
+        The surface; None without one.
     poses
-        (N, 4, 4) T_world_camera, one at least.
+        (N, 4, 4) T_world_camera, at least one.
     """
-    some = poses[:: -(-len(poses) // _CAMERAS), :3, :3]
+    some = poses[:: -(-len(poses) // _MAX_CAMERAS), :3, :3]
     own = -some[:, :, 1].mean(0)
     if mesh is None or len(mesh) == 0:
         normals = np.zeros((0, 3))
     else:
-        normals = mesh.normals[:: -(-len(mesh) // _JUDGING)].astype(float)
+        normals = mesh.normals[:: -(-len(mesh) // _MAX_NORMALS)].astype(float)
         normals = normals[np.isfinite(normals).all(1)]
-    if np.linalg.norm(own) > 0.1:  # between the others it may be best, too
+    if np.linalg.norm(own) > 0.1:  # the mean of the cameras is a candidate, too
         tried = np.concatenate([[own / np.linalg.norm(own)], _directions()])
     else:
         tried = _directions()
-    score = _camera_score(some, tried) + _STRUCTURE * _built(normals, tried)
+    score = _camera_score(some, tried) + _STRUCTURE_WEIGHT * _structure_score(normals, tried)
     best = tried[int(score.argmax())]
     return _refined(normals, best)
 
 
 def _directions() -> Float64:
-    """Unit vectors (N, 3), evenly over the sphere."""
+    """Return unit vectors (N, 3), evenly over the sphere."""
     k = np.arange(_DIRECTIONS) + 0.5
     z, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - z**2)
@@ -98,77 +102,77 @@ def _directions() -> Float64:
 
 
 def _camera_score(R_world_camera: Float64, ups: Float64) -> Float64:
-    """Logarithm (N,) of how probable directions (N, 3) are, by how cameras (K, 3, 3) are held."""
-    # Cameras that are held alike are one piece of evidence: this counts the pieces.
+    """Return the log-likelihood (N,) of up directions (N, 3), by cameras (K, 3, 3)."""
+    # Similar orientations are correlated: the effective number of independent cameras.
     cos = 0.5 * (np.einsum("aij,bij->ab", R_world_camera, R_world_camera) - 1)
     apart = np.arccos(cos.clip(-1, 1))
-    independent = 1 / np.exp(-0.5 * (apart / _ALIKE) ** 2).mean()
+    independent = 1 / np.exp(-0.5 * (apart / _SIMILAR) ** 2).mean()
     right, below, ahead = (ups @ R_world_camera[:, :, k].T for k in range(3))
-    held = []
+    scores = []
     for aside, above, prior in (
         (right, -below, _LEVEL),
-        (below, right, _TURNED),
-        (below, -right, _TURNED),
-        (right, below, _TURNED),
+        (below, right, _ROLLED),
+        (below, -right, _ROLLED),
+        (right, below, _ROLLED),
     ):
         roll = np.arcsin(aside.clip(-1, 1))
         down = np.arctan2(-ahead, above)
         each = -0.5 * ((roll / _ROLL) ** 2 + (down / np.where(down < 0, _UP, _DOWN)) ** 2)
-        held.append(independent * np.maximum(each, _OUTLIER).mean(1) + prior)
-    score: Float64 = np.max(held, axis=0)
+        scores.append(independent * np.maximum(each, _OUTLIER).mean(1) + prior)
+    score: Float64 = np.max(scores, axis=0)
     return score
 
 
-def _built(normals: Float64, ups: Float64) -> Float64:
-    """Share (N,) of surfaces (K, 3) that are plumb or face up, less those that face down.
+def _structure_score(normals: Float64, ups: Float64) -> Float64:
+    """Return the fraction (N,) of normals (K, 3) that are horizontal or up, minus those down.
 
-    Between 1, all is as (N, 3) directions ask for, and -1.
+    `ups` (N, 3) are up directions; 1 if all surfaces are vertical or face up, -1 if all face down.
     """
     if not len(normals):
         return np.zeros(len(ups))
     along = ups @ normals.T
-    away2 = np.minimum(along**2, 1 - along**2)  # sine squared of the angle from plumb or level
-    fits = np.exp(-0.5 * away2 / np.sin(_PLUMB) ** 2)
-    share: Float64 = np.where(along < -np.sqrt(0.5), -fits, fits).mean(1)
-    return share
+    sine2 = np.minimum(along**2, 1 - along**2)  # of the angle from vertical or horizontal
+    fits = np.exp(-0.5 * sine2 / np.sin(_STRUCTURE_ANGLE) ** 2)
+    score: Float64 = np.where(along < -np.sqrt(0.5), -fits, fits).mean(1)
+    return score
 
 
 def _refined(normals: Float64, up: Float64) -> Float64:
-    """The direction (3,) near `up` to which surfaces are level or plumb, by least squares."""
+    """Refine up (3,) by least squares, so that surfaces are horizontal or vertical."""
     for _ in range(4):
         along = normals @ up
-        plumb, level = (
+        vertical, horizontal = (
             normals[np.abs(along) < np.sin(_ANGLE)],
             normals[np.abs(along) > np.cos(_ANGLE)],
         )
-        if len(level) < _LEAST_SHARE * len(normals) or not len(level):
+        if len(horizontal) < _MIN_FRACTION * len(normals) or not len(horizontal):
             return up
-        _, vectors = np.linalg.eigh(plumb.T @ plumb - level.T @ level)
+        _, vectors = np.linalg.eigh(vertical.T @ vertical - horizontal.T @ horizontal)
         found = vectors[:, 0]
         up = found if found @ up > 0 else -found
     return up
 
 
 def _floor(mesh: Mesh, up: Float64) -> Float64 | None:
-    """Normal (3,) of the largest plane facing up that has nothing below it, or None."""
+    """Return the normal (3,) of the largest plane facing up with nothing below it, or None."""
     step = max(1, len(mesh) // _POINTS)
     p, n = mesh.vertices[::step].astype(float), mesh.normals[::step].astype(float)
     facing = np.flatnonzero(n @ up > np.cos(_MAX_TILT))
-    if len(facing) < max(20, _LEAST_SHARE * len(p)):
+    if len(facing) < max(20, _MIN_FRACTION * len(p)):
         return None
     band = 0.01 * float(np.linalg.norm(np.ptp(np.percentile(p, [2, 98], axis=0), axis=0)))
-    tried = facing[:: max(1, len(facing) // _TRIED)]
+    tried = facing[:: max(1, len(facing) // _CANDIDATES)]
     normals, heights = n[tried], (p[tried] * n[tried]).sum(1)
     for _ in range(4):
         over = normals @ p.T - heights[:, None]
         on = (np.abs(over) < band) & (normals @ n.T > np.cos(_ANGLE))
-        # A table is larger than what is seen of the floor, but there is something below it.
-        lowest = (over < -3 * band).mean(1) <= _MOST_BELOW
+        # A table may be larger than the visible floor, but there is something below it.
+        lowest = (over < -3 * band).mean(1) <= _MAX_BELOW
         best = int(np.argmax(on.sum(1) * lowest))
         mine = on[best]
-        if not lowest[best] or mine.sum() < max(20, _LEAST_SHARE * len(p)):
+        if not lowest[best] or mine.sum() < max(20, _MIN_FRACTION * len(p)):
             return None
-        # The mean of what lies on it is better than one vertex.
+        # The plane through all its vertices is more accurate than that of one.
         centre = p[mine].mean(0)
         normal = np.linalg.eigh(np.cov((p[mine] - centre).T))[1][:, 0]
         normal = normal if normal @ up > 0 else -normal

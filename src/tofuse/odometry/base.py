@@ -1,4 +1,4 @@
-"""What odometry gives for each frame, whatever the method."""
+"""The interface of odometry: methods, their trackers, and the result of each frame."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ Status = Literal["tracked", "predicted", "lost", "skipped"]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What became of one frame.
+    """The result of tracking one frame.
 
     Attributes
     ----------
     status
-        "tracked"; "predicted" where no direction was observable; "lost" without a pose.
+        "tracked"; "predicted" where all directions are degenerate; "lost" without a pose.
     reason
-        Why it is not tracked, or what was out of the ordinary in tracking it; may be empty.
+        Why it is not tracked, or what was unusual in tracking it; may be empty.
     T_component_camera
         (4, 4) pose in the frame of its component; None where lost.
     reference
         Index (`Frame.index`) of the frame it was registered to; None for the first of a component.
     registration
-        T_reference_frame and how well it is known; None for the first of a component.
+        T_reference_frame and its information; None for the first of a component.
     surface
-        The view as it was prepared for tracking; None where the method makes none, and for
-        frames without a pose.
+        The view as prepared for tracking; None where the method needs none, and for frames
+        without a pose.
     component
-        Number of the component: what is tracked without a break. A frame that can't be connected
-        begins a new one, in a frame of its own.
+        Number of the component: the frames tracked without a break. A frame that can't be
+        connected begins a new one, in a coordinate frame of its own.
     links
-        Registrations of this frame to frames of other components, that may join them.
+        Registrations of this frame to frames of other components, which may join them.
     doubtful
         Whether it fits worse than views of this camera usually do.
     moving
-        (H, W) mask of the frame's pixels that moved by themselves; None where none did.
+        (H, W) mask of the frame's pixels on moving objects; None without any.
     """
 
     status: Status
@@ -57,35 +57,37 @@ class Step:
 
 
 class Tracker(Protocol):
-    """Odometry at work: keeps what it needs of the frames so far."""
+    """The state of an odometry method on one recording."""
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
-        """Find the pose of the next (filtered) frame.
+        """Estimate the pose of the next frame.
 
         Parameters
         ----------
+        frame
+            The filtered frame.
         T_odometry
-            The frame's T_world_camera from an odometry file, if there is one.
+            Its (4, 4) T_world_camera by external odometry, if known.
         surface
-            What `prepare` made of the frame, if it was asked to.
+            The result of `prepare` for the frame, if it was called.
         """
         ...
 
     def prepare(self, frame: Frame) -> PreparedView | None:
-        """Make a frame ready before its turn, if there is something to be made of it alone.
+        """Prepare a frame before its turn, as far as that depends on it alone; None if it doesn't.
 
-        Other threads may ask for it while frames before it are tracked.
+        May be called by other threads while earlier frames are tracked.
         """
         return None
 
-    def expected(self, now: Moment) -> Float64 | None:
-        """Pose (4, 4) in the frame of the present component that the motion leads to, if known."""
+    def predicted_pose(self, now: Moment) -> Float64 | None:
+        """Return the predicted pose (4, 4) in the present component's frame, if known."""
         return None
 
     def interrupt(self) -> None:
-        """Hear that the next frame begins another recording: the motion need not go on."""
+        """Expect the first frame of another recording: the motion is not continuous."""
         return
 
 
@@ -100,5 +102,5 @@ class Odometry(Protocol):
         ...
 
     def start(self, seed: int) -> Tracker:
-        """Begin a new recording."""
+        """Return a tracker for a new recording; random choices derive from `seed`."""
         ...

@@ -1,18 +1,19 @@
-"""Poses from elsewhere in place of tracking: to refine them, and to see whether they are right."""
+"""Given poses in place of tracking: to refine them, or to check whether they are right."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.odometry.moving import MovingObjects, at_size
-from tofuse.odometry.segmentation import NOTICED
+from tofuse.odometry.motion_segmentation import MIN_MOVING_FRACTION
+from tofuse.odometry.moving_objects import MovingObjects, at_size
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
@@ -23,17 +24,17 @@ from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
 @part("odometry", "given")
 @dataclass(frozen=True)
-class GivenPoses(Odometry):
-    """Takes the poses of the odometry beside the images as they are.
+class GivenPoses(Bounded, Odometry):
+    """Adopts the poses of external odometry unchanged.
 
     Each frame is aligned with the newest keyframe, or with the nearest one where that sees another
-    place, to know what the images say of the motion between them; the pose stays as given. What
-    moves by itself is left out. A frame without a pose is lost.
+    place, to measure the motion between them by the images; the pose stays as given. Moving
+    objects are left out. A frame without a pose is lost.
 
     Attributes
     ----------
     surface, alignment, uncertainty
-        As of `Keyframes`.
+        As in `Keyframes`.
     keyframe_angle, keyframe_distance
         Motion after which a frame becomes a keyframe: rad, and as a fraction of the median depth.
     """
@@ -41,8 +42,8 @@ class GivenPoses(Odometry):
     surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
-    keyframe_angle: float = 0.2
-    keyframe_distance: float = 0.1
+    keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
+    keyframe_distance: Annotated[float, Bounds(0, exclusive=True)] = 0.1
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
@@ -79,10 +80,10 @@ class _GivenTracker(Tracker):
             return Step("tracked", "", T, surface=view)
         keyframe = self._keyframes.in_sight(T)
         moving = self._objects.compare(view, T, keyframe.view, keyframe.T_component_camera)
-        self._objects.learn(moving)
+        self._objects.update(moving)
         mask = None
         target = keyframe.target
-        if moving.fraction > NOTICED:
+        if moving.fraction > MIN_MOVING_FRACTION:
             mask = at_size(moving.view, frame)
             view = moving.applied(view)
             reference = moving.applied_to_reference(keyframe.view)
@@ -104,16 +105,16 @@ class _GivenTracker(Tracker):
 
 @dataclass(frozen=True, eq=False)
 class StatedPose:
-    """What an earlier result says of a frame.
+    """The pose of a frame in an earlier result.
 
     Attributes
     ----------
     status, reason
-        As of `Step`.
+        As in `Step`.
     T_component_camera
-        (4, 4); None where it has no pose.
+        (4, 4); None without a pose.
     component
-        Number of the component whose frame that is.
+        Number of the component.
     """
 
     status: Status
@@ -124,12 +125,12 @@ class StatedPose:
 
 @dataclass(frozen=True, eq=False)
 class StatedPoses(Odometry):
-    """Takes the poses of earlier results as they are, each component in a frame of its own.
+    """Adopts the poses of earlier results unchanged, each component in a frame of its own.
 
     Attributes
     ----------
     stated
-        By the index of the frame. Others are lost.
+        By frame index. Other frames are lost.
     options
         How frames are aligned with keyframes of their component.
     """

@@ -1,4 +1,4 @@
-"""The keyframes of all components: what views are aligned with, and searched for in."""
+"""The keyframes of all components, for alignment and relocalization."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
 from tofuse.registration.verification import IN_SIGHT
 
-# Keyframes that are kept, so that memory stays flat.
+# Maximum number of keyframes, so that memory is constant.
 CAPACITY = 40
-# By which fraction of its width an image may be shifted against another that it looks like.
-_SHIFT = 0.5
+# Largest shift between the descriptors of similar views, as a fraction of the image width.
+_MAX_SHIFT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A view with its pose in the frame of its component; doubtful if it fitted unusually badly."""
+    """A view with its pose (4, 4) in its component; doubtful if it fitted unusually badly."""
 
     view: PreparedView
     T_component_camera: Float64
@@ -31,7 +31,7 @@ class Keyframe:
 
     @property
     def depth(self) -> float:
-        """Median, m."""
+        """Median depth, m."""
         return self.view.depth
 
     @cached_property
@@ -41,7 +41,7 @@ class Keyframe:
 
     @cached_property
     def target(self) -> Target:
-        """What views are aligned with."""
+        """The target of alignments with it."""
         return Target(self.view, se3.inverse(self.T_component_camera))
 
 
@@ -63,20 +63,20 @@ class KeyframeMap:
 
     @property
     def newest(self) -> Keyframe:
-        """The one that is tracked against."""
+        """The keyframe that views are tracked against."""
         return self._keyframes[-1]
 
     def add(self, keyframe: Keyframe) -> None:
-        """Add the newest keyframe; where there are too many, the most dispensable one goes."""
-        if self._keyframes:  # only lost views are compared with it from here on
+        """Add the newest keyframe; beyond the capacity, remove the most redundant one."""
+        if self._keyframes:  # from here on used for relocalization only
             before = self._keyframes[-1]
             self._keyframes[-1] = replace(before, view=before.view.without_caches())
         self._keyframes.append(keyframe)
         if len(self._keyframes) > CAPACITY:
-            del self._keyframes[self._dispensable()]
+            del self._keyframes[self._most_redundant()]
 
     def is_far(self, T_component_camera: Float64, keyframe: Keyframe) -> bool:
-        """Whether a view with this pose is to become a keyframe, seen from another one."""
+        """Whether a pose (4, 4) is so far from a keyframe that its view becomes the next one."""
         between = se3.inverse(keyframe.T_component_camera) @ T_component_camera
         return bool(
             se3.angle(between) > self._angle
@@ -84,26 +84,32 @@ class KeyframeMap:
         )
 
     def in_sight(self, T_component_camera: Float64) -> Keyframe:
-        """The newest keyframe, or the nearest one where the newest sees another place."""
+        """Return the newest keyframe, or the nearest one where the newest sees another place.
+
+        Parameters
+        ----------
+        T_component_camera
+            (4, 4) pose of the view.
+        """
         T = np.stack([k.T_component_camera for k in self._keyframes])
         between = se3.inverse(T_component_camera) @ T
         depth = np.array([k.depth for k in self._keyframes])
         away = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
         return self._keyframes[-1 if away[-1] < IN_SIGHT else int(np.argmin(away))]
 
-    def alike(self, view: PreparedView, component: int) -> Keyframe | None:
-        """The keyframe outside of a component that looks most like a view, of equals the newest."""
+    def most_similar(self, view: PreparedView, component: int) -> Keyframe | None:
+        """Return the most similar keyframe of another component; of ties the newest."""
         others = [k for k in self._keyframes if k.component != component]
         if not others:
             return None
-        far = unlikeness(look_of(view), np.stack([k.look for k in others]), _SHIFT)
+        far = unlikeness(look_of(view), np.stack([k.look for k in others]), _MAX_SHIFT)
         return others[int(np.flatnonzero(far == far.min())[-1])]
 
-    def _dispensable(self) -> int:
-        """Which keyframe is missed least: the later one of the two that are nearest in pose.
+    def _most_redundant(self) -> int:
+        """Return the position of the later one of the two keyframes that are nearest in pose.
 
-        The earlier one has drifted less. The newest one, which is tracked against, stays, and so
-        does the last one of each component.
+        The earlier one has drifted less. The newest one, which views are tracked against, stays,
+        and so does the last one of each component.
         """
         old = self._keyframes[:-1]
         T = np.stack([k.T_component_camera for k in old])
@@ -116,8 +122,6 @@ class KeyframeMap:
         away = np.hypot(apart, angle)
         away[np.triu_indices(len(old))] = np.inf
         away[component[:, None] != component] = np.inf
-        if np.isinf(
-            away
-        ).all():  # nothing but components of one keyframe: the oldest is missed least
+        if np.isinf(away).all():  # one keyframe per component: remove the oldest
             return 0
         return int(np.argmin(away.min(1)))

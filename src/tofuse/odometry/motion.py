@@ -1,9 +1,9 @@
-"""How a camera moves: where it is expected next, and which motions are surprises.
+"""Constant-velocity motion model: the predicted pose of the next frame, and its validation gate.
 
-A camera that is carried or turned changes its velocity little from one frame to the next. A frame
-that fits well at a place where it can hardly be (another place that looks alike, say) is given away
-by that. Time is what the timestamps say, or the frames' indices where they say nothing: frames
-that are missing make the next motion longer, not stranger.
+A camera that is carried or turned changes its velocity little from one frame to the next, so that
+a good fit at a wrong place (another place that looks alike, say) violates the gate. Time is that of
+the timestamps, or the frame index where there are none: after missing frames the predicted motion
+is longer and the gate wider.
 """
 
 from __future__ import annotations
@@ -15,25 +15,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.geometry import se3
 from tofuse.kernels.motion import distance_and_angle, retract, twist_between
 
-# What a motion may differ from the expected one, whatever was seen before: m and rad. Carried
-# cameras at 5 to 30 frames a second stay below. At lower rates the same accelerations, of 3 m/s^2,
-# take them further, by the square of the time; after 0.6 s nothing can be expected any more.
-FLOOR = np.array([0.06, np.radians(4.0)])
-# What a hand can do at any time, m/s and rad/s.
+# Minimum of the gate, m and rad: handheld cameras at 5 to 30 frames a second stay below. At lower
+# rates the same acceleration of 3 m/s^2 moves them further, by the square of the time since the
+# last frame over _GATE_SECONDS; at most _MAX_GATE_SCALE times, which is reached after 0.6 s.
+GATE = np.array([0.06, np.radians(4.0)])
+_GATE_SECONDS, _MAX_GATE_SCALE = 0.2, 10.0
+# Largest velocity of a handheld camera, m/s and rad/s.
 HANDHELD = np.array([3.0, 6.0])
-_SECONDS, _FARTHEST = 0.2, 10.0
-# Over that, so many times the largest of so many recent differences.
-_TIMES, _RECENT = 2.0, 4
-# Differences of a tripod are the tracker's noise: m and rad.
-_STILL = np.array([0.003, np.radians(0.2)])
-# Share of the newest motion in the running mean.
-_NEWEST = 0.3
-# Odometry is compared with the velocity over so many turns, at least half of them.
-_PROOF = 10
-# After so many frames without a pose, of which no time is known, the camera can be anywhere.
-_FORGOTTEN = 3
+# The gate is wider by this factor times the largest of the recent deviations from the prediction.
+_DEVIATION_FACTOR, _RECENT = 2.0, 4
+# Deviations of a camera on a tripod are the noise of tracking: m and rad.
+_TRACKING_NOISE = np.array([0.003, np.radians(0.2)])
+# Weight of the newest motion in the exponential moving average of the velocity.
+_NEWEST_WEIGHT = 0.3
+# External odometry is compared with the velocity over this number of turns, at least half of them.
+_COMPARED_TURNS = 10
+# After more frames without a pose than these, without timestamps, nothing is predicted.
+_MAX_UNTIMED_GAP = 3
 
 
 @dataclass(frozen=True)
@@ -59,179 +60,195 @@ class Moment:
         return self.timestamp - before.timestamp if timed else None
 
 
-class Motion:
-    """The motion of a camera so far; poses are (4, 4) T_world_camera.
+class MotionModel:
+    """The velocity of a camera, estimated from its poses, (4, 4) T_world_camera, so far.
 
     Attributes
     ----------
-    is_guess
-        Whether the velocity is that of another component: what differs from it is no surprise.
+    velocity_is_inherited
+        Whether the velocity is that of the component before, so that deviations from it are not
+        counted.
     """
 
     def __init__(self) -> None:
-        self.is_guess = False
-        self._T: Float64 | None = None  # of the last frame with a pose
-        self._when: Moment | None = None
-        self._velocity: Float64 | None = None  # (6,) by the unit of time, while it is known
-        self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
+        self.velocity_is_inherited = False
+        self._T_last: Float64 | None = None  # of the last frame with a pose
+        self._last_time: Moment | None = None
+        self._velocity: Float64 | None = None  # (6,) twist per unit of time, while it is known
+        self._mean_velocity: Float64 | None = None  # (6,) its exponential moving average
         self._interval = 1.0  # between the last two frames with a pose
-        self._differences: deque[Float64] = deque(maxlen=_RECENT)
-        # (4, 4) of odometry beside the images, at the last frame and now; and by which angles it
-        # and the velocity failed to predict recent turns.
-        self._sensed_before: Float64 | None = None
-        self._sensed: Float64 | None = None
-        self._failed: deque[tuple[float, float]] = deque(maxlen=_PROOF)
+        self._deviations: deque[Float64] = deque(maxlen=_RECENT)
+        # (4, 4) poses of external odometry at the last frame and now; and the errors, in rad, of
+        # the recent turns as predicted by it and by the velocity.
+        self._T_odometry_before: Float64 | None = None
+        self._T_odometry_now: Float64 | None = None
+        self._turn_errors: deque[tuple[float, float]] = deque(maxlen=_COMPARED_TURNS)
 
-    def sense(self, T_odometry: Float64 | None) -> None:
-        """Take the pose (4, 4) that odometry gives the coming frame, in any fixed frame."""
-        self._sensed = T_odometry
+    def set_odometry(self, T_odometry: Float64 | None) -> None:
+        """Set the pose (4, 4) of the coming frame by external odometry, in any fixed frame."""
+        self._T_odometry_now = T_odometry
 
-    def expected(self, now: Moment) -> Float64 | None:
-        """Pose if the last motion goes on; None if it is not known.
+    def predicted_pose(self, now: Moment) -> Float64 | None:
+        """Return the pose at constant velocity; None while the velocity is unknown.
 
-        Turned as odometry says, if it has predicted recent turns better than the velocity did.
+        The rotation is that of external odometry, if it has predicted recent turns better than the
+        velocity did.
         """
-        T = self._onward(self._velocity, now)
-        if not self._odometry_is_proven():
+        T = self._extrapolated(self._velocity, now)
+        if not self._trusts_odometry():
             return T
-        sensed = self._as_sensed(self._T if T is None else T)
-        return T if sensed is None else sensed
+        T_rotated = self._rotated_by_odometry(self._T_last if T is None else T)
+        return T if T_rotated is None else T_rotated
 
-    def steadily(self, now: Moment) -> Float64 | None:
-        """Pose if the mean motion of some frames goes on; None if it is not known.
+    def odometry_pose(self) -> Float64 | None:
+        """Return the last pose moved as by external odometry; None without odometry."""
+        T, before, now = self._T_last, self._T_odometry_before, self._T_odometry_now
+        if T is None or before is None or now is None:
+            return None
+        return np.asarray(T @ se3.inverse(before) @ now, np.float64)
 
-        Where a direction is degenerate for many frames, the camera goes on there by what is
-        expected, and the noise of one motion would add up.
+    def smoothed_pose(self, now: Moment) -> Float64 | None:
+        """Return the pose at the mean velocity of recent frames; None while it is unknown.
+
+        Where a direction is degenerate for many frames, only the prediction moves the camera
+        along it, and the noise of single motions would accumulate.
         """
-        return self._onward(self._steady, now)
+        return self._extrapolated(self._mean_velocity, now)
 
-    def allowed(self, now: Moment) -> Float64:
-        """What a pose may differ from the expected one, m and rad; infinite if none is expected."""
-        if self._T is None or self._when is None or self._velocity is None:
+    def gate(self, now: Moment) -> Float64:
+        """Return by how much a pose may deviate from the predicted one, (2,), m and rad.
+
+        Infinite without a prediction.
+        """
+        if self._T_last is None or self._last_time is None or self._velocity is None:
             return np.full(2, np.inf)
-        elapsed = now.since(self._when) / self._interval
-        if self._differences or self.is_guess:
-            usual = np.max([np.zeros(2), *self._differences], axis=0)
+        elapsed = now.since(self._last_time) / self._interval
+        if self._deviations or self.velocity_is_inherited:
+            usual = np.max([np.zeros(2), *self._deviations], axis=0)
         else:
-            usual = _apart(self._T, retract(self._T, self._velocity * self._interval))
-        seconds = now.seconds_since(self._when)
+            T_next = retract(self._T_last, self._velocity * self._interval)
+            usual = _distance_and_angle(self._T_last, T_next)
+        seconds = now.seconds_since(self._last_time)
         if seconds is None:
-            if elapsed > _FORGOTTEN:
+            if elapsed > _MAX_UNTIMED_GAP:
                 return np.full(2, np.inf)
-            floor = FLOOR * max(elapsed, 1.0)
+            minimum = GATE * max(elapsed, 1.0)
         else:
-            floor = FLOOR * min(max((seconds / _SECONDS) ** 2, 1.0), _FARTHEST)
-        return np.asarray(floor + _TIMES * usual * max(elapsed, 1.0), np.float64)
+            minimum = GATE * min(max((seconds / _GATE_SECONDS) ** 2, 1.0), _MAX_GATE_SCALE)
+        return np.asarray(minimum + _DEVIATION_FACTOR * usual * max(elapsed, 1.0), np.float64)
 
-    def surprise(self, T: Float64, now: Moment) -> str:
-        """How a pose differs from what was expected, in words; empty if that is nothing unusual."""
-        expected = self.expected(now)
-        if expected is None:
+    def gate_violation(self, T: Float64, now: Moment) -> str:
+        """Describe by how much a pose outside of the gate deviates; empty for one inside."""
+        T_predicted = self.predicted_pose(now)
+        if T_predicted is None:
             return ""
-        difference = _apart(expected, T)
-        if (difference <= self.allowed(now)).all():
+        deviation = _distance_and_angle(T_predicted, T)
+        if (deviation <= self.gate(now)).all():
             return ""
         return (
-            f"{difference[0]:.2f} m and {np.degrees(difference[1]):.0f} degrees from the predicted "
+            f"{deviation[0]:.2f} m and {np.degrees(deviation[1]):.0f} degrees from the predicted "
             "pose"
         )
 
-    def is_possible(self, T: Float64, now: Moment) -> bool:
-        """Whether a hand can have moved the camera to a pose since the last frame."""
-        if self._T is None or self._when is None:
+    def is_feasible(self, T: Float64, now: Moment) -> bool:
+        """Whether a handheld camera can have moved to a pose since the last frame."""
+        if self._T_last is None or self._last_time is None:
             return True
-        seconds = now.seconds_since(self._when)
-        far = FLOOR + HANDHELD * (1.0 if seconds is None else seconds)
-        return bool((_apart(self._T, T) <= far).all())
+        seconds = now.seconds_since(self._last_time)
+        limit = GATE + HANDHELD * (1.0 if seconds is None else seconds)
+        return bool((_distance_and_angle(self._T_last, T) <= limit).all())
 
-    def deviation(self, T: Float64, now: Moment) -> float:
-        """Distance of a pose from the expected one, in multiples of what recent ones had.
+    def normalised_deviation(self, T: Float64, now: Moment) -> float:
+        """Return the deviation from the predicted pose as a multiple of the largest recent one.
 
-        0 where nothing is expected.
+        0 without a prediction.
         """
-        expected = self.expected(now)
-        if expected is None or not self._differences:
+        T_predicted = self.predicted_pose(now)
+        if T_predicted is None or not self._deviations:
             return 0.0
-        usual = np.maximum(np.max(self._differences, axis=0), _STILL)
-        return float(np.max(_apart(expected, T) / usual))
+        usual = np.maximum(np.max(self._deviations, axis=0), _TRACKING_NOISE)
+        return float(np.max(_distance_and_angle(T_predicted, T) / usual))
 
-    def _as_sensed(self, T: Float64 | None) -> Float64 | None:
-        """A pose (4, 4), turned since the last frame as odometry says; None where it is silent."""
-        if T is None or self._T is None or self._sensed is None or self._sensed_before is None:
+    def _rotated_by_odometry(self, T: Float64 | None) -> Float64 | None:
+        """Replace the rotation of a pose (4, 4) by that of external odometry; None without it."""
+        before, now = self._T_odometry_before, self._T_odometry_now
+        if T is None or self._T_last is None or before is None or now is None:
             return None
         out = T.copy()
-        turn = self._sensed_before[:3, :3].T @ self._sensed[:3, :3]
-        out[:3, :3] = self._T[:3, :3] @ turn
+        out[:3, :3] = self._T_last[:3, :3] @ (before[:3, :3].T @ now[:3, :3])
         return out
 
-    def _odometry_is_proven(self) -> bool:
-        if len(self._failed) < _PROOF // 2:
+    def _trusts_odometry(self) -> bool:
+        if len(self._turn_errors) < _COMPARED_TURNS // 2:
             return False
-        odometry, velocity = np.median(self._failed, axis=0)
+        odometry, velocity = np.median(self._turn_errors, axis=0)
         return bool(odometry < velocity)
 
-    def _compare_odometry(self, T: Float64, now: Moment) -> None:
-        """Take note of how well odometry and velocity predicted a turn."""
-        sensed, onward = self._as_sensed(T), self._onward(self._velocity, now)
-        if sensed is not None and onward is not None:
-            self._failed.append((float(_apart(sensed, T)[1]), float(_apart(onward, T)[1])))
+    def _record_turn_errors(self, T: Float64, now: Moment) -> None:
+        """Record how well odometry and velocity predicted a turn."""
+        T_odometry = self._rotated_by_odometry(T)
+        T_velocity = self._extrapolated(self._velocity, now)
+        if T_odometry is not None and T_velocity is not None:
+            _, by_odometry = _distance_and_angle(T_odometry, T)
+            _, by_velocity = _distance_and_angle(T_velocity, T)
+            self._turn_errors.append((float(by_odometry), float(by_velocity)))
 
-    def follow(self, T: Float64, now: Moment) -> None:
-        """Take the pose of the next frame."""
-        self._compare_odometry(T, now)
-        self._move(T, now)
-        self._sensed_before, self._sensed = self._sensed, None
+    def update(self, T: Float64, now: Moment) -> None:
+        """Update the velocity with the pose of the next frame."""
+        self._record_turn_errors(T, now)
+        self._update_velocity(T, now)
+        self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
 
-    def _move(self, T: Float64, now: Moment) -> None:
-        if self._T is None or self._when is None:
-            self._T, self._when = T, now
+    def _update_velocity(self, T: Float64, now: Moment) -> None:
+        if self._T_last is None or self._last_time is None:
+            self._T_last, self._last_time = T, now
             return
-        elapsed = now.since(self._when)
-        expected = self.expected(now)
-        if expected is not None:
-            difference = _apart(expected, T)
-            if not self.is_guess and (difference <= self.allowed(now)).all():
-                self._differences.append(difference * min(self._interval / elapsed, 1.0))
-        velocity = twist_between(self._T, T) / elapsed
-        mean = velocity if self._steady is None else self._steady
+        elapsed = now.since(self._last_time)
+        T_predicted = self.predicted_pose(now)
+        if T_predicted is not None:
+            deviation = _distance_and_angle(T_predicted, T)
+            if not self.velocity_is_inherited and (deviation <= self.gate(now)).all():
+                self._deviations.append(deviation * min(self._interval / elapsed, 1.0))
+        velocity = twist_between(self._T_last, T) / elapsed
+        mean = velocity if self._mean_velocity is None else self._mean_velocity
         off = (velocity - mean) * elapsed
-        # A jump hardly counts: the camera does not go on jumping.
-        far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
-        self._steady = mean + _NEWEST / far * (velocity - mean)
+        # Jumps are down-weighted: they do not continue.
+        excess = max(np.linalg.norm(off[:3]) / GATE[0], np.linalg.norm(off[3:]) / GATE[1], 1.0)
+        self._mean_velocity = mean + _NEWEST_WEIGHT / excess * (velocity - mean)
         self._velocity, self._interval = velocity, elapsed
-        self._T, self._when, self.is_guess = T, now, False
+        self._T_last, self._last_time, self.velocity_is_inherited = T, now, False
 
-    def jump(self, T: Float64, now: Moment) -> None:
-        """Take the pose of the next frame, but not the motion to it, which does not go on."""
-        self._T, self._when = T, now
-        self._sensed_before, self._sensed = self._sensed, None
+    def restart_at(self, T: Float64, now: Moment) -> None:
+        """Continue from the pose of the next frame at the same velocity: the motion was a jump."""
+        self._T_last, self._last_time = T, now
+        self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
 
-    def restart(self) -> None:
-        """Say that the next pose is in another frame of reference.
+    def change_frame(self) -> None:
+        """Expect the next pose in another frame of reference.
 
-        The velocity is still the best guess, unless it was but a guess itself.
+        The velocity is inherited, unless it already was.
         """
-        if self.is_guess or self._velocity is None:
+        if self.velocity_is_inherited or self._velocity is None:
             self.interrupt()
-        self._T = self._when = None
-        self.is_guess = self._velocity is not None
-        self._differences.clear()
+        self._T_last = self._last_time = None
+        self.velocity_is_inherited = self._velocity is not None
+        self._deviations.clear()
 
     def interrupt(self) -> None:
-        """Say that the camera may be anywhere by the next frame."""
-        self._velocity = self._steady = self._T = self._when = None
-        self.is_guess = False
-        self._differences.clear()
+        """Forget the motion: the next pose can be anywhere."""
+        self._velocity = self._mean_velocity = self._T_last = self._last_time = None
+        self.velocity_is_inherited = False
+        self._deviations.clear()
 
-    def _onward(self, velocity: Float64 | None, now: Moment) -> Float64 | None:
-        if self._T is None or self._when is None or velocity is None:
+    def _extrapolated(self, velocity: Float64 | None, now: Moment) -> Float64 | None:
+        if self._T_last is None or self._last_time is None or velocity is None:
             return None
-        return retract(self._T, velocity * now.since(self._when))
+        return retract(self._T_last, velocity * now.since(self._last_time))
 
 
 def is_small(T: Float64) -> bool:
-    """Whether a motion (4, 4) is one that needs no explanation."""
-    return bool((_apart(np.eye(4), T) <= FLOOR).all())
+    """Whether a motion (4, 4) is within the smallest gate, and plausible without a prediction."""
+    return bool((_distance_and_angle(np.eye(4), T) <= GATE).all())
 
 
 def jumps(
@@ -239,28 +256,34 @@ def jumps(
     moments: Sequence[Moment],
     interruptions: Collection[int] = (),
 ) -> list[tuple[int, str]]:
-    """Positions of poses (4, 4) that the motion before does not lead to, and how far off they are.
+    """Return the positions of poses outside of the gate, and descriptions of their deviations.
 
-    None is a frame without a pose; `moments` say when each was taken; `interruptions` are positions
-    to which no motion leads: where a recording or a component begins, or where the motion before
-    was not measured.
+    Parameters
+    ----------
+    poses
+        (4, 4) T_world_camera each; None for a frame without a pose.
+    moments
+        When each frame was taken.
+    interruptions
+        Positions at which no motion is predicted: where a recording or a component begins, or where
+        the motion before was not measured.
     """
-    motion = Motion()
+    motion = MotionModel()
     found = []
     for k, (T, now) in enumerate(zip(poses, moments, strict=True)):
         if k in interruptions:
             motion.interrupt()
         if T is None:
             continue
-        words = motion.surprise(T, now)
-        if words:
-            found.append((k, words))
-            motion.jump(T, now)
+        violation = motion.gate_violation(T, now)
+        if violation:
+            found.append((k, violation))
+            motion.restart_at(T, now)
         else:
-            motion.follow(T, now)
+            motion.update(T, now)
     return found
 
 
-def _apart(A: Float64, B: Float64) -> Float64:
-    """Distance in m and angle in rad of the motion from one pose (4, 4) to another."""
+def _distance_and_angle(A: Float64, B: Float64) -> Float64:
+    """Return the distance, m, and the angle, rad, between two poses (4, 4), as (2,)."""
     return np.array(distance_and_angle(A, B))

@@ -1,17 +1,19 @@
-"""Odometry of views far apart: each is registered to an earlier one, as far as that is believed."""
+"""Odometry of views far apart: each is registered to an earlier one, if the pose is believed."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Odometry, Step, Tracker
-from tofuse.odometry.motion import Moment, Motion
+from tofuse.odometry.motion import Moment, MotionModel
 from tofuse.odometry.sequential import SEED_STAGE
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
@@ -21,49 +23,41 @@ from tofuse.registration.confidence import CERTAIN
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.reduce import extent
 
-# The motion is followed without a search once it has predicted the results of so many of the last
-# searches, of which one more is looked at.
-_PROVEN = 2
-# Poses that differ by this share of the extent are the same.
-_SAME = 0.03
+# The prediction replaces the search once it has agreed with 2 of the last 3 searches.
+_MIN_CONFIRMED = 2
+# Poses that differ by less than this fraction of the extent are the same.
+_SAME_POSE = 0.03
 
 
 @part("odometry", "pairwise")
 @dataclass(frozen=True)
-class Pairwise(Odometry):
+class Pairwise(Bounded, Odometry):
     """Registers each view to the one before; where that is not believed, to earlier ones.
 
-    Once the motion has led to where searches ended, it is followed without a search, as far as the
-    views agree there; along degenerate directions it goes on. In views in no order, or far apart,
-    it does not, and each pair is searched.
+    Once the predicted motion has agreed with searches, it replaces them as long as the views agree
+    there; degenerate directions follow the motion. For unordered views, or views far apart, each
+    pair is searched.
 
     A view whose best pose is not believed, but more probable than not, keeps it and is marked as
-    doubtful. Else it begins a component of its own; registrations to views of other components that
-    are believed become links.
+    doubtful. Else it begins a component of its own; believed registrations to views of other
+    components become links.
 
     Attributes
     ----------
     registration
-        Registers one pair, and says whether the pose is to be believed.
+        Registers one pair, and states whether the pose is believed.
     references
-        Earlier views that a view is registered to at most, the last one first.
+        Maximum number of earlier views that a view is registered to, the last one first.
     minimum_points
         Points that a view must have.
     probable
-        Least probability of a pose that is not believed, but kept.
+        Minimum probability of a pose that is not believed, but kept.
     """
 
     registration: AnyPair = field(default_factory=AnyPair)
-    references: int = 6
-    minimum_points: int = 10
-    probable: float = PROBABLE
-
-    def __post_init__(self) -> None:
-        for name in ("references", "minimum_points"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-        if not 0 <= self.probable <= 1:
-            raise ValueError(f"probable is {self.probable}, not 0 to 1")
+    references: Annotated[int, Bounds(1)] = 6
+    minimum_points: Annotated[int, Bounds(1)] = 10
+    probable: Annotated[float, Bounds(0, 1)] = PROBABLE
 
     @property
     def takes(self) -> frozenset[str]:
@@ -91,57 +85,64 @@ class _PairwiseTracker(Tracker):
         self._placed: deque[_Placed] = deque(maxlen=options.references)
         self._component = -1
         self._connected = True  # whether links join the component to an earlier one
-        self._motion = Motion()
-        self._degenerate = False  # whether the last motion was, in some direction
-        self._following = replace(options.registration, search=False)
-        # Whether what the motion led to was what a search found, in the last few views.
-        self._steady: deque[bool] = deque(maxlen=_PROVEN + 1)
+        self._motion = MotionModel()
+        self._degenerate = False  # whether some direction of the last motion was degenerate
+        self._local_registration = replace(options.registration, search=False)
+        # Whether predicted poses of the last views agreed with searches.
+        self._motion_confirmed: deque[bool] = deque(maxlen=_MIN_CONFIRMED + 1)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
         self._motion.interrupt()
-        self._steady.clear()
+        self._motion_confirmed.clear()
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
-        least = self._options.minimum_points
-        if len(frame) < least:
+        minimum = self._options.minimum_points
+        if len(frame) < minimum:
             self._motion.interrupt()
-            return Step("lost", f"{len(frame)} valid points, {least} are needed", None)
+            return Step("lost", f"{len(frame)} valid points, {minimum} are needed", None)
         own = [p for p in reversed(self._placed) if p.component == self._component]
-        near = self._followed(frame, own[0]) if own else None
-        steady = sum(self._steady) >= _PROVEN
-        if steady and near is not None and near.needs_no_search:
-            return self._follow(frame, near)
+        local = self._by_prediction(frame, own[0]) if own else None
+        confirmed = sum(self._motion_confirmed) >= _MIN_CONFIRMED
+        if confirmed and local is not None and local.needs_no_search:
+            return self._continue_component(frame, local)
         doubtful: list[_Registered] = []
-        for each in own:
-            found = self._searched(frame, each)
-            if found is not None and found.believed:
-                if each is own[0]:
-                    self._steady.append(near is not None and near.agrees(found, frame.points))
-                return self._follow(frame, found)
-            if found is not None:
-                doubtful.append(found)
+        for earlier in own:
+            registered = self._by_search(frame, earlier)
+            if registered is not None and registered.believed:
+                if earlier is own[0]:
+                    self._motion_confirmed.append(
+                        local is not None and local.agrees(registered, frame.points)
+                    )
+                return self._continue_component(frame, registered)
+            if registered is not None:
+                doubtful.append(registered)
         links = self._links(frame)
-        # The latest views share most with this one.
+        # The latest views overlap most with this one.
         probable = [r for r in doubtful if r.probability >= self._options.probable]
         if probable and not links:
-            return self._follow(frame, probable[0])
-        return self._begin(frame, links, doubtful[0] if doubtful else None)
+            return self._continue_component(frame, probable[0])
+        return self._begin_component(frame, links, doubtful[0] if doubtful else None)
 
-    def _followed(self, frame: Frame, last: _Placed) -> _Registered | None:
-        """Register to the last view from where the motion so far leads to.
+    def _by_prediction(self, frame: Frame, last: _Placed) -> _Registered | None:
+        """Register to the last view from the predicted pose.
 
-        In a direction that is degenerate for many views, the noise of one motion would add up.
+        Along a direction that is degenerate for many views, the noise of single motions would
+        accumulate.
         """
         now = _moment(frame)
-        T = self._motion.steadily(now) if self._degenerate else self._motion.expected(now)
+        T = (
+            self._motion.smoothed_pose(now)
+            if self._degenerate
+            else self._motion.predicted_pose(now)
+        )
         guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
-        return self._registered(frame, last, guess, self._following)
+        return self._registered(frame, last, guess, self._local_registration)
 
-    def _searched(self, frame: Frame, to: _Placed) -> _Registered | None:
+    def _by_search(self, frame: Frame, to: _Placed) -> _Registered | None:
         """Register to an earlier view, wherever it is."""
         return self._registered(frame, to, None, self._options.registration)
 
@@ -154,41 +155,42 @@ class _PairwiseTracker(Tracker):
         except RegistrationError:
             return None
 
-    def _follow(self, frame: Frame, found: _Registered) -> Step:
-        """Take the pose that a registration gives in the present component."""
-        to, made = found.to, found.registration
-        T = se3.orthonormalise(to.T_component_view @ made.T_target_source)
-        self._motion.follow(T, _moment(frame))
-        self._degenerate = len(made.unobservable) > 0
+    def _continue_component(self, frame: Frame, registered: _Registered) -> Step:
+        """Take the pose of a registration to a view of the present component."""
+        to, registration = registered.to, registered.registration
+        T = se3.orthonormalise(to.T_component_view @ registration.T_target_source)
+        self._motion.update(T, _moment(frame))
+        self._degenerate = len(registration.unobservable) > 0
         links = () if self._connected else self._links(frame)
         self._connected |= bool(links)
         self._placed.append(_Placed(frame, T, self._component))
         return Step(
             "tracked",
-            "" if found.believed else made.reason,
+            "" if registered.believed else registration.reason,
             T,
             to.frame.index,
-            made,
+            registration,
             component=self._component,
             links=links,
-            doubtful=not found.believed,
+            doubtful=not registered.believed,
         )
 
-    def _begin(self, frame: Frame, links: tuple[Link, ...], refused: _Registered | None) -> Step:
-        """Begin a component."""
+    def _begin_component(
+        self, frame: Frame, links: tuple[Link, ...], refused: _Registered | None
+    ) -> Step:
         self._component += 1
         self._connected = self._component == 0 or bool(links)
         self._motion.interrupt()
-        self._motion.follow(np.eye(4), _moment(frame))
+        self._motion.update(np.eye(4), _moment(frame))
         self._placed.append(_Placed(frame, np.eye(4), self._component))
         reason = "" if refused is None else f"not connected: {refused.registration.reason}"
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
     def _links(self, frame: Frame) -> tuple[Link, ...]:
-        """The registration to the last view of another component, if it is believed."""
+        """Return the registration to the last view of another component, if it is believed."""
         others = [p for p in self._placed if p.component != self._component]
-        found = self._searched(frame, others[-1]) if others else None
-        return (found.link(frame),) if found is not None and found.believed else ()
+        registered = self._by_search(frame, others[-1]) if others else None
+        return (registered.link(frame),) if registered is not None and registered.believed else ()
 
 
 def _moment(frame: Frame) -> Moment:
@@ -208,21 +210,21 @@ class _Registered:
 
     @property
     def needs_no_search(self) -> bool:
-        """Whether a pose that was followed is certain, or the best that a search could say."""
-        sure = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
-        return self.believed and sure
+        """Whether a pose is believed and either certain or degenerate, so that no search helps."""
+        certain = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
+        return self.believed and certain
 
     def agrees(self, other: _Registered, points: Float32) -> bool:
-        """Whether both take points (n, 3) to the same place, as far as their extent tells."""
+        """Whether both map points (n, 3) to the same place, relative to their extent."""
         ours, theirs = (r.registration.T_target_source for r in (self, other))
         gap = se3.transform(ours, points) - se3.transform(theirs, points)
         rms = np.sqrt((gap**2).sum(1).mean())
-        return bool(rms <= _SAME * extent(points))
+        return bool(rms <= _SAME_POSE * extent(points))
 
     @property
     def probability(self) -> float:
         return self.registration.probability or 0.0
 
     def link(self, frame: Frame) -> Link:
-        made = self.registration
-        return Link(self.to.frame.index, frame.index, made, self.believed, made.how)
+        r = self.registration
+        return Link(self.to.frame.index, frame.index, r, self.believed, r.how)

@@ -1,4 +1,4 @@
-"""Finding a lost camera again among earlier keyframes, within a budget of searches."""
+"""Relocalization: global registration to earlier keyframes, within a budget of searches."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit, comparable
 from tofuse.registration.view_pair import register_pair
 
-# A search costs about as much as tracking so many frames. With one search for so many frames, being
-# lost costs no more than tracking does; some are free, as short recordings may be all large steps.
-_FRAMES_PER_SEARCH, _FREE = 40, 24
+# A search costs about as much as tracking 40 frames. With one per 40 frames, a lost camera costs no
+# more than a tracked one; some are free, as short recordings may consist of large steps.
+_FRAMES_PER_SEARCH, _FREE_SEARCHES = 40, 24
 
 
 class Relocalizer:
-    """Searches a view in the newest keyframe and in the one that looks most like it.
+    """Registers a view to the newest keyframe and to the most similar one, without a guess.
 
     The budget counts frames, not seconds, so that every machine makes the same searches.
 
     Parameters
     ----------
     search
-        How far and how finely is searched; None never searches.
+        Extent and resolution of the search; None never searches.
     usual
         How views of this camera usually fit.
     """
 
     def __init__(self, search: SearchOptions | None, usual: UsualFit) -> None:
         self._search, self._usual = search, usual
-        self._left = float(_FREE)
-        # Registrations of the last view, as several of its explanations ask for the same pair.
-        self._known: dict[tuple[int, int], Registration | None] = {}
+        self._budget = float(_FREE_SEARCHES)
+        # Registrations of the last view, as several hypotheses need the same pair.
+        self._cache: dict[tuple[int, int], Registration | None] = {}
 
     def count_frame(self) -> None:
-        """Say that a frame was processed, which adds to the budget."""
-        self._left += 1 / _FRAMES_PER_SEARCH
+        """Add a processed frame to the budget."""
+        self._budget += 1 / _FRAMES_PER_SEARCH
 
     def links(
         self,
@@ -45,55 +45,63 @@ class Relocalizer:
         component: int,
         last: int | None = None,
     ) -> tuple[Link, ...]:
-        """Register a view of a component to keyframes of others; stops at a link that is certain.
+        """Register a view to keyframes of other components, up to the first certain link.
 
-        `last` is the frame just before the view, if it has a pose.
+        Parameters
+        ----------
+        view, component
+            The view and the number of its component.
+        keyframes
+            All keyframes.
+        last
+            Index of the frame just before the view, if it has a pose.
         """
         candidates: list[Keyframe] = []
         if len(keyframes) and keyframes.newest.component != component:
             candidates.append(keyframes.newest)
-        alike = keyframes.alike(view, component)
-        if alike is not None and alike not in candidates:
-            candidates.append(alike)
-        found = []
+        similar = keyframes.most_similar(view, component)
+        if similar is not None and similar not in candidates:
+            candidates.append(similar)
+        links = []
         for keyframe in candidates:
             link = self.link(view, keyframe, adjacent=keyframe.view.index == last)
             if link is not None:
-                found.append(link)
+                links.append(link)
                 if link.certain:
                     break
-        return tuple(found)
+        return tuple(links)
 
     def link(self, view: PreparedView, keyframe: Keyframe, *, adjacent: bool) -> Link | None:
         """Register a view to a keyframe, if the budget allows and the pose is probable.
 
         Views that are adjacent in time see the same place, so that a probable pose is certain.
         """
-        found = self._probable(view, keyframe)
-        if found is None:
+        registration = self._probable(view, keyframe)
+        if registration is None:
             return None
-        certain = adjacent or found.stands_alone
-        return Link(keyframe.view.index, view.index, found, certain, found.how)
+        certain = adjacent or registration.stands_alone
+        return Link(keyframe.view.index, view.index, registration, certain, registration.how)
 
     def agrees(self, view: PreparedView, keyframe: Keyframe, T: Float64) -> bool | None:
-        """Whether a registration without a guess finds T_keyframe_camera; None if it finds none."""
-        found = self._probable(view, keyframe)
-        if found is None or self._search is None:
+        """Whether a search confirms T_keyframe_camera (4, 4); None if it finds no probable pose."""
+        registration = self._probable(view, keyframe)
+        if registration is None or self._search is None:
             return None
-        return not self._search.differ(found.T_target_source, T)
+        return not self._search.differ(registration.T_target_source, T)
 
     def _probable(self, view: PreparedView, keyframe: Keyframe) -> Registration | None:
-        """Register a view to a keyframe, if the budget allows; the same pair once."""
+        """Register a view to a keyframe, each pair once, if the budget allows."""
         pair = view.index, keyframe.view.index
-        if pair not in self._known:
-            if self._search is None or self._left < 1 or not comparable(view.depth, keyframe.depth):
+        if pair not in self._cache:
+            can_search = self._search is not None and self._budget >= 1
+            if not can_search or not comparable(view.depth, keyframe.depth):
                 return None
-            self._left -= 1
-            # Even where an alignment seems certain: a box looks alike from its other side.
-            found = register_pair(
+            self._budget -= 1
+            # Even where an alignment seems certain: a box looks the same from its other side.
+            registration = register_pair(
                 view, keyframe.view, usual=self._usual, options=self._search, always_search=True
             )
-            self._known = {p: r for p, r in self._known.items() if p[0] == view.index}
-            self._known[pair] = found
-        found = self._known[pair]
-        return found if found is not None and found.is_probable else None
+            self._cache = {p: r for p, r in self._cache.items() if p[0] == view.index}
+            self._cache[pair] = registration
+        registration = self._cache[pair]
+        return registration if registration is not None and registration.is_probable else None

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Odometry, Step, Tracker
@@ -19,18 +20,18 @@ from tofuse.registration.prepared_view import PreparedView
 
 Guess = Literal["identity", "previous", "odometry"]
 
-# Keeps the draws of odometry apart from those of other stages that register the same pair.
+# Seeds the random draws of odometry differently from other stages that register the same pair.
 SEED_STAGE = 1
 
 
 @part("odometry", "sequential", label="validated")
 @dataclass(frozen=True)
-class Sequential(Odometry):
+class Sequential(Bounded, Odometry):
     """Registers each frame to the last one that has a pose, and chains the motions.
 
     Eqs 3.1 and 3.2, ``t = R t_new + t`` and ``R = R R_new``, as matrices:
     ``T_world_current = T_world_previous T_previous_current``. The first frame with enough points
-    is the world.
+    defines the world frame.
 
     A frame is lost, without a pose, when it has too few points, when its registration fails, or
     when too few of its points correspond; the next is then registered to the last with a pose.
@@ -40,27 +41,20 @@ class Sequential(Odometry):
     registration
         Registers one pair.
     guess
-        Where a registration starts from (section 4.1): "identity"; "previous", the motion that
-        the preceding registration found (identity at first; a lost frame leaves it as it was);
-        "odometry", the motion between the poses of an odometry file (identity where either is
-        missing).
+        Initial guess of a registration (section 4.1): "identity"; "previous", the motion of the
+        preceding registration (identity at first; a lost frame does not change it); "odometry",
+        the motion between the poses of an odometry file (identity where either is missing).
     minimum_points
         Valid points that a frame must have.
     minimum_share
-        Smallest share of corresponding points, 0 to 1. The thesis has no such threshold for
-        neighbours; this one is low and only catches registrations that hold on to almost nothing.
+        Smallest inlier fraction, 0 to 1. The thesis has no such threshold for consecutive frames;
+        this one is low and only refuses registrations with hardly any correspondences.
     """
 
     registration: Registrar = field(default_factory=algorithm_1)
     guess: Guess = "identity"
-    minimum_points: int = 10
-    minimum_share: float = 0.02
-
-    def __post_init__(self) -> None:
-        if self.minimum_points < 1:
-            raise ValueError(f"minimum_points is {self.minimum_points}, not 1 or more")
-        if not 0 <= self.minimum_share <= 1:
-            raise ValueError(f"minimum_share is {self.minimum_share}, not 0 to 1")
+    minimum_points: Annotated[int, Bounds(1)] = 10
+    minimum_share: Annotated[float, Bounds(0, 1)] = 0.02
 
     @property
     def takes(self) -> frozenset[str]:
@@ -106,20 +100,20 @@ class _SequentialTracker(Tracker):
         guess = self._guess(last, T_odometry)
         rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, last.frame.index])
         try:
-            found = options.registration.register(frame, last.frame, guess, rng)
+            registration = options.registration.register(frame, last.frame, guess, rng)
         except RegistrationError as error:
             return _lost(f"not registered to frame {last.frame.index}: {error}", last)
-        if found.share < options.minimum_share:
+        if registration.share < options.minimum_share:
             return _lost(
-                f"only {found.share:.1%} of the points correspond to frame {last.frame.index}, "
-                f"{options.minimum_share:.1%} are needed",
+                f"only {registration.share:.1%} of the points correspond to frame "
+                f"{last.frame.index}, {options.minimum_share:.1%} are needed",
                 last,
             )
-        self._motion = found.T_target_source
-        # Long products drift away from rotations; the nearest one is taken at each step.
-        T_world_camera = se3.orthonormalise(last.T_world_camera @ found.T_target_source)
+        self._motion = registration.T_target_source
+        # Rounding accumulates in long products; each is projected onto the nearest rotation.
+        T_world_camera = se3.orthonormalise(last.T_world_camera @ registration.T_target_source)
         self._last = _Tracked(frame, T_world_camera, T_odometry)
-        return Step("tracked", "", T_world_camera, last.frame.index, found)
+        return Step("tracked", "", T_world_camera, last.frame.index, registration)
 
     def _guess(self, last: _Tracked, T_odometry: Float64 | None) -> Float64:
         if self._options.guess == "odometry":

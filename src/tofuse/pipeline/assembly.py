@@ -1,4 +1,4 @@
-"""The end of a run: components are joined, and each connected part is reconstructed."""
+"""Global stages of a run: join components, and reconstruct each connected part."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.backend import BackEnd
-from tofuse.pipeline.checkpoint import NotKept, Stages
+from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.components import numbered_components
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
@@ -24,14 +24,14 @@ from tofuse.results.types import Reconstruction
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Makes reconstructions of what was tracked and kept.
+    """Reconstructs tracked frames from stored observations.
 
     Attributes
     ----------
     observations
-        What was kept of the frames.
+        The store of observations.
     given
-        Loops known beforehand.
+        Given loops.
     """
 
     config: Config
@@ -46,19 +46,19 @@ class Assembly:
         """Join components, and reconstruct them: the main one last."""
         with threads(self.threads):
             groups = self._join(log, stages)
-            log, components = numbered_components(log, groups, self._alone)
+            log, components = numbered_components(log, groups, self._reconstruct_apart)
             poses = poses_in_world(log, groups[0].T_group_component)
             result = self._back_end(log, poses, groups[0].joins).run(stages, components)
         return replace(result, seed=self.seed, threads=self.threads)
 
     def graph(self, log: FrameLog, component: int, loops: Sequence[ClosedLoop]) -> PoseGraph:
-        """The graph of a component as it was tracked, with loops."""
+        """Return the pose graph of a component as tracked, with loops."""
         own = log.of_component(component)
         poses = poses_in_world(own, {component: np.eye(4)})
         return self._back_end(own, poses, ()).graph(loops)
 
     def _join(self, log: FrameLog, stages: Stages) -> list[Group]:
-        """Decide, now that everything was seen, which components are connected, and how."""
+        """Decide which components are connected, and how, from all views."""
         kept = stages.load("joining")
         if kept is not None:
             self.watch.seconds.update(kept[1])
@@ -71,11 +71,11 @@ class Assembly:
         stages.save("joining", (groups, dict(self.watch.seconds)))
         return groups
 
-    def _alone(
+    def _reconstruct_apart(
         self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
     ) -> Reconstruction:
-        """Make the model of a component that is not connected with the main one."""
-        result = self._back_end(log, poses, joins).run(NotKept(), ())
+        """Reconstruct a component that is not connected to the main one."""
+        result = self._back_end(log, poses, joins).run(NoCheckpoints(), ())
         return replace(result, seed=self.seed, threads=self.threads)
 
     def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
@@ -85,7 +85,7 @@ class Assembly:
             poses,
             joins,
             self.given,
-            self.observations.at_the_end(),
+            self.observations.for_back_end(),
             self.progress,
             self.watch,
         )

@@ -1,4 +1,4 @@
-"""From tracked frames in one frame of reference to a reconstruction."""
+"""The back end: from tracked frames in one coordinate frame to a reconstruction."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.fusion.pose_errors import with_pose_errors
 from tofuse.odometry.given import GivenPoses
-from tofuse.odometry.prediction import Prediction, runs, with_prediction
+from tofuse.odometry.prediction import Prediction, degenerate_runs, with_prediction
 from tofuse.parts import name_of
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.checks import Evidence, judge
@@ -44,34 +44,37 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 from tofuse.results.verdict import ranked
 
-# So many times loops of a long path are looked for again.
-_LOOKS = 2
+# Maximum number of repeated loop searches along a long trajectory.
+_MAX_SEARCHES = 2
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What the verdict looks at: without sensors beside the camera, but for how they led."""
+class VisualEvidence:
+    """The evidence of the images alone: a graph without external sensors.
+
+    `sequential` are the poses before loops closed, with external sensors.
+    """
 
     sequential: Float64
     optimisation: Optimisation
 
 
 @dataclass(frozen=True, eq=False)
-class Closed:
-    """What there is once loops are closed."""
+class Optimised:
+    """The result of closing loops and optimising."""
 
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
     told: SensorPriors
-    judged: Judged
+    visual: VisualEvidence
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """What there is once all views are refined."""
+    """The result of refining all views."""
 
     graph: PoseGraph
     refinement: Refinement
@@ -79,26 +82,32 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The model, and how it looked before poses moved; None where none did."""
+    """The model, and a cloud at the poses before they were optimised; None if none moved."""
 
     model: Model
     before: Cloud | None
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
-    """What a run keeps of its frames for the end.
+class BackEndInput:
+    """Stored observations of all frames.
 
     Attributes
     ----------
+    loops
+        The loop detector, which received every frame.
+    refiner
+        The refinement, which received every frame.
+    model
+        Stored views of the model.
     checks
         Images that are compared with each other at the final poses.
     depths
         Typical radial range of each posed frame, m, by index.
     ambiguity_m
-        Range after which the camera's phase repeats, if it is known.
+        Ambiguity range of the camera, if known.
     knows_errors
-        Whether registrations state errors that can be relied on; ICP's are too small.
+        Whether covariances of registrations are realistic; those of ICP are too small.
     views
         Prepared views, spaced by motion.
     """
@@ -118,12 +127,20 @@ class BackEnd:
 
     Parameters
     ----------
+    config
+        The configuration.
     log
-        What became of its frames.
+        The frames of the part.
     poses
-        (4, 4) T_world_camera by index of the frames that have one, the identity first.
+        (4, 4) T_world_camera by frame index, the identity first.
     joins
         Edges between components.
+    given
+        Given loops.
+    kept
+        Stored observations.
+    progress, watch
+        Receive stages and times.
     """
 
     def __init__(
@@ -133,7 +150,7 @@ class BackEnd:
         poses: dict[int, Float64],
         joins: Sequence[Join],
         given: Sequence[GivenLoop],
-        kept: Kept,
+        kept: BackEndInput,
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
@@ -146,35 +163,36 @@ class BackEnd:
         }
 
     def run(self, stages: Stages, components: tuple[Component, ...]) -> Reconstruction:
-        """Make the reconstruction; `stages` keeps what there is after each step."""
-        closed = self._staged(stages, "loops", self._close)
+        """Return the reconstruction; `stages` stores the result of each step."""
+        closed = self._staged(stages, "loops", self._close_loops)
         refined = self._staged(stages, "refinement", lambda: self._refine(closed))
         fused = self._staged(stages, "fusion", lambda: self._fuse(closed, refined))
         return self._judge(closed, refined, fused, components)
 
     def _staged(self, stages: Stages, name: str, work: Callable[[], T]) -> T:
-        """Do the work of a stage, unless a stopped job has done it; its time counts either way."""
-        kept = stages.load(name)
-        if kept is not None:
-            found: T = kept[0]
-            self._watch.seconds.update(kept[1])
-            return found
-        found = work()
+        """Return the result of a stage, stored by an interrupted job or computed now."""
+        stored = stages.load(name)
+        if stored is not None:
+            result: T = stored[0]
+            self._watch.seconds.update(stored[1])
+            return result
+        result = work()
         with self._watch.timing("keeping"):
-            stages.save(name, (found, dict(self._watch.seconds)))
-        return found
+            stages.save(name, (result, dict(self._watch.seconds)))
+        return result
 
-    def _close(self) -> Closed:
+    def _close_loops(self) -> Optimised:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
             tracked = self.graph(())
-            # Where the camera may be: the motion there need not be like that of other stretches.
-            wary = self.graph((), cautious=True) if self._unobservable else tracked
-            unsure = dict(zip(wary.ids.tolist(), pose_covariances(wary), strict=True))
-            loops = with_joins(self._kept.loops.finish(self._poses, unsure), self._joins)
-            loops = self._closed_again(loops)
+            # For the search, motion in degenerate directions may differ from that elsewhere.
+            cautious = self.graph((), cautious=True) if self._unobservable else tracked
+            covariances = dict(zip(cautious.ids.tolist(), pose_covariances(cautious), strict=True))
+            loops = with_joins(self._kept.loops.finish(self._poses, covariances), self._joins)
+            loops = self._search_loops_again(loops)
             graph = self.graph(loops)
-        sequential = led = graph.poses
+        # Without loops: with and without external sensors.
+        sequential = guided = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
         told = measure_all(self._config.outside, sensed, tracked)
         graph = with_sensors(graph, told)
@@ -183,26 +201,26 @@ class BackEnd:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation = self._config.optimiser.optimise(graph)
-                if told and graph.loop.any():  # what loops are to be compared with
-                    alone = with_sensors(tracked, told)
-                    led = self._config.optimiser.optimise(alone).graph.poses
-            loops = _decided(loops, optimisation)
+                if told and graph.loop.any():  # the poses that loops are compared with
+                    without_loops = with_sensors(tracked, told)
+                    guided = self._config.optimiser.optimise(without_loops).graph.poses
+            loops = _without_rejected(loops, optimisation)
             optimisation = accepted_only(optimisation)
         graph = optimisation.graph
-        judged = Judged(led, optimisation)
+        visual = VisualEvidence(guided, optimisation)
         if told:
-            # The verdict stays with what was seen: no file beside the images makes it better.
-            seen = self.graph(loops).with_poses(graph.poses)
-            judged = Judged(led, replace(optimisation, graph=seen))
-        return Closed(loops, sequential, optimisation, told, judged)
+            # The verdict rests on the images alone: external sensors can't improve it.
+            images_only = self.graph(loops).with_poses(graph.poses)
+            visual = VisualEvidence(guided, replace(optimisation, graph=images_only))
+        return Optimised(loops, sequential, optimisation, told, visual)
 
-    def _closed_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
-        """Look for loops again where those that were found move views that others are between.
+    def _search_loops_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
+        """Search loops again once those found have corrected the poses in between.
 
-        A long path drifts by more than a loop may be off, and is right in its middle once its ends
-        are joined.
+        Along a long trajectory the drift exceeds the search range of loops; its middle is right
+        once the ends are joined.
         """
-        for _ in range(_LOOKS if self._kept.loops.many else 0):
+        for _ in range(_MAX_SEARCHES if self._kept.loops.many else 0):
             graph = self.graph(loops)
             if not graph.loop.any():
                 break
@@ -210,11 +228,11 @@ class BackEnd:
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
             if not self._kept.loops.look_again(poses):
                 break
-            unsure = dict(zip(graph.ids.tolist(), pose_covariances(graph), strict=True))
-            loops = with_joins(self._kept.loops.finish(poses, unsure), self._joins)
+            covariances = dict(zip(graph.ids.tolist(), pose_covariances(graph), strict=True))
+            loops = with_joins(self._kept.loops.finish(poses, covariances), self._joins)
         return loops
 
-    def _refine(self, closed: Closed) -> Refined:
+    def _refine(self, closed: Optimised) -> Refined:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
@@ -223,7 +241,7 @@ class BackEnd:
                 graph = with_sensors(self.graph(closed.loops, refinement), closed.told)
         return Refined(graph, refinement)
 
-    def _fuse(self, closed: Closed, refined: Refined) -> Fused:
+    def _fuse(self, closed: Optimised, refined: Refined) -> Fused:
         graph, refinement, model = refined.graph, refined.refinement, self._kept.model
         moved = bool(graph.loop.any()) or refinement.kept or bool(closed.told)
         self._progress.stage("fusing", model.views)
@@ -239,7 +257,7 @@ class BackEnd:
 
     def _judge(
         self,
-        closed: Closed,
+        closed: Optimised,
         refined: Refined,
         fused: Fused,
         components: tuple[Component, ...],
@@ -258,8 +276,8 @@ class BackEnd:
                 records,
                 tuple(e.step.registration if e.step is not None else None for e in log.entries),
                 loops,
-                closed.judged.sequential if self._tracks else graph.poses,
-                closed.judged.optimisation,
+                closed.visual.sequential if self._tracks else graph.poses,
+                closed.visual.optimisation,
                 cross_view,
                 accuracy,
                 model.cloud.diagonal_m,
@@ -288,7 +306,7 @@ class BackEnd:
             mesh=model.mesh,
             diagnostics=Diagnostics(
                 verdict,
-                ranked([*reasons, *self._about_corrections(), *self._about_surface(model)]),
+                ranked([*reasons, *self._correction_reasons(), *self._surface_reasons(model)]),
                 records,
                 loops,
                 self._scatter(closed.sequential),
@@ -317,18 +335,25 @@ class BackEnd:
         *,
         cautious: bool = False,
     ) -> PoseGraph:
-        """The graph as it was tracked and joined, or with what the refinement measured instead.
+        """Return the pose graph as tracked and joined, or with the edges of the refinement.
 
-        If `cautious`, motion in degenerate directions is taken to be lost as fast as it ever is.
+        Parameters
+        ----------
+        loops
+            Closed loops to include.
+        refined
+            Replaces poses and edges of the views that it refined.
+        cautious
+            Whether the error of predicted motion grows at the largest rate (`at_worst`).
         """
         ids = [e.record.index for e in self._posed]
         tracked = np.array([self._poses[index] for index in ids])
         poses = tracked if refined is None else refined.poses
-        again = () if refined is None else refined.edges
-        replaced = {index for edge in again for index in (edge.i, edge.j)}
+        refined_edges = () if refined is None else refined.edges
+        replaced = {index for edge in refined_edges for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
         unobservable = [e.record.unobservable for e in self._posed]
-        run = runs(unobservable)
+        run = degenerate_runs(unobservable)
         prediction = Prediction.of(tracked, unobservable) if run.any() else None
         if prediction is not None and cautious:
             prediction = prediction.at_worst()
@@ -342,7 +367,7 @@ class BackEnd:
             if {step.reference, index} <= replaced:
                 continue
             r = step.registration
-            # Over longer intervals than usual errors of a prediction grow with the time squared.
+            # Over longer intervals than usual the prediction error grows with the time squared.
             frames = abs(place[index] - place[step.reference])
             elapsed = abs(times[index] - times[step.reference])
             longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
@@ -362,45 +387,46 @@ class BackEnd:
             for c in loops
             if c.T_i_j is not None and c.information is not None
         ]
-        return build_graph(ids, poses, [*sequence, *needed, *again], closing)
+        return build_graph(ids, poses, [*sequence, *needed, *refined_edges], closing)
 
     def _accuracy(
         self,
-        closed: Closed,
+        closed: Optimised,
         refined: Refined,
         model: Model,
         cross_view: CrossViewConsistency | None,
     ) -> tuple[Accuracy, Float64]:
-        """How far off the final poses may be, and their covariances (P, 6, 6).
+        """Return the accuracy of the final poses, and their covariances (P, 6, 6).
 
-        Not assessed where registrations don't know their errors.
+        Not assessed if covariances of registrations are unrealistic.
         """
         if not self._kept.knows_errors:
             return Accuracy(), pose_covariances(closed.optimisation.graph)
         refinement = refined.refinement
-        graph = seen = self._measured(refined.graph, refinement)
-        if closed.told:  # as the verdict, the accuracy stays with what was seen
-            alone = closed.judged.optimisation.graph
+        graph = images_only = self._measured(refined.graph, refinement)
+        if closed.told:  # like the verdict, the accuracy rests on the images alone
+            without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
-                alone = self.graph(closed.loops, refinement)
-            seen = self._measured(alone, refinement)
+                without_sensors = self.graph(closed.loops, refinement)
+            images_only = self._measured(without_sensors, refinement)
         moved = 0.0, 0.0
-        if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
+        if self._tracks:  # the initial error of given poses says nothing of the final one
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if cross_view is None else cross_view.excess_m()
         suspicion, gap = refinement.calibration_check, (0.0, 0.0)
         if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
             gap = suspicion.gap.before
         shown = Shown(*moved, excess, *gap)
-        return accuracy_of(seen, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
+        accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
+        return accuracy, covariances_of(graph, shown)
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
-        """The model with the errors of the poses (P, 6, 6) in its accuracy."""
-        frames, at = self._checked(graph)
+        """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
+        frames, at = self._checked_images(graph)
         return with_pose_errors(model, frames, graph.poses[at], covariances[at])
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
-        """The graph without what is only extrapolated from the motion."""
+        """Return the graph without edges and directions that are extrapolated motion only."""
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
         own = {
             (e.step.reference, e.record.index)
@@ -414,7 +440,7 @@ class BackEnd:
         return without_degenerate(graph, directions, bridges)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
-        """The records with the covariances (P, 6, 6) of the frames that have a pose here."""
+        """Return the records with the covariances (P, 6, 6) of the frames with a pose here."""
         known = dict(zip((e.record.index for e in self._posed), covariances, strict=True))
         out = []
         for entry in self._log.entries:
@@ -424,12 +450,12 @@ class BackEnd:
         return tuple(out)
 
     def _on_a_single_link(self, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
-        """Frames that a single link connects with the first one, and no other one confirms it."""
+        """Return the frames connected to the first one by a single, unconfirmed link."""
         if not self._joins:
             return ()
         component_of = {e.record.index: e.step.component for e in self._posed if e.step is not None}
         pairs = [(j.link.i, j.link.j) for j in self._joins]
-        # Another registration of the same two views confirms nothing.
+        # Another registration of the same two views is no confirmation.
         known = {frozenset(pair) for pair in pairs}
         pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in known]
         edges = [(component_of[i], component_of[j]) for i, j in pairs]
@@ -441,12 +467,12 @@ class BackEnd:
         return tuple(index for index, c in component_of.items() if c in hanging)
 
     def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
-        """What overlapping images say of the final poses."""
-        frames, at = self._checked(graph)
+        """Compare overlapping images at the final poses."""
+        frames, at = self._checked_images(graph)
         return cross_view_consistency(frames, graph.poses[at]) if len(frames) > 1 else None
 
-    def _checked(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
-        """The images that are compared in the end, and where their poses are in the graph."""
+    def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
+        """Return the images for the final comparison, and their positions in the graph."""
         frames = [f for f in self._kept.checks if f.index in self._poses]
         row = {int(frame): k for k, frame in enumerate(graph.ids)}
         return frames, np.array([row[f.index] for f in frames], np.intp)
@@ -456,8 +482,8 @@ class BackEnd:
         out[[e.record.index in self._poses for e in self._log.entries]] = poses
         return out
 
-    def _about_corrections(self) -> tuple[Reason, ...]:
-        """What is to be said where a correction was left out."""
+    def _correction_reasons(self) -> tuple[Reason, ...]:
+        """Return the reason if a correction was left out."""
         names = [name_of(c) for c in self._config.corrections if c.disabled]
         if not names:
             return ()
@@ -465,48 +491,48 @@ class BackEnd:
             f"Correction not applied: {' and '.join(names)}. Overlapping views do not clearly show "
             "the error that it compensates."
         )
-        return (Reason("correction_left_out", self._everything, text),)
+        return (Reason("correction_left_out", self._whole_recording, text),)
 
     @property
-    def _everything(self) -> tuple[tuple[int, int], ...]:
+    def _whole_recording(self) -> tuple[tuple[int, int], ...]:
         entries = self._log.entries
         return ((entries[0].record.index, entries[-1].record.index),)
 
-    def _about_surface(self, model: Model) -> tuple[Reason, ...]:
-        """What is to be said where there is no surface."""
+    def _surface_reasons(self, model: Model) -> tuple[Reason, ...]:
+        """Return the reason if there is no surface."""
         if model.mesh is not None and len(model.mesh):
             return ()
         text = "The views show no surface of any size: mesh.ply and mesh.glb are empty."
         if model.mesh is None:
             text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
-        return (Reason("no_surface", self._everything, text),)
+        return (Reason("no_surface", self._whole_recording, text),)
 
 
 def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:
-    """Loops, and what joins components beyond what is needed: these close loops as well."""
+    """Return loops, and the redundant joins of components, which close loops as well."""
     known = {(c.record.i, c.record.j) for c in loops}
     more = []
     for join in joins:
         link = join.link
         if join.needed or {(link.i, link.j), (link.j, link.i)} & known:
             continue
-        seen = link.registration
+        r = link.registration
         record = LoopRecord(
             link.i,
             link.j,
             True,
             f"joins components, {link.how}",
-            overlap=seen.overlap,
-            rms_m=seen.rms_m if np.isfinite(seen.rms_m) else None,
-            free_space_violation=seen.violation,
-            margin=seen.margin,
+            overlap=r.overlap,
+            rms_m=r.rms_m if np.isfinite(r.rms_m) else None,
+            free_space_violation=r.violation,
+            margin=r.margin,
         )
         more.append(ClosedLoop(record, link.T_i_j, link.information))
     return [*loops, *more]
 
 
-def _decided(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:
-    """The loops, those rejected that the optimiser left out because they contradict the others."""
+def _without_rejected(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:
+    """Return the loops; those that the optimiser left out as contradictory are rejected."""
     if optimisation.weights is None:
         return list(loops)
     weights = iter(optimisation.weights[optimisation.graph.loop])

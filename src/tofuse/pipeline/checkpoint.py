@@ -1,7 +1,7 @@
-"""Where a run that was killed goes on: what it had after each stage, kept beside its result.
+"""Checkpoints: the state after each stage of a run, from which an interrupted run is resumed.
 
-A state is an .npz file: arrays, and JSON that says how our own types are made of them (`states`).
-Nothing else is ever loaded, so that a folder from somebody else runs no code of theirs.
+A state is an .npz file: arrays, and JSON that describes how our own types consist of them
+(`states`). Nothing else is loaded, so that a folder from somebody else executes no code.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from tofuse.files.stamps import Stamp, stamp, stamps_in
 from tofuse.pipeline.states import PIECE, StateError, decode, encode
 from tofuse.results.folder import CHECKPOINT
 
-# While frames are tracked a state is kept this often, and so seldom that it costs little.
-_EVERY_S, _SHARE = 10.0, 0.03
-# What must be left for the result: so many times the state, and so many bytes.
+# While frames are tracked, a state is saved at this interval, at most at this fraction of the time.
+_EVERY_S, _TIME_FRACTION = 10.0, 0.03
+# Free space to leave for the result: a multiple of the state, and bytes.
 _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
-# A failure after so much work leaves the states, for when there is space or memory again.
+# A failure after this time keeps the states, for when there is space or memory again.
 _WORTH_KEEPING_S = 60.0
-# Names of states, and of parts of them that were being written.
+# Names of states, and of temporary files of these.
 _STATE = re.compile(r"[a-z]+\.(state|part)")
 _VERSION = 2  # of the format; 1 were pickles
 _MAX_BYTES, _MAX_NODES_BYTES, _MAX_HEADER_BYTES = 16 << 30, 1 << 30, 4096
@@ -44,23 +44,23 @@ _HEADER, _NODES = "header", "nodes"
 
 
 class Stages(Protocol):
-    """Keeps what a job has after each stage, and knows what an earlier, stopped job had."""
+    """Stores the state of a job after each stage, and provides those of an interrupted job."""
 
     def load(self, stage: str) -> Any:
-        """Return what was kept of a stage, or None."""
+        """Return the stored state of a stage, or None."""
         ...
 
     def save(self, stage: str, state: Any) -> None:
-        """Keep what there is after a stage; None is not kept."""
+        """Store the state after a stage; None is not stored."""
         ...
 
     def due(self) -> bool:
-        """Whether it is worth while to keep something in the middle of a stage."""
+        """Whether the state within a stage should be saved now."""
         ...
 
 
-class NotKept(Stages):
-    """Keeps nothing."""
+class NoCheckpoints(Stages):
+    """Stores nothing."""
 
     def load(self, stage: str) -> Any:
         """See `Stages`."""
@@ -75,28 +75,31 @@ class NotKept(Stages):
 
 
 class Checkpoints(Stages):
-    """Keeps the stages of one run in its output folder until it is finished.
+    """Stores the stages of one run in its output folder until it is finished.
 
     Attributes
     ----------
     folder
-        Where they are.
+        The folder of the checkpoints.
     used
-        Whether the run goes on from something that was kept.
+        Whether the run was resumed from a checkpoint.
     fresh
-        Whether the run began without an earlier result in the folder; None where there is nothing
-        of this run. Then it may write there once more without being told to.
+        Whether the run began without an earlier result in the folder, so that it may write there
+        again without --overwrite; None without checkpoints of this run.
     """
 
     def __init__(self, out: Path, key: str, note: Callable[[str], None]) -> None:
-        """Look at what an earlier run left.
+        """Look for checkpoints of an earlier run.
 
         Parameters
         ----------
+        out
+            The output folder.
         key
-            Digest of all that decides the result. What was kept under another one is not used.
+            Digest of everything that determines the result. Checkpoints with another one are not
+            used.
         note
-            Hears what a person should know.
+            Shows a message to the user.
         """
         self.folder = out / CHECKPOINT
         self.fresh: bool | None = None
@@ -107,34 +110,34 @@ class Checkpoints(Stages):
         self._finished = False
         self._begun = self._last = perf_counter()
         self._cost_s = 0.0
-        self._strange: list[Path] = []
+        self._foreign: list[Path] = []
         linked = self.folder.is_symlink()
         for file in () if linked else sorted(self.folder.glob("*.state")):
             header = _header(file)
             if header.get("key") == key:
                 self.fresh = bool(header.get("fresh"))
             else:
-                self._strange.append(file)
+                self._foreign.append(file)
 
     def begin(self, fresh: bool) -> None:
-        """Begin the run, or go on with it.
+        """Begin or resume the run.
 
         Parameters
         ----------
         fresh
-            Whether the folder holds no earlier result; a stopped run knows better.
+            Whether the folder contains no earlier result, unless a checkpoint states it.
         """
         self.fresh = fresh if self.fresh is None else self.fresh
-        if self._strange:
+        if self._foreign:
             self._note(
-                "a run that was stopped left a state for another input, other options or another "
-                "version: it is not used"
+                "the checkpoint of an interrupted run is of another input, other options or "
+                "another version: it is not used"
             )
-        for file in self._strange:
+        for file in self._foreign:
             _unlink(file)
 
     def load(self, stage: str) -> Any:
-        """See `Stages`. What is damaged is left out, with a note."""
+        """See `Stages`. A damaged state is not used, with a note."""
         path = self._path(stage)
         if not path.exists():
             return None
@@ -142,14 +145,14 @@ class Checkpoints(Stages):
             state = _read(path, self._key)
         except (InputError, StateError) as error:
             why = error.problem if isinstance(error, InputError) else str(error)
-            self._note(f"what a stopped run left of its {stage} is damaged, and not used ({why})")
+            self._note(f"the checkpoint of stage {stage} is damaged, and not used ({why})")
             _unlink(path)
             return None
         self.used = True
         return state
 
     def save(self, stage: str, state: Any) -> None:
-        """See `Stages`. Where it can't be written the run goes on without."""
+        """See `Stages`. If it can't be written, the run continues without checkpoints."""
         if not self._works or state is None:
             return
         start = perf_counter()
@@ -163,13 +166,13 @@ class Checkpoints(Stages):
             size = path.stat().st_size
             if shutil.disk_usage(self.folder).free < _TIMES_LEFT * size + _BYTES_LEFT:
                 raise OSError("hardly any space left")
-        # A part that somebody added may hold what can't be kept.
+        # A part from elsewhere may have attributes that can't be stored.
         except (OSError, StateError) as error:
             self._works = False
             why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self._note(
-                f"can't keep what it has after {stage} ({why.lower()}): if this run is stopped, "
-                "the next one begins anew"
+                f"can't save a checkpoint after {stage} ({why.lower()}): if this run is "
+                "interrupted, the next one starts from the beginning"
             )
             self.discard()
         self._last = perf_counter()
@@ -178,27 +181,27 @@ class Checkpoints(Stages):
     def due(self) -> bool:
         """See `Stages`."""
         waited = perf_counter() - self._last
-        return self._works and waited >= max(_EVERY_S, self._cost_s / _SHARE)
+        return self._works and waited >= max(_EVERY_S, self._cost_s / _TIME_FRACTION)
 
     def discard(self) -> None:
-        """Remove all that was kept."""
+        """Remove all checkpoints."""
         _clear(self.folder)
 
     def finish(self) -> None:
-        """Remove all that was kept: there is a result."""
+        """Remove all checkpoints, as there is a result."""
         self._finished = True
         self.discard()
 
     def give_up(self, error: BaseException) -> None:
-        """Remove what was kept, unless it was much work and trying again may help."""
+        """Remove all checkpoints, unless they save much work and a retry may succeed."""
         can_help = isinstance(error, OutputError | OSError | MemoryError | Ended)
         if self._finished or not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
             self.discard()
 
     def unusable(self, error: Exception) -> InputError:
-        """Say that what was kept, and is removed now, led to an error."""
+        """Return the error for checkpoints, now removed, from which the run can't be resumed."""
         return InputError(
-            f"what a stopped run left can't be gone on from ({type(error).__name__}: {error})",
+            f"can't resume from the checkpoint ({type(error).__name__}: {error})",
             where=self.folder,
             remedy="it has been removed: run the same command again",
         )
@@ -208,12 +211,12 @@ class Checkpoints(Stages):
 
 
 def discard_states(out: Path) -> None:
-    """Remove what a stopped run left in its output folder to go on from."""
+    """Remove the checkpoints of an interrupted run from its output folder."""
     _clear(out / CHECKPOINT)
 
 
 def _clear(folder: Path) -> None:
-    """Remove states, and nothing that only lies beside them."""
+    """Remove states, and no other files in the folder."""
     if folder.is_symlink() or not folder.is_dir():
         return
     for file in folder.iterdir():
@@ -224,10 +227,17 @@ def _clear(folder: Path) -> None:
 
 
 def digest(facts: Mapping[str, Any], files: Iterable[Path], *, without: Path) -> str:
-    """Return a digest of plain facts, of what files are, and of this program.
+    """Return a digest of plain facts, of files, and of this program.
 
-    Files and all that is in folders count by path, size and time of change; beside a single file,
-    so do its neighbours. `without` is a folder that does not count.
+    Parameters
+    ----------
+    facts
+        Plain data.
+    files
+        Files and folders, which count by path, size and modification time; the other files in the
+        folder of a single file count as well.
+    without
+        A folder that does not count.
     """
     stats = []
     for path in files:
@@ -244,7 +254,7 @@ def _stamps(path: Path, without: Path) -> list[Stamp]:
 
 @cache
 def _program() -> str:
-    """Digest of our sources, and of what computes for us."""
+    """Return a digest of our sources and of the numerical libraries."""
     import cv2
     import numba
     import numpy
@@ -267,7 +277,7 @@ def _unlink(path: Path) -> None:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """What a file of ours says of itself; nothing where it is none."""
+    """Return the header of a checkpoint; empty for other files."""
     try:
         return _header_in(read_npz(path, limit=_MAX_HEADER_BYTES, only=frozenset({_HEADER})))
     except (InputError, StateError):
@@ -296,7 +306,7 @@ def _text(data: Any) -> UInt8:
 
 def _write(path: Path, header: dict[str, Any], state: Any) -> None:
     nodes, arrays = encode(state)
-    # Not forced to the disk: should the power fail, the sums tell.
+    # Not synchronised with the disk: after a power failure, checksums show damage.
     with path.open("wb") as file:
         write_npz(file, {_HEADER: _text(header), _NODES: _text(nodes), **arrays})
 

@@ -1,4 +1,4 @@
-"""From what a run saw of itself to a verdict. Nothing here knows a reference."""
+"""The verdict of a run, from its own evidence and without a reference."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from tofuse.results.ranges import Range, in_words, is_one, runs, runs_of, size, 
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
-# Below this share of corresponding points a registration is a guess.
-WEAK_SHARE = 0.05
-# More registrations than this that ran out of iterations are a pattern.
-UNSETTLED_SHARE = 0.05
-# More frames than this that are not held in every direction build up drift.
-UNHELD_SHARE = 0.1
-# Typical depths in m that ToF cameras hardly have.
-NEAREST_M, FARTHEST_M = 0.3, 12.0
-# More jumps than a few, and than this share of the poses, are views in no order.
-UNORDERED, UNORDERED_SHARE = 3, 0.2
-# A camera that moved by no more than this stood still.
+# Inlier fraction below which a registration is weak.
+WEAK_INLIER_FRACTION = 0.05
+# Largest fraction of registrations that may run out of iterations.
+MAX_NOT_CONVERGED = 0.05
+# Largest fraction of degenerate registrations; more accumulate drift.
+MAX_DEGENERATE = 0.1
+# Range of plausible typical depths of ToF cameras, m.
+MIN_DEPTH_M, MAX_DEPTH_M = 0.3, 12.0
+# Views are unordered if there are more jumps than this, and than this fraction of the poses.
+MIN_UNORDERED, UNORDERED_FRACTION = 3, 0.2
+# Largest motion of a camera that stands still.
 STILL_M, STILL_RAD = 0.01, np.radians(0.5)
-# Unless a tolerance is given, it is this share of the model's diagonal, and at least so many m.
-TOLERANCE_SHARE, TOLERANCE_M = 0.005, 0.01
-# Rotations are never good beyond this.
+# Default tolerance: fraction of the model's diagonal, and its minimum in m.
+TOLERANCE_FRACTION, TOLERANCE_M = 0.005, 0.01
+# Tolerance of rotations.
 TOLERANCE_RAD = np.radians(2)
-# Loops miss where odometry leads by a chi-square variable with six degrees of freedom, if both
-# know their errors: one in a thousand misses by more.
-MISSED = 22.46
-# Where errors aren't known, a loop may move the end by this share of the path, and these floors.
-GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
-# Disconnected parts that are named, the largest ones; and loops.
-LISTED = 6
-# Of what overlapping images say of the poses, this share has to support them, or they are wrong;
-# below that share of what neighbours reach, they differ.
-CONTRADICTED_SHARE, AGREEMENT_RATIO = 0.5, 0.9
+# The squared Mahalanobis drift over a loop is chi-square distributed with six degrees of freedom if
+# covariances are right: one in a thousand exceeds this.
+MAX_LOOP_CHI2 = 22.46
+# Without covariances: tolerated drift over a loop as a fraction of its path, and its minimum.
+GAP_FRACTION, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
+# Maximum number of disconnected parts (the largest) and of loops that are named.
+MAX_LISTED = 6
+# Minimum fraction of overlapping measurements that support the poses; and its minimum ratio to that
+# of consecutive images.
+MIN_SUPPORT, AGREEMENT_RATIO = 0.5, 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the judgement rests on.
+    """The evidence of a run.
 
     Attributes
     ----------
@@ -61,43 +61,43 @@ class Evidence:
         Of every frame, in order; a registration is None for the first and for lost frames.
         Registrations of frames outside the main model do not count.
     loops
-        Every loop that was considered.
+        All candidate loops.
     sequential
         (N, 4, 4) poses before optimisation, of the frames in the main model.
     optimisation
-        The graph after it.
+        The optimised graph.
     cross_view
-        What overlapping images say of the final poses; None where there are too few.
+        Consistency of overlapping images at the final poses; None if there are too few.
     accuracy
-        Of the final poses.
+        Accuracy of the final poses.
     diagonal_m
-        Of the model.
+        Diagonal of the model.
     tolerance_m
-        What the poses may be off by; None for the usual share of the model's size.
+        Tolerance of the poses; None for a fraction of the model's diagonal.
     knows_errors
-        Whether registrations state errors that can be relied on, which ICP's don't.
+        Whether covariances of registrations are realistic, which ICP's are not.
     refinement
-        What became of the refinement over all views.
+        Result of the refinement of all views.
     given
-        Pairs (i, j) of loops given by hand.
+        Pairs (i, j) of given loops.
     depths
         Median radial range of every frame with a pose, m.
     ambiguity_m
-        Range after which the camera's phase repeats, if it is known.
+        Ambiguity range of the camera, if known.
     repeated
-        Indices of the frames that are the same as the one before, to the last pixel.
+        Indices of the frames that equal the one before in every pixel.
     interruptions
         Positions among the records at which another recording begins.
     outside
-        What became of sensors beside the camera.
+        Records of external sensors.
     components
-        As in `Reconstruction`; empty where nothing looked for them.
+        As in `Reconstruction`; empty if all frames are in one.
     moving
-        (frame index, fraction of the image) where moving objects were found.
+        (frame index, fraction of the image) of frames with moving objects.
     doubtful
         Indices of the frames that fit worse than this camera's views usually do.
     hanging
-        Indices of the frames that a single registration connects with the first one.
+        Indices of the frames that a single registration connects to the first one.
     """
 
     records: tuple[FrameRecord, ...]
@@ -135,30 +135,30 @@ class Evidence:
 
     @property
     def tolerance(self) -> float:
-        """What the poses may be off by, m."""
+        """Tolerance of the poses, m."""
         return tolerance_of(self.tolerance_m, self.diagonal_m)
 
     @property
     def in_main(self) -> list[bool]:
-        """For every record whether it is in the main model."""
+        """Whether each record is in the main model."""
         return [in_main_model(record, self.components) for record in self.records]
 
     def runs(self, marked: Sequence[bool]) -> tuple[Range, ...]:
-        """Ranges of the records that are marked."""
+        """Return the ranges of marked records."""
         return runs([record.index for record in self.records], marked)
 
     def runs_of(self, frames: Collection[int]) -> tuple[Range, ...]:
-        """Ranges of the records with these indices."""
+        """Return the ranges of the records with these indices."""
         return runs_of([record.index for record in self.records], frames)
 
 
 def tolerance_of(given_m: float | None, diagonal_m: float) -> float:
-    """What poses may be off by, m: as given, or in proportion to the model's diagonal."""
-    return max(TOLERANCE_M, TOLERANCE_SHARE * diagonal_m) if given_m is None else given_m
+    """Return the tolerance of poses, m: as given, or in proportion to the model's diagonal."""
+    return max(TOLERANCE_M, TOLERANCE_FRACTION * diagonal_m) if given_m is None else given_m
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
-    """Return the verdict and the reasons for it, each code once, the gravest first."""
+    """Return the verdict and the reasons for it, each code once, the most severe first."""
     reasons = ranked(
         [
             *_poses(evidence),
@@ -169,7 +169,7 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
             *_loops(evidence),
             *(_uncertainty(evidence) if evidence.knows_errors else _drift(evidence)),
             *_optimiser(evidence),
-            *_outside(evidence),
+            *_external_sensors(evidence),
             *_images(evidence),
             *_scene(evidence),
         ]
@@ -181,7 +181,7 @@ def _poses(e: Evidence) -> Iterator[Reason]:
     readable = [r for r in e.records if r.status != "skipped"]
     posed = [r for r in readable if r.status != "lost"]
     main = sum(e.in_main)
-    # Single frames that nothing connects are no model, however few there are.
+    # Unconnected single frames are no model, however few there are.
     scattered = main == 1 and len(posed) > 1
     if 2 * main < len(readable) or scattered:
         if main < len(posed):
@@ -203,7 +203,7 @@ def _poses(e: Evidence) -> Iterator[Reason]:
 
 
 def _connections(e: Evidence) -> Iterator[Reason]:
-    """What is not connected to the main component, or by one link or extrapolated motion only."""
+    """Parts not connected to the main component, or by one link or extrapolated motion only."""
     apart = [c for c in e.components if not c.connected]
     if apart:
         joined = [r for c in e.components if c.connected for r in c.frames]
@@ -216,7 +216,7 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             "overlap found.",
         )
     bridged = union(r for c in e.components if c.joined == "motion" for r in c.frames)
-    # Where all poses are bounded, measurements connect both sides by now.
+    # If all poses are bounded, later measurements connect both sides.
     if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
         text = (
             f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest by "
@@ -234,7 +234,7 @@ def _connections(e: Evidence) -> Iterator[Reason]:
 
 def _listed(parts: Sequence[tuple[Range, ...]]) -> str:
     """Name the largest of several parts, in order."""
-    large = sorted(sorted(parts, key=size, reverse=True)[:LISTED])
+    large = sorted(sorted(parts, key=size, reverse=True)[:MAX_LISTED])
     if all(len(part) == 1 for part in large):
         text = in_words([part[0] for part in large])
     else:
@@ -249,22 +249,22 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     poses = [next(posed) if has else None for has in has_pose]
     moments = [Moment(r.index, r.timestamp) for r in e.records]
     unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
-    unexpected = {*e.interruptions, *_crossings(e.records, has_pose), *unmeasured}
+    unexpected = {*e.interruptions, *_component_changes(e.records, has_pose), *unmeasured}
     found = jumps(poses, moments, unexpected)
     frames = [e.records[k].index for k, _ in found]
-    if len(found) > max(UNORDERED, UNORDERED_SHARE * sum(has_pose)):
+    if len(found) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (
             f"{len(found)} of {sum(has_pose)} poses are far from the predicted motion, as if the "
-            "views were in no order: motion does not tell whether they are right."
+            "views were in no order: the motion does not show whether they are right."
         )
         yield Reason("jumped", ((frames[0], frames[-1]),), text)
     elif found:
         jumped = e.runs_of(frames)
-        far = found[0][1].removeprefix("that is ")
+        deviation = found[0][1]
         text = (
-            f"The pose of {in_words(jumped)} jumps: {far}."
+            f"The pose of {in_words(jumped)} jumps: {deviation}."
             if is_one(jumped)
-            else f"The poses of {in_words(jumped)} jump; that of frame {frames[0]} is {far}."
+            else f"The poses of {in_words(jumped)} jump; that of frame {frames[0]} is {deviation}."
         )
         yield Reason("jumped", jumped, text)
     repeated = e.runs_of(e.repeated)
@@ -277,12 +277,12 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     moved = se3.inverse(T[:1]) @ T
     still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
     if len(T) > 2 and (still & (se3.angle(moved) < STILL_RAD)).all():
-        text = f"The camera never moved in {len(T)} frames: the model is what one view sees."
+        text = f"The camera never moved in {len(T)} frames: the model is that of a single view."
         yield Reason("stood_still", e.posed, text)
 
 
-def _crossings(records: Sequence[FrameRecord], chosen: Sequence[bool]) -> list[int]:
-    """Positions at which the chosen records go on in another component."""
+def _component_changes(records: Sequence[FrameRecord], chosen: Sequence[bool]) -> list[int]:
+    """Return the positions at which the chosen records change to another component."""
     at = [k for k, has in enumerate(chosen) if has]
     return [b for a, b in pairwise(at) if records[a].component != records[b].component]
 
@@ -294,9 +294,9 @@ def _depths(e: Evidence) -> Iterator[Reason]:
     what = f"The typical distance is {typical:.3g} m"
     if e.ambiguity_m is not None and typical > e.ambiguity_m:
         text = f"{what}, but this camera's phase repeats after {e.ambiguity_m:.3g} m"
-    elif typical > FARTHEST_M:
+    elif typical > MAX_DEPTH_M:
         text = f"{what}, farther than ToF cameras see"
-    elif typical < NEAREST_M:
+    elif typical < MIN_DEPTH_M:
         text = f"{what}, nearer than most ToF cameras see"
     else:
         return
@@ -311,29 +311,29 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
     ]
     if not pairs:
         return
-    weak = e.runs_of({index for index, r in pairs if r.share < WEAK_SHARE})
+    weak = e.runs_of({index for index, r in pairs if r.share < WEAK_INLIER_FRACTION})
     if weak:
         text = (
-            f"Fewer than {_percent(WEAK_SHARE)} of the points of {in_words(weak)} have a "
+            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of {in_words(weak)} have a "
             "correspondence."
         )
         yield Reason("weak_registration", weak, text)
     if e.knows_errors:
-        return  # what was unobservable, or did not converge, is in the bounds
+        return  # degenerate or unconverged registrations are included in the bounds
     free = {index for index, r in pairs if len(r.unobservable)}
-    if len(free) > UNHELD_SHARE * len(pairs):
+    if len(free) > MAX_DEGENERATE * len(pairs):
         text = (
             f"In {len(free)} of {len(pairs)} registrations the motion is unobservable in some "
             "direction (degenerate geometry): the pose is predicted there, and drifts."
         )
         yield Reason("unobserved_motion", e.runs_of(free), text)
-    unsettled = {index for index, r in pairs if not r.converged}
-    if len(unsettled) > UNSETTLED_SHARE * len(pairs):
+    not_converged = {index for index, r in pairs if not r.converged}
+    if len(not_converged) > MAX_NOT_CONVERGED * len(pairs):
         text = (
-            f"{len(unsettled)} of {len(pairs)} registrations ran out of iterations before they "
+            f"{len(not_converged)} of {len(pairs)} registrations ran out of iterations before they "
             "converged."
         )
-        yield Reason("not_converged", e.runs_of(unsettled), text)
+        yield Reason("not_converged", e.runs_of(not_converged), text)
 
 
 def _loops(e: Evidence) -> Iterator[Reason]:
@@ -344,8 +344,8 @@ def _loops(e: Evidence) -> Iterator[Reason]:
         (p,) = rejected
         text = f"Loop {p.i}-{p.j}, given by hand, was not used: {p.reason}."
     else:
-        named = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:LISTED])
-        more = len(rejected) - LISTED
+        named = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:MAX_LISTED])
+        more = len(rejected) - MAX_LISTED
         named += f" and {more} more" if more > 0 else ""
         text = f"{len(rejected)} loops given by hand were not used: {named}."
     yield Reason("loop_rejected", union((k, k) for p in rejected for k in (p.i, p.j)), text)
@@ -365,7 +365,7 @@ def _optimiser(e: Evidence) -> Iterator[Reason]:
         yield Reason("not_refined", e.posed, text)
 
 
-def _outside(e: Evidence) -> Iterator[Reason]:
+def _external_sensors(e: Evidence) -> Iterator[Reason]:
     for sensor in e.outside:
         if 2 * sensor.used < sensor.measured:
             text = f"{sensor.text[0].upper()}{sensor.text[1:]}."
@@ -373,7 +373,7 @@ def _outside(e: Evidence) -> Iterator[Reason]:
 
 
 def _scene(e: Evidence) -> Iterator[Reason]:
-    """What moves in view, and which views fit badly."""
+    """Moving objects, and views with a bad fit."""
     moving = {frame: fraction for frame, fraction in e.moving if fraction > 0}
     where = e.runs_of(moving)
     if where:
@@ -394,7 +394,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
 
 
 def _drift(e: Evidence) -> Iterator[Reason]:
-    """Without known errors only loops tell of drift."""
+    """Drift over loops, where registrations have no covariances."""
     graph = e.optimisation.graph
     if len(graph.ids) > 1 and not graph.loop.any():
         text = "No loop was closed: the accumulated drift is unchecked."
@@ -403,15 +403,15 @@ def _drift(e: Evidence) -> Iterator[Reason]:
 
 
 def _uncertainty(e: Evidence) -> Iterator[Reason]:
-    """With known errors of the registrations, those of the path follow."""
-    yield from _missed(e)
-    yield from _suspected(e)
+    """Uncertainty of the poses and of the calibration, from covariances of registrations."""
+    yield from _loop_drift(e)
+    yield from _calibration_alarm(e)
     yield from _unchecked_calibration(e)
     yield from bounds(e.accuracy, e.tolerance, [r.index for r in e.records])
 
 
 def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[Reason]:
-    """Give reasons where an accuracy of frames with these indices is not within a tolerance."""
+    """Yield reasons if the accuracy of frames with these indices exceeds a tolerance, m."""
     if not a.assessed:
         return
     free = runs_of(frames, a.unbounded)
@@ -431,13 +431,13 @@ def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[R
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
 
 
-def _missed(e: Evidence) -> Iterator[Reason]:
-    """Errors of the camera that all views share bend the path, and no registration knows them."""
+def _loop_drift(e: Evidence) -> Iterator[Reason]:
+    """Drift beyond covariances: systematic errors of the camera bend the trajectory."""
     graph = e.optimisation.graph
     errors = loop_errors(graph, e.sequential)
     known = np.isfinite(errors)
-    # Half of the loops: a few may be wrong by themselves.
-    if not known.any() or np.median(errors[known]) <= MISSED:
+    # The median, as single loops may be wrong.
+    if not known.any() or np.median(errors[known]) <= MAX_LOOP_CHI2:
         return
     worst = int(np.nanargmax(errors))
     i, j = graph.edges[graph.loop][worst]
@@ -445,17 +445,17 @@ def _missed(e: Evidence) -> Iterator[Reason]:
         se3.inverse(e.sequential[i]) @ e.sequential[j]
     )
     first, last = sorted((int(graph.ids[i]), int(graph.ids[j])))
-    miss = f"{_length(float(np.linalg.norm(gap[:3, 3])))}, {_angle(float(se3.angle(gap)))}"
+    drift = f"{_length(float(np.linalg.norm(gap[:3, 3])))}, {_angle(float(se3.angle(gap)))}"
     text = (
-        f"Odometry drift over loop {first}-{last} is {miss}, {np.sqrt(errors[worst] / 6):.1f} "
+        f"Odometry drift over loop {first}-{last} is {drift}, {np.sqrt(errors[worst] / 6):.1f} "
         "times what noise explains: the depth offset or the focal length of the camera may be "
         "wrong."
     )
     yield Reason("calibration_alarm", ((first, last),), text)
 
 
-def _suspected(e: Evidence) -> Iterator[Reason]:
-    """All views together may say what is wrong with the camera."""
+def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
+    """A calibration error that the refined views show."""
     found = None if e.refinement is None else e.refinement.calibration_check
     if found is None or not found.alarm or found.gap is None:
         return
@@ -471,7 +471,7 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
 
 
 def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
-    """The bound of the poses assumes a calibration that this recording may not be able to check."""
+    """A calibration that the recording can't check, on which the bound of the poses relies."""
     found = None if e.refinement is None else e.refinement.calibration_check
     if found is None or found.alarm:
         return
@@ -492,7 +492,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
 
 
 def _gap(e: Evidence) -> Iterator[Reason]:
-    """Tell of the loop whose ends were furthest apart, compared with what its path allows."""
+    """The loop with the largest drift relative to the length of its path."""
     graph = e.optimisation.graph
     steps = np.linalg.norm(np.diff(e.sequential[:, :3, 3], axis=0), axis=1)
     turns = se3.angle(se3.inverse(e.sequential[:-1]) @ e.sequential[1:])
@@ -504,8 +504,8 @@ def _gap(e: Evidence) -> Iterator[Reason]:
         gap = se3.inverse(measured) @ se3.inverse(e.sequential[i]) @ e.sequential[j]
         distance, angle = float(np.linalg.norm(gap[:3, 3])), float(se3.angle(gap))
         excess = max(
-            distance / max(GAP_FLOOR_M, GAP_SHARE * float(steps[a:b].sum())),
-            angle / max(GAP_FLOOR_RAD, GAP_SHARE * float(turns[a:b].sum())),
+            distance / max(GAP_FLOOR_M, GAP_FRACTION * float(steps[a:b].sum())),
+            angle / max(GAP_FLOOR_RAD, GAP_FRACTION * float(turns[a:b].sum())),
         )
         if excess > 1:
             wide.append((excess, int(graph.ids[a]), int(graph.ids[b]), distance, angle))
@@ -527,33 +527,33 @@ def _images(e: Evidence) -> Iterator[Reason]:
 
 
 def images(s: CrossViewConsistency, everything: tuple[Range, ...]) -> Iterator[Reason]:
-    """Give reasons where overlapping images contradict the poses of a stretch of frames."""
+    """Yield reasons if overlapping images contradict the poses of a range of frames."""
     if not np.isfinite(s.support()):
         return
     found = f"{_percent(s.support())} of overlapping measurements are consistent with the poses"
     if np.isfinite(s.rms_m()):
         found += f" ({s.rms_m() * 1e3:.1f} mm rms)"
-    if s.support() < CONTRADICTED_SHARE:
+    if s.support() < MIN_SUPPORT:
         yield Reason("images_disagree", everything, f"Only {found}.")
         return
     texts = []
-    alone = runs(s.frames, [share < CONTRADICTED_SHARE for share in s.support_of_views()])
+    alone = runs(s.frames, [support < MIN_SUPPORT for support in s.support_of_views()])
     if alone:
         verb = "is" if is_one(alone) else "are"
         texts.append(f"{_sentence(alone)} {verb} inconsistent with most overlapping frames.")
-    # Images next to each other see the same errors of the sensor, but hardly any drift. By how much
-    # they are apart is in the bounds; how many are not there at all is not.
+    # Consecutive images share the errors of the sensor, but have hardly any drift. Distances of
+    # surfaces are in the bounds, the fraction of inconsistent measurements is not.
     near = [p for p in s.pairs if p.j == p.i + 1]
-    share = s.support(near)
-    if s.support() < AGREEMENT_RATIO * share:
-        nearby = f"{_percent(share)} ({s.rms_m(near) * 1e3:.1f} mm rms)"
+    nearby_support = s.support(near)
+    if s.support() < AGREEMENT_RATIO * nearby_support:
+        nearby = f"{_percent(nearby_support)} ({s.rms_m(near) * 1e3:.1f} mm rms)"
         texts.append(f"{found}, but {nearby} in consecutive images.")
     if texts:
         yield Reason("images_differ", alone or everything, " ".join(texts))
 
 
 def stretches(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:
-    """Return (first, last) frame index of each unbroken stretch of frames with that status."""
+    """Return (first, last) frame index of each range of consecutive frames with that status."""
     return runs([r.index for r in records], [r.status == status for r in records])
 
 

@@ -1,4 +1,4 @@
-"""The final numbers of components, and what becomes of those that nothing connects."""
+"""The final numbers of components, and models of those that are not connected."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tofuse.posegraph.joining import Group, How, Join
 from tofuse.results.ranges import runs
 from tofuse.results.types import Component, Reconstruction
 
-# Reconstructs frames, given their poses in one frame and what joins their components.
+# Reconstructs frames, given their poses in one frame and the joins of their components.
 Reconstruct = Callable[[FrameLog, dict[int, Float64], Sequence[Join]], Reconstruction]
 
-# A component of fewer frames that nothing connects gets no model of its own.
-_WORTH_A_MODEL = 5
+# An unconnected component gets a model of its own if it has more frames than these.
+_MAX_WITHOUT_MODEL = 5
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What becomes one component: some of the tracker's, and where they are."""
+    """Components of the tracker that form one of the result, and their pose (4, 4)."""
 
     members: tuple[int, ...]
     group: Group
@@ -36,15 +36,17 @@ def numbered_components(
 
     Parameters
     ----------
+    log
+        All frames.
     groups
-        Of the tracker's components, the main one first. Those that are joined with each other, but
-        not with the main one, become one.
+        Groups of connected tracker components, the main one first. Each other group becomes one
+        component.
     reconstruct
-        Makes the model of a component that is not connected with the main one.
+        Reconstructs a component that is not connected to the main one.
 
     Returns
     -------
-    The log, whose records know their component now, and the components.
+    The log with the final component in each record, and the components.
     """
     parts = _parts(groups)
     numbered = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
@@ -53,9 +55,9 @@ def numbered_components(
         mine = [e.has_pose and e.record.component == k for e in numbered.entries]
         ranges = runs([e.record.index for e in log.entries], mine)
         result = None
-        if part.T_main_component is None and part.group.frames > _WORTH_A_MODEL:
+        if part.T_main_component is None and part.group.frames > _MAX_WITHOUT_MODEL:
             frames = [e.record.index for e in numbered.posed if e.record.component == k]
-            own = log.of(frames)  # in its own model it is no component of another one
+            own = log.of(frames)  # in its own model it is the main component
             poses = poses_in_world(own, part.group.T_group_component)
             result = reconstruct(own, poses, part.group.joins)
         components.append(Component(ranges, part.T_main_component, part.joined, result))

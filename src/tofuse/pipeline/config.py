@@ -6,11 +6,10 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Annotated, Any, Literal
 
 from tofuse import parts
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction
 from tofuse.errors import InputError
 from tofuse.files.reading import parsed, read_text
@@ -29,7 +28,7 @@ ViewKind = Literal["range", "cloud"]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Bounded):
     """Everything that decides a result, apart from the recording and the seed.
 
     Attributes
@@ -39,32 +38,33 @@ class Config:
     filters
         Applied in this order to every frame.
     odometry
-        Turns frames into poses.
+        Tracks the camera.
     loops
-        Finds and confirms places that the camera comes back to.
+        Detects and verifies loops.
     optimiser
-        Spreads the error of the loops.
+        Optimises the pose graph.
     fusion
-        Makes the cloud.
+        Makes the model.
     refinement
-        Makes the poses better, all at once, after loops are closed.
+        Optimises all poses jointly, after loops are closed.
     corrections
         Applied in this order to every frame, before the filters.
     model_filters
-        Applied after tracking, to what goes into the model: a tracker that weighs each pixel by
-        its noise loses by what a clean model gains.
+        Applied after tracking, to the views of the model: the tracker weights each pixel by its
+        noise and loses accuracy without noisy pixels, which a clean model must leave out.
     outside
-        Sensors beside the camera whose measurements count.
+        External sensors whose measurements are used.
     joining
-        Connects components that were tracked apart.
+        Connects components that were tracked separately.
     self_calibration
-        Whether a recording that shows an error of its camera is reconstructed again without it.
+        Whether a recording is reconstructed again with a corrected calibration if it shows an
+        error of its camera.
     tolerance_m
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
     memory_mb
-        What a run may hold in memory, about; `pipeline.budget` divides it. What is more is kept on
-        disk until it is asked for.
+        Approximate memory of a run; `pipeline.budget` divides it. What does not fit is on disk
+        until it is needed.
     """
 
     method: str
@@ -79,14 +79,8 @@ class Config:
     outside: tuple[ExternalSensor, ...] = ()
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True
-    tolerance_m: float | None = None
-    memory_mb: int = 2000
-
-    def __post_init__(self) -> None:
-        if self.tolerance_m is not None and not 0 < self.tolerance_m < np.inf:
-            raise ValueError(f"tolerance_m is {self.tolerance_m}, not above 0")
-        if not 500 <= self.memory_mb <= 10_000_000:
-            raise ValueError(f"memory_mb is {self.memory_mb}, not 500 or more")
+    tolerance_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    memory_mb: Annotated[int, Bounds(500, 10_000_000)] = 2000
 
     @property
     def window(self) -> int:

@@ -1,14 +1,14 @@
-"""How much a camera's amplitude falls off towards the corners, estimated from its own recording.
+"""Falloff of the amplitude towards the corners, estimated from a recording.
 
 Lens and illumination together make an image darker off the axis, about as a power of the cosine to
 the axis (natural vignetting of a lens is the fourth power; illumination adds to it, and cameras may
-compensate either). Left in, it is a texture that is fixed to the camera, and drags every alignment
-towards standing still. Two views that are aligned by geometry alone see the same surfaces at
-different places of the image: what their albedo differs by shows the exponent, whatever the scene.
+compensate either). Uncompensated, it is a texture that is fixed to the camera, and biases every
+alignment towards no motion. Two views aligned by geometry alone see the same surfaces at different
+places of the image: the difference of their albedo shows the exponent, whatever the scene.
 
-Along a wall geometry alone does not tell the motion. Then the light has to help with it: the views
-are aligned by both, the exponent that this shows is taken off, and so on until nothing changes.
-What pairs say is pooled, those with much motion counting most.
+Along a wall, geometry alone does not constrain the motion. Then views are aligned by geometry and
+amplitude, compensated by the exponent that this shows, and aligned again until it converges. The
+exponents of pairs are pooled, weighted by their information, which grows with the motion.
 """
 
 from __future__ import annotations
@@ -32,67 +32,69 @@ from tofuse.registration.view_points import landing_pixels
 
 Prepare = Callable[[Frame], Frame]
 
-# Pairs of frames, evenly spaced over the recording; frames from one to the other, which are doubled
-# while that is too little motion, up to so many times.
-_PAIRS, _STRIDE, _DOUBLED = 7, 2, 3
-# Mean motion of points in the image, in units of x/z, that is wanted, and the least that tells; and
-# less than this fraction of inliers is no alignment.
-_WANTED, _MOVED, _FITS = 0.05, 0.02, 0.6
-# Geometry alone, from far enough; and with light.
-_BY_SHAPE = ProjectiveOptions(levels=PATIENT, photometric=False, prior_m=3.0, prior_rad=3.0)
-_BY_LIGHT = replace(_BY_SHAPE, photometric=True)
-# Alignments with light, at most, and by how much the exponent still changes when they are enough.
-_ROUNDS, _SETTLED = 5, 0.1
-# Points that count: on the surface within so many metres and fraction of the depth.
+# Number of pairs, evenly spaced over the recording; frames between the views of a pair, which are
+# doubled up to this number of times while there is too little motion.
+_PAIRS, _STRIDE, _MAX_DOUBLINGS = 7, 2, 3
+# Desired and minimum mean motion of points in the image, in units of x/z; and the minimum inlier
+# fraction of an alignment.
+_DESIRED_MOTION, _MIN_MOTION, _MIN_INLIERS = 0.05, 0.02, 0.6
+# Alignment by geometry alone, with wide priors; and with amplitude.
+_GEOMETRIC = ProjectiveOptions(levels=PATIENT, photometric=False, prior_m=3.0, prior_rad=3.0)
+_PHOTOMETRIC = replace(_GEOMETRIC, photometric=True)
+# Maximum number of photometric alignments, and the change of the exponent at convergence.
+_MAX_ROUNDS, _CONVERGED = 5, 0.1
+# Corresponding points are within this distance of the surface: m, plus a fraction of the depth.
 _NEAR_M, _NEAR = 0.01, 0.01
-# Fewest points of a pair, fewest pairs, and the chance that what they say is luck.
-_LEAST_POINTS, _LEAST_PAIRS, _LUCK = 300, 3, 0.01
+# Minimum numbers of points of a pair and of pairs, and the significance level.
+_MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 300, 3, 0.01
 
 
 def estimate_falloff(recording: Recording, prepare: Prepare, options: SurfaceOptions) -> float:
-    """Exponent of the cosine by which amplitude falls off; 0 where the recording shows none.
+    """Return the exponent of the cosine by which amplitude falls off; 0 if not significant.
 
     Parameters
     ----------
+    recording
+        The recording.
     prepare
-        Makes of a frame what will be tracked.
+        Corrects and filters a frame as for tracking.
     options
         How views are prepared.
     """
     views = _Views(recording, prepare, replace(options, falloff=0.0))
-    found: list[_Slope] = []
+    slopes: list[_Slope] = []
     for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
-        # What is known by then: light that is hardly wrong hardly drags.
-        known = float(np.median([one.exponent for one in found])) if found else 0.0
-        shown = _from(views, int(start), known)
-        if shown is not None:
-            found.append(shown)
-    if len(found) < _LEAST_PAIRS:
+        # The initial exponent is the median so far: nearly compensated amplitude hardly biases.
+        initial = float(np.median([one.exponent for one in slopes])) if slopes else 0.0
+        slope = _slope_from(views, int(start), initial)
+        if slope is not None:
+            slopes.append(slope)
+    if len(slopes) < _MIN_PAIRS:
         return 0.0
-    exponents, information = np.array([(one.exponent, one.information) for one in found]).T
+    exponents, information = np.array([(one.exponent, one.information) for one in slopes]).T
     exponent, error = pooled(exponents, information)
-    # Student's, as the spread is known from as few pairs.
-    least = float(stdtrit(len(found) - 1, 1 - _LUCK)) * error
-    return exponent if abs(exponent) > least else 0.0
+    # Student's t, as the spread is estimated from few pairs.
+    threshold = float(stdtrit(len(slopes) - 1, 1 - _SIGNIFICANCE)) * error
+    return exponent if abs(exponent) > threshold else 0.0
 
 
 @dataclass(frozen=True)
 class _Slope:
-    """What a pair shows: the exponent, what it is known by (squares of x), and its motion."""
+    """Exponent of a pair, its information (sum of squares of x), and the motion in the image."""
 
     exponent: float
     information: float
-    moved: float
+    motion: float
 
 
 class _Views:
-    """Views of a recording without anything taken off their light."""
+    """Views of a recording, with uncompensated amplitude."""
 
     def __init__(self, recording: Recording, prepare: Prepare, options: SurfaceOptions) -> None:
         self._recording, self._prepare, self._options = recording, prepare, options
 
     def get(self, k: int) -> PreparedView | None:
-        """The k-th view; None if there is none, or none with light."""
+        """Return the k-th view; None if there is none, or it has no amplitude."""
         if k >= len(self._recording):
             return None
         try:
@@ -105,24 +107,24 @@ class _Views:
         return view if view.has_albedo else None
 
 
-def _from(views: _Views, start: int, known: float) -> _Slope | None:
-    """What a view and a later one show, far enough from it; None where they show nothing."""
+def _slope_from(views: _Views, start: int, initial: float) -> _Slope | None:
+    """Return the slope of a view and a later one with enough motion in between, if any."""
     target = views.get(start)
     if target is None:
         return None
     best, T, stride = None, np.eye(4), _STRIDE
-    for _ in range(1 + _DOUBLED):
+    for _ in range(1 + _MAX_DOUBLINGS):
         source = views.get(start + stride)
-        aligned = None if source is None else _aligned(source, target, T, known)
+        aligned = None if source is None else _aligned(source, target, T, initial)
         if aligned is None:
             if best is not None or stride < _STRIDE:
                 break
             T, stride = np.eye(4), 1  # that was too far
             continue
-        T, shown = aligned
-        if shown is not None:
-            best = shown
-            if shown.moved >= _WANTED:
+        T, slope = aligned
+        if slope is not None:
+            best = slope
+            if slope.motion >= _DESIRED_MOTION:
                 break
         if stride < _STRIDE:
             break
@@ -131,46 +133,46 @@ def _from(views: _Views, start: int, known: float) -> _Slope | None:
 
 
 def _aligned(
-    source: PreparedView, target: PreparedView, guess: Float64, known: float
+    source: PreparedView, target: PreparedView, guess: Float64, initial: float
 ) -> tuple[Float64, _Slope | None] | None:
-    """T_target_source (4, 4), and what the light of two views shows; None where they don't fit.
+    """Return T_target_source (4, 4) and the slope of two views; None if they don't fit.
 
     Parameters
     ----------
     guess
-        (4, 4) T_target_source to start from.
-    known
-        Exponent as known so far.
+        (4, 4) initial T_target_source.
+    initial
+        Initial exponent.
     """
-    T = _fitted(source, target, guess, _BY_SHAPE)
-    shown = None if T is None else _slope(source, target, T)
-    if T is not None and shown is not None:
-        return T, shown
-    T, exponent, shown = guess, known, None
-    for _ in range(_ROUNDS):
-        lit = _without(source, exponent), _without(target, exponent)
-        found = _fitted(*lit, T, _BY_LIGHT)
-        if found is None:
+    T = _constrained_pose(source, target, guess, _GEOMETRIC)
+    slope = None if T is None else _slope(source, target, T)
+    if T is not None and slope is not None:
+        return T, slope
+    T, exponent, slope = guess, initial, None
+    for _ in range(_MAX_ROUNDS):
+        compensated = _compensated(source, exponent), _compensated(target, exponent)
+        pose = _constrained_pose(*compensated, T, _PHOTOMETRIC)
+        if pose is None:
             return None
-        T, shown = found, _slope(source, target, found)
-        if shown is None or abs(shown.exponent - exponent) < _SETTLED:
-            return T, shown
-        exponent = shown.exponent
+        T, slope = pose, _slope(source, target, pose)
+        if slope is None or abs(slope.exponent - exponent) < _CONVERGED:
+            return T, slope
+        exponent = slope.exponent
     return T, None
 
 
-def _fitted(
+def _constrained_pose(
     source: PreparedView, target: PreparedView, guess: Float64, options: ProjectiveOptions
 ) -> Float64 | None:
-    """T_target_source (4, 4), if the views fit, and hold it in every direction."""
-    found = align(source, [Target(target, np.eye(4))], guess, options)
-    if not found.converged or found.inlier_share < _FITS or len(found.unobservable):
+    """Return T_target_source (4, 4), if the views fit and constrain it in all directions."""
+    aligned = align(source, [Target(target, np.eye(4))], guess, options)
+    if not aligned.converged or aligned.inlier_share < _MIN_INLIERS or len(aligned.unobservable):
         return None
-    return found.T_world_source
+    return aligned.T_world_source
 
 
-def _without(view: PreparedView, exponent: float) -> PreparedView:
-    """A view with the falloff taken off its albedo."""
+def _compensated(view: PreparedView, exponent: float) -> PreparedView:
+    """Return a view with an albedo that is compensated for the falloff."""
     x, y = np.moveaxis(view.rays, -1, 0)
     length2 = 1 + x * x + y * y
     more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
@@ -179,7 +181,7 @@ def _without(view: PreparedView, exponent: float) -> PreparedView:
 
 
 def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | None:
-    """Slope of the difference in log albedo over that in the log cosine; None without much motion.
+    """Regress the difference of log albedo on that of the log cosine; None without much motion.
 
     Parameters
     ----------
@@ -197,11 +199,11 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | N
     near = (z > 0) & (np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9)) < _NEAR_M + _NEAR * q[:, 2])
     lighter = target.albedo[v, u, 0] - packed[inside, POINT_ALBEDO]
     near &= np.isfinite(lighter)
-    if np.count_nonzero(near) < _LEAST_POINTS:
+    if np.count_nonzero(near) < _MIN_POINTS:
         return None
     here, there = p[near, :2] / p[near, 2:], q[near, :2] / q[near, 2:]
-    moved = float(np.linalg.norm(there - here, axis=1).mean())
-    if moved < _MOVED:
+    motion = float(np.linalg.norm(there - here, axis=1).mean())
+    if motion < _MIN_MOTION:
         return None
     cosine = -0.5 * (np.log1p((there**2).sum(1)) - np.log1p((here**2).sum(1)))
     y = lighter[near].astype(np.float64)
@@ -214,4 +216,4 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | N
         off = y - slope * cosine
         off -= np.median(off[keep])
         keep = np.abs(off) < 3 * 1.48 * float(np.median(np.abs(off[keep]))) + 1e-9
-    return _Slope(slope, squares, moved)
+    return _Slope(slope, squares, motion)

@@ -1,4 +1,4 @@
-"""What became of every frame, in the order in which they came."""
+"""The log of frames: the record and the tracking result of each, in their order."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ class Entry:
 
     Attributes
     ----------
+    record
+        What is reported of it.
     step
-        None where it could not be read.
+        Its tracking result; None if it could not be read.
     recording
-        Number of the recording that it is of, where several are joined.
+        Number of its recording, if several are joined.
     T_odometry, gravity
-        What the recording knows of it beside the image.
+        Measurements of external sensors: (4, 4), (4,).
     moving
-        Fraction of its pixels that moved by themselves.
+        Fraction of its pixels on moving objects.
     """
 
     record: FrameRecord
@@ -50,7 +52,7 @@ class Entry:
 
 
 def record_of(frame: Frame, step: Step) -> FrameRecord:
-    """What is reported of a frame once it was tracked."""
+    """Return the record of a tracked frame."""
     r = step.registration
     return FrameRecord(
         frame.index,
@@ -70,10 +72,12 @@ class FrameLog:
 
     Attributes
     ----------
+    entries
+        One per frame.
     interruptions
         Positions at which another recording begins.
     repeated
-        Indices of the frames whose image is the one before, to the last pixel.
+        Indices of the frames whose image equals the one before in every pixel.
     """
 
     entries: list[Entry] = field(default_factory=list)
@@ -89,7 +93,7 @@ class FrameLog:
         T_odometry: Float64 | None = None,
         gravity: Float64 | None = None,
     ) -> None:
-        """Add the next frame; its prepared view is not kept here."""
+        """Add the next frame, without its prepared view."""
         moving = 0.0
         if step is not None:
             moving = 0.0 if step.moving is None else float(step.moving.mean())
@@ -98,14 +102,14 @@ class FrameLog:
         self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
 
     def check_posed(self) -> None:
-        """Raise InputError if no frame has a pose: there is nothing to make a model of."""
+        """Raise InputError if no frame has a pose."""
         if not self.posed:
             entries = self.entries
             raise InputError(
                 f"none of the {len(entries)} frames has enough valid points for a pose"
                 + (f" (first: {entries[0].record.reason})" if entries else ""),
                 where="recording",
-                remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
+                remedy="check it with `tofuse inspect`; the filters may be too strict for it",
             )
 
     @property
@@ -115,11 +119,11 @@ class FrameLog:
 
     @property
     def links(self) -> list[Link]:
-        """All that were found on the way."""
+        """All links between components that were found while tracking."""
         return [link for e in self.posed if e.step is not None for link in e.step.links]
 
     def of(self, frames: Collection[int]) -> FrameLog:
-        """The part of the log with these frames."""
+        """Return the part of the log with these frame indices."""
         kept = set(frames)
         rows = [k for k, e in enumerate(self.entries) if e.record.index in kept]
         starts = [int(np.searchsorted(rows, at)) for at in self.interruptions]
@@ -130,16 +134,16 @@ class FrameLog:
         )
 
     def of_component(self, component: int) -> FrameLog:
-        """The part of the log in one component of the tracker."""
-        found = [
+        """Return the part of the log in one component of the tracker."""
+        members = [
             e.record.index
             for e in self.posed
             if e.step is not None and e.step.component == component
         ]
-        return self.of(found)
+        return self.of(members)
 
     def step_of(self, frame: int) -> Step:
-        """The step of a frame with a pose."""
+        """Return the tracking result of a frame with a pose."""
         if self._counted != len(self.entries):
             for entry in self.entries[self._counted :]:
                 if entry.step is not None:
@@ -148,7 +152,7 @@ class FrameLog:
         return self._steps[frame]
 
     def numbered(self, numbers: Mapping[int, int]) -> FrameLog:
-        """The log whose records say the final number of their component, by the tracker's."""
+        """Return the log with final component numbers in its records, by the tracker's numbers."""
         entries = [
             replace(e, record=replace(e.record, component=numbers[e.step.component]))
             if e.step is not None and e.has_pose
@@ -158,7 +162,7 @@ class FrameLog:
         return FrameLog(entries, self.interruptions, self.repeated)
 
     def stretches(self, views: ViewStore[PreparedView]) -> list[Stretch]:
-        """The components as they were tracked, in the order in which they began."""
+        """Return the components as tracked, in the order in which they began."""
         members: dict[int, list[Entry]] = {}
         for entry in self.posed:
             assert entry.step is not None
@@ -179,7 +183,7 @@ class FrameLog:
         return found
 
     def sensed(self, ids: Sequence[int]) -> SensorData:
-        """What the recording knows of some frames beside their images."""
+        """Return the measurements of external sensors for some frame indices."""
         by_index = {e.record.index: e for e in self.entries}
         odometry, gravity = np.full((len(ids), 4, 4), np.nan), np.full((len(ids), 4), np.nan)
         for k, index in enumerate(ids):
@@ -193,8 +197,16 @@ class FrameLog:
 
 
 def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:
-    """(4, 4) T_world_camera by index, the first of them the identity, of the given components."""
-    found: dict[int, Float64] = {}
+    """Return (4, 4) T_world_camera by frame index, the first one the identity.
+
+    Parameters
+    ----------
+    log
+        All frames.
+    T_world_component
+        (4, 4) by component, for those that are wanted.
+    """
+    poses: dict[int, Float64] = {}
     T_first: Float64 | None = None
     for entry in log.posed:
         step = entry.step
@@ -205,5 +217,5 @@ def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> d
         T = T_world_component[step.component] @ step.T_component_camera
         if T_first is None:
             T_first = se3.inverse(T)
-        found[entry.record.index] = np.asarray(T_first @ T, np.float64)
-    return found
+        poses[entry.record.index] = np.asarray(T_first @ T, np.float64)
+    return poses

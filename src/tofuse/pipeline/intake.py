@@ -1,4 +1,4 @@
-"""What is checked of a frame before anything is made of it."""
+"""Checks of frames before they are processed."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 
 class Intake:
-    """The order and the kind of frames, and whether an image is the one before.
+    """Checks the order and the kind of frames, and detects repeated images.
 
     Attributes
     ----------
     kind
-        Of the frames so far; None before the first.
+        Kind of the frames so far; None before the first.
     """
 
     def __init__(self) -> None:
         self.kind: ViewKind | None = None
         self._index: int | None = None
-        self._before: RangeFrame | None = None  # as the camera gave it
+        self._before: RangeFrame | None = None  # uncorrected
 
     def check_kind(self, frame: Frame) -> bool:
-        """Whether it is the first frame; InputError if it is of another kind than those before."""
+        """Return whether it is the first frame; InputError for another kind than those before."""
         kind = kind_of(frame)
         if self.kind and kind != self.kind:
             raise InputError(
@@ -35,7 +35,7 @@ class Intake:
         return self.kind is None
 
     def check_order(self, index: int) -> None:
-        """Raise InputError if the index of the next frame does not grow."""
+        """Raise InputError if the index of the next frame is not larger than the last one."""
         if self._index is not None and index <= self._index:
             raise InputError(
                 f"comes after frame {self._index}",
@@ -44,12 +44,12 @@ class Intake:
             )
 
     def accept(self, index: int, kind: ViewKind | None = None) -> None:
-        """Take note of a frame that passed all checks; its kind is None if it was not read."""
+        """Record a frame that passed all checks; its kind is None if it could not be read."""
         self._index = index
         self.kind = self.kind or kind
 
     def is_repeated(self, frame: Frame) -> bool:
-        """Whether an image is the one before: a camera that hangs, as noise never repeats."""
+        """Whether an image equals the one before: the camera hangs, as noise never repeats."""
         if not isinstance(frame, RangeFrame):
             return False
         before, self._before = self._before, frame
@@ -58,5 +58,5 @@ class Intake:
         return np.array_equal(before.depth, frame.depth) and len(frame) > 0
 
     def end(self) -> None:
-        """Keep no frame any longer."""
+        """Release the last frame."""
         self._before = None

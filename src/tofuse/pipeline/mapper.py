@@ -1,4 +1,4 @@
-"""The engine: frames go in one at a time, poses come out, and at the end a model."""
+"""The mapper: takes frames one at a time, returns their poses, and finally the model."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from tofuse.kernels.threads import serial_chunks, thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
 from tofuse.pipeline.assembly import Assembly
-from tofuse.pipeline.behind import Behind
-from tofuse.pipeline.checkpoint import NotKept, Stages
+from tofuse.pipeline.background_queue import BackgroundQueue
+from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config, check_views, from_method, kind_of
 from tofuse.pipeline.frame_log import FrameLog, record_of
 from tofuse.pipeline.intake import Intake
-from tofuse.pipeline.live import LivePoses
+from tofuse.pipeline.live_poses import LivePoses
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
@@ -46,9 +46,9 @@ class Mapper:
     threads
         How many threads to use; None: all cores. The result does not depend on it.
     loops
-        Loops known beforehand, in frame indices.
+        Given loops, in frame indices.
     progress
-        Hears about frames and stages.
+        Receives frames and stages.
     """
 
     def __init__(
@@ -69,15 +69,15 @@ class Mapper:
         self._progress = progress or Silent()
         self._intake = Intake()
         self._log = FrameLog()
-        self._behind = Behind()
+        self._queue = BackgroundQueue()
         self._ended = self._finished = False
-        self._begin()
+        self._start_method()
 
-    def _begin(self) -> None:
+    def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
         self._tracker = self.config.odometry.start(self.seed)
-        self._kept = Observations(self.config, self.seed, self._given)
-        self._live = LivePoses(self._kept.loops)
+        self._observations = Observations(self.config, self.seed, self._given)
+        self._live_poses = LivePoses(self._observations.loops)
         self._component = 0
 
     def push(
@@ -98,30 +98,30 @@ class Mapper:
         T_odometry
             (4, 4) T_world_camera from odometry, in any fixed world frame.
         gravity
-            (4,) unit vector in which things fall in the camera's frame, and its sigma in rad.
+            (4,) unit vector of gravity in the camera's frame, and its sigma in rad.
         history
-            Unfiltered frames just before this one, oldest first, for temporal filters; the
-            frames pushed before it unless given.
+            Unfiltered frames just before this one, oldest first, for temporal filters; by default
+            the frames pushed before.
         prepared
-            What `prepare` made of the frame, if it was asked to.
+            The result of `prepare` for the frame, if it was called.
 
         Returns
         -------
-        T_world_camera (4, 4) as known so far, or None where the frame is lost or in a component
-        that is not connected to the first one yet. A loop that closes on the way counts some frames
-        later; the end joins components and moves all poses once more.
+        T_world_camera (4, 4) as known so far; None if the frame is lost, or in a component that is
+        not yet connected to the first one. Loops take effect some frames later; `finish` joins
+        components and moves all poses once more.
 
         Raises
         ------
         InputError
-            If the frame is of another kind than those before, or one that the configuration
-            can't work on, or its index does not grow.
+            If the frame is of another kind than those before, or of one that the configuration
+            does not support, or its index is not larger than those before.
         """
         self._check(frame)
         repeated = self._intake.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
-        # A search for a lost camera is worth dividing, while those who prepare frames are waiting.
+        # Chunks run serially while other threads prepare frames; else relocalization uses all.
         busy = prepared is not None and prepared.ready is not None
         with threads(self.threads), serial_chunks(busy):
             ready = self._prepare(frame, history, prepared)
@@ -136,7 +136,7 @@ class Mapper:
         with self.watch.timing("filters"):
             expected = None
             if self._log.entries and self._log.entries[-1].has_pose:
-                expected = self._tracker.expected(Moment(frame.index, frame.timestamp))
+                expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
             return self._preparation.ready(frame, expected, history, prepared)
 
     def _track(self, ready: Ready, T_odometry: Float64 | None, repeated: bool) -> Step:
@@ -162,44 +162,38 @@ class Mapper:
             ready = replace(ready, clean=ready.clean.keep(~step.moving))
         if not lost:
             with self.watch.timing("loops"):
-                self._kept.add(ready, step)
+                self._observations.add(ready, step)
             with self.watch.timing("fusion"):
-                self._behind.do(lambda: self._kept.add_to_model(frame, ready.clean, step))
-        self._behind.do(lambda: self._kept.sample(ready, lost=lost))
+                self._queue.submit(
+                    lambda: self._observations.add_to_model(frame, ready.clean, step)
+                )
+        self._queue.submit(lambda: self._observations.sample(ready, lost=lost))
 
     def _close_loops(self, step: Step) -> None:
-        """Let loops that were found some frames ago count in the present component."""
+        """Correct the present component by loops that were searched for some frames ago."""
         with self.watch.timing("loops"):
-            loops = self._live.follow(step, self._log)
+            loops = self._live_poses.update(step, self._log)
             if loops:
                 graph = self._assembly().graph(self._log, step.component, loops)
-                self._live.close(graph, self.config.optimiser.optimise(graph).graph)
+                self._live_poses.apply_loops(graph, self.config.optimiser.optimise(graph).graph)
 
     def _report(self, ready: Ready, step: Step) -> Float64 | None:
         self._progress.advance(self._log.entries[-1].record)
-        T_world_camera = self._live.pose(step)
+        T_world_camera = self._live_poses.pose(step)
         if T_world_camera is not None:
             self._progress.placed(ready.clean, T_world_camera)
         return T_world_camera
 
     def prepare(self, frame: Frame) -> Prepared | None:
-        """Make what can be made of a frame before its turn, for `push`; None if nothing can.
+        """Prepare a frame before its turn, for `push`, as far as that depends on it alone.
 
-        Other threads may ask for it while frames before it are pushed. It makes no difference to
-        what comes out.
+        May be called by other threads while earlier frames are pushed. The result of `push` does
+        not depend on it.
         """
         return self._preparation.ahead(frame, self._tracker)
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
-        """Record that a frame could not be read.
-
-        Parameters
-        ----------
-        index, timestamp
-            Frame index, larger than those before (else InputError), and s.
-        reason
-            Why it could not be read.
-        """
+        """Record a frame that could not be read; InputError if its index is not the largest."""
         self._check_open()
         self._intake.check_order(index)
         self._intake.accept(index)
@@ -207,13 +201,13 @@ class Mapper:
         self._progress.advance(self._log.entries[-1].record)
 
     def interrupt(self, config: Config | None = None) -> None:
-        """Say that the next frame begins another recording: the camera may be elsewhere by then.
+        """Begin another recording with the next frame: the motion is not continuous.
 
         Parameters
         ----------
         config
-            Its corrections, filters and odometry are for the frames of this recording, where they
-            are others than so far. Numbers of its components must not have been used before.
+            Provides corrections, filters and odometry of the new recording; None continues with
+            those so far. Numbers of its components must not have been used before.
         """
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
@@ -224,16 +218,16 @@ class Mapper:
 
     @property
     def log(self) -> FrameLog:
-        """What became of every frame so far."""
+        """The log of all frames so far."""
         return self._log
 
     @property
     def views(self) -> Sequence[PosedView[PreparedView]]:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
-        return self._kept.views.views
+        return self._observations.views.views
 
     def end(self) -> None:
-        """Say that no frame follows: what only they would ask for need not be kept any longer."""
+        """End tracking, and release what only further frames would need."""
         if not self._ended:
             self._intake.end()
             self._ended = True
@@ -245,7 +239,7 @@ class Mapper:
         Parameters
         ----------
         stages
-            Keeps what there is after each of these stages, and knows what a stopped job had.
+            Stores the result of each stage, and provides those of an interrupted job.
 
         Raises
         ------
@@ -256,23 +250,23 @@ class Mapper:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
         self._finished = True
         self._log.check_posed()
-        self._live.finish()
+        self._live_poses.finish()
         with self.watch.timing("fusion"):
-            self._behind.finish()
+            self._queue.finish()
         self.end()
-        result = self._assembly().run(self._log, stages or NotKept())
+        result = self._assembly().run(self._log, stages or NoCheckpoints())
         diagnostics = replace(
             result.diagnostics,
             removed=self._preparation.counts.shares,
             seconds=dict(self.watch.seconds),
-            samples=self._kept.samples.all,
+            samples=self._observations.samples.all,
         )
         return replace(result, diagnostics=diagnostics)
 
     def _assembly(self) -> Assembly:
         return Assembly(
             self.config,
-            self._kept,
+            self._observations,
             self._given,
             self._progress,
             self.watch,
@@ -287,7 +281,7 @@ class Mapper:
         if self._intake.check_kind(frame):
             if self._method is not None and kind == "cloud":
                 self.config = from_method(self._method, kind)
-                self._begin()
+                self._start_method()
             check_views(self.config, kind)
         self._intake.accept(frame.index, kind)
 
@@ -296,16 +290,16 @@ class Mapper:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but who hears of it, so that a copy can go on elsewhere."""
-        self._live.wait()  # they change what is kept here
-        self._behind.wait()
+        """Return everything but the progress, so that a copy can be resumed elsewhere."""
+        self._live_poses.wait()  # background jobs change this state
+        self._queue.wait()
         return {name: value for name, value in self.__dict__.items() if name != "_progress"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _progress=Silent())
 
-    def go_on(self, threads: int | None, progress: Progress) -> None:
-        """Go on as a copy: with so many threads (None: all cores), and telling `progress`."""
+    def resume(self, threads: int | None, progress: Progress) -> None:
+        """Resume a copy with a number of threads (None: all cores) and a new progress."""
         self.threads = threads if threads is not None else thread_count()
         self._progress = progress
         for entry in self._log.entries:

@@ -20,7 +20,7 @@ from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
-from tofuse.pipeline.checkpoint import NotKept
+from tofuse.pipeline.checkpoint import NoCheckpoints
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.paint import TEXTURE, paint
@@ -149,7 +149,7 @@ def merge_sessions(
         for session, first in zip(sessions, firsts, strict=True):
             mapper.interrupt(_config_of(session, first))
             own = replace(recording, indices=session.recording.indices + first)
-            push_frames(Tracked(mapper), own, session.config.window, NotKept())
+            push_frames(Tracked(mapper), own, session.config.window, NoCheckpoints())
         result = mapper.finish()
         progress.stage("comparing sessions")
         with use_threads(mapper.threads):

@@ -38,8 +38,8 @@ def thesis(kind: ViewKind) -> Config:
         method="thesis",
         filters=(Confidence(minimum=7), NeighbourShare(fraction=0.5, k=3)),
         odometry=Sequential(registration=icp, guess="previous"),
-        # Wide, because the trajectory has drifted when a loop closes; strict in what is accepted,
-        # because a wrong loop does more harm than a missing one.
+        # A wide search, as the trajectory has drifted when a loop closes; a strict verification, as
+        # a wrong loop does more harm than a missing one.
         loops=Nearby(
             max_distance_m=1.5,
             max_yaw_rad=0.8,
@@ -53,18 +53,18 @@ def thesis(kind: ViewKind) -> Config:
 
 
 def default(kind: ViewKind) -> Config:
-    """Return what `tofuse run` does unless another method is asked for.
+    """Return the default method of `tofuse run`.
 
-    Range images get their noise model and lose multipath, as far as that helps, and are aligned
-    with keyframes by planes and albedo; only what goes into the model is filtered further. Places
-    that are seen again close loops, and all views are refined together. Clouds are registered in
-    pairs, as far as their poses are believed, and moved to the planes that all of them share.
+    Range images get a noise model, multipath is compensated if views show it, and they are aligned
+    with keyframes by planes and albedo; views of the model are filtered further. Revisited places
+    close loops, and all views are refined jointly. Clouds are registered in pairs, as far as their
+    poses are believed, and refined by the planes that they share.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
         return replace(
             base,
-            filters=(),  # where a cloud was seen from shows in how its points are spread
+            filters=(),  # the density of its points shows from where a cloud was seen
             odometry=Pairwise(),
             loops=Nearby(
                 max_distance_m=1.5,
@@ -78,14 +78,14 @@ def default(kind: ViewKind) -> Config:
     return replace(
         base,
         corrections=(Noise(), Multipath()),
-        # What the camera itself takes for no measurement is none: phones fill gaps in with guesses.
+        # Pixels of zero confidence are no measurements: phones fill gaps by interpolation.
         filters=(Confidence(minimum=1),),
         model_filters=(Wrapped(), Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),
         loops=Revisits(),
-        # Not for clouds: it believes what a registration says of its errors, and ICP's is too good.
+        # Not for clouds: it relies on the covariance of registrations, and ICP's is too small.
         optimiser=LevenbergMarquardt(),
         refinement=Joint(),
-        # Odometry only when asked for: a file beside the images may be of anything.
+        # Odometry only on request: a file next to the images may be of any quality.
         outside=(GravityEdges(),),
     )

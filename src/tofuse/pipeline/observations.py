@@ -1,4 +1,4 @@
-"""What is kept of frames with a pose until the end: one store that all later stages ask."""
+"""The store of observations: what all stages after tracking need of frames with a pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.odometry.base import Step
-from tofuse.pipeline.backend import Kept
+from tofuse.pipeline.backend import BackEndInput
 from tofuse.pipeline.budget import views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
@@ -23,9 +23,9 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.samples import FrameSample, FrameSamples
 
-_KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
-_CHECKED_IMAGES = 60  # how many images are compared with each other in the end
-# Views as the global stages take them: more pixels would not say more.
+_MAX_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
+_CHECKED_IMAGES = 60  # images that are compared with each other at the final poses
+# Width of stored views: more pixels do not improve loops and refinement.
 _COLUMNS = 200
 
 
@@ -35,9 +35,9 @@ class Observations:
     Attributes
     ----------
     views
-        Prepared views of all components: joining, loops and refinement work on these.
+        Prepared views of all components, for joining, loops and refinement.
     loops
-        Loop detection at work, told of every frame.
+        The loop detector, which receives every frame.
     samples
         Some frames for the report.
     """
@@ -56,33 +56,33 @@ class Observations:
         self._knows_errors = False
 
     def add(self, ready: Ready, step: Step) -> None:
-        """Keep what joining, loops and refinement need of a frame with a pose."""
+        """Store what joining, loops and refinement need of a frame with a pose."""
         T, surface = step.T_component_camera, step.surface
         assert T is not None
         if isinstance(ready.frame, RangeFrame):
             self._ambiguity_m = ready.frame.ambiguity_m
         if surface is not None:
-            # Only who looks at surfaces states errors that can be relied on; ICP's are too small.
+            # Covariances of trackers with prepared views are realistic; those of ICP are too small.
             self._knows_errors = True
             if self.views.wants(surface.index, surface.depth, T, step.component):
                 self.views.push(surface.subsampled(_COLUMNS).without_caches(), T, step.component)
         view: Frame = ready.clean
-        # Who looks at surfaces leaves the points alone, which take long to make.
+        # Methods on prepared views need no points, which take long to compute.
         if surface is None or self.loops.points or self._refiner.points:
-            view = as_cloud(ready.clean, _KEPT_POINTS)
+            view = as_cloud(ready.clean, _MAX_POINTS)
         self.loops.push(view, T)
         self._refiner.push(view, T)
 
     def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
-        """Keep what the model and the verdict need of a frame with a pose."""
+        """Store what the model and the verdict need of a frame with a pose."""
         if isinstance(frame, RangeFrame):
             self._depths[frame.index] = _typical_range(frame)
             if isinstance(clean, RangeFrame):
                 self._checks.add(lambda: restore_thinned(frame, clean))
-        self._model.add(clean, step.surface, _KEPT_POINTS)
+        self._model.add(clean, step.surface, _MAX_POINTS)
 
     def sample(self, ready: Ready, *, lost: bool) -> None:
-        """Keep a small picture of some frames, for the report."""
+        """Store a small picture of some frames, for the report."""
         frame, filtered, clean = ready.frame, ready.filtered, ready.clean
         if (
             isinstance(frame, RangeFrame)
@@ -91,9 +91,9 @@ class Observations:
         ):
             self.samples.take(lost=lost, make=partial(FrameSample.of, frame, filtered, clean))
 
-    def at_the_end(self) -> Kept:
-        """What the back end works on."""
-        return Kept(
+    def for_back_end(self) -> BackEndInput:
+        """Return the input of the back end."""
+        return BackEndInput(
             self.loops,
             self._refiner,
             self._model,
@@ -106,7 +106,7 @@ class Observations:
 
 
 def _typical_range(frame: RangeFrame) -> float:
-    """Median radial range of some of the pixels, m; 0 where nothing is valid."""
+    """Return the median radial range of a subset of the pixels, m; 0 without valid ones."""
     ranges = frame.depth[::4, ::4]
     if frame.depth_kind == "z":
         ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
@@ -115,15 +115,15 @@ def _typical_range(frame: RangeFrame) -> float:
 
 
 class _EvenSample:
-    """Keeps at most `size` items of an endless stream, evenly spaced."""
+    """Keeps at most `size` items of a stream of unknown length, evenly spaced."""
 
     def __init__(self, size: int) -> None:
         self.items: list[RangeFrame] = []
         self._size, self._step, self._count = size, 1, 0
 
-    def add(self, made: Callable[[], RangeFrame]) -> None:
+    def add(self, make: Callable[[], RangeFrame]) -> None:
         if self._count % self._step == 0:
-            self.items.append(made())
+            self.items.append(make())
             if len(self.items) > self._size:
                 self.items = self.items[::2]
                 self._step *= 2

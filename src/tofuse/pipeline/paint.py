@@ -1,4 +1,4 @@
-"""The texture of a finished model, from frames that are read once more."""
+"""The texture of a finished model, from frames that are read again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import UnreadableFrameError
-from tofuse.fusion.texture import LitView, Textured, textured
+from tofuse.fusion.texture import Textured, TextureView, textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.pipeline.progress import Progress, Silent
@@ -15,12 +15,12 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 
-# Views that give their colours, and triangles that are painted at most: more of either are hardly
-# seen, and take long to lay out.
+# Maximum number of views and of textured triangles: more are hardly visible, and take long to lay
+# out.
 _VIEWS, _FACES = 60, 60_000
-# One radian of motion blurs as much as so many metres.
-_METRES_A_RADIAN = 1.0
-TEXTURE = 2048  # texels, where no size is given
+# Metres of motion that blur as much as one radian.
+_METRES_PER_RADIAN = 1.0
+TEXTURE = 2048  # default size in texels
 
 
 def paint(
@@ -30,23 +30,27 @@ def paint(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Textured | None:
-    """Make the texture of a model's surface; None where there is no surface, or nothing to see.
+    """Make the texture of a model's surface; None without a surface, colour and amplitude.
 
     Parameters
     ----------
+    recording, result
+        The recording and its reconstruction.
     size
         Edge of the texture, in texels.
     threads
-        How many to use; None: all cores. The result does not depend on it.
+        Number of threads; None: all cores. The result does not depend on it.
+    progress
+        Receives the stage.
     """
     mesh = result.mesh
     if mesh is None or not len(mesh.faces):
         return None
-    chosen = steady(result)
+    chosen = steadiest_frames(result)
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(chosen))
-    views: list[LitView] = []
+    views: list[TextureView] = []
     poses = []
     for k in chosen:
         progress.advance()
@@ -56,7 +60,7 @@ def paint(
             continue
         for corrector in correctors:
             frame = corrector.apply(frame)
-        view = LitView.of(frame) if isinstance(frame, RangeFrame) else None
+        view = TextureView.of(frame) if isinstance(frame, RangeFrame) else None
         if view is not None and (not views or view.light.shape == views[0].light.shape):
             views.append(view)
             poses.append(result.trajectory[k])
@@ -67,20 +71,20 @@ def paint(
         return textured(mesh.decimated(_FACES), views, np.array(poses), size)
 
 
-def steady(result: Reconstruction, most: int = _VIEWS) -> list[int]:
-    """Return frames that were tracked, spread evenly, and of each stretch the one that moved least.
+def steadiest_frames(result: Reconstruction, max_frames: int = _VIEWS) -> list[int]:
+    """Return positions of tracked frames: the one with the least motion blur of each stretch.
 
-    Motion blurs; the first frame of the recording is number 0, whatever its index.
+    Stretches have equal numbers of frames, at most `max_frames` of them.
     """
     tracked = [k for k, f in enumerate(result.diagnostics.frames) if f.status == "tracked"]
     posed = np.array([k for k in tracked if result.has_pose[k]], np.intp)
-    if len(posed) <= most:
+    if len(posed) <= max_frames:
         return [int(k) for k in posed]
     motion = se3.log(se3.inverse(result.trajectory[posed[:-1]]) @ result.trajectory[posed[1:]])
     step = np.linalg.norm(motion[:, :3], axis=1)
-    step += _METRES_A_RADIAN * np.linalg.norm(motion[:, 3:], axis=1)
+    step += _METRES_PER_RADIAN * np.linalg.norm(motion[:, 3:], axis=1)
     speed = np.maximum(np.r_[step[:1], step], np.r_[step, step[-1:]])
     return [
         int(part[np.argmin(speed[np.searchsorted(posed, part)])])
-        for part in np.array_split(posed, most)
+        for part in np.array_split(posed, max_frames)
     ]

@@ -1,4 +1,4 @@
-"""Registering two files or frames: opened, moved near the origin, registered, written."""
+"""Registration of two files or frames: open, move near the origin, register, write."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from tofuse.registration.register import register
 from tofuse.results.folder import OutputFolder
 from tofuse.results.pair import LocalView, PairResult, pair_folder, write_pair
 
-# Clouds this far out are registered about their middle: errors of rotation would have long levers.
+# Clouds this far from the origin are centred first: rotation errors would have long lever arms.
 FAR_M = 1000.0
 
 
 @dataclass(frozen=True)
 class PairOptions:
-    """What can be asked for beside the two views.
+    """Options of the registration of two views.
 
     Attributes
     ----------
     guess
-        File with the T_target_source to start from; see `read_pose`.
+        File with the initial T_target_source; see `read_pose`.
     out
-        Folder for the result, which is only returned unless given.
+        Folder for the result; None writes none.
     overwrite
         Whether an earlier registration there is replaced.
     format, camera, topic
-        As of `open_recording`. The camera is that of all inputs that store images.
+        As in `open_recording`. The camera is that of all inputs that store images.
     threads
-        How many are used; None for all.
+        Number of threads; None for all cores.
     """
 
     guess: Path | None = None
@@ -81,7 +81,7 @@ def register_files(
 
 
 def exit_status(result: PairResult) -> int:
-    """Return 0 if the pose is believed, 3 if it is not, or cannot be verified."""
+    """Return 0 if the pose is believed, 3 if not or if it can't be verified."""
     return 0 if result.found.believed else 3
 
 
@@ -94,7 +94,7 @@ def _registered(
     if guess is not None:
         start = guess.copy()
         start[:3, 3] += guess[:3, :3] @ data.center - model.center
-        # Made a rotation here: rounded entries would move what lies far from the origin.
+        # Projected onto a rotation: rounded entries would move points far from the origin.
         start = se3.orthonormalise(start)
     progress.stage("registering")
     began = perf_counter()
@@ -105,7 +105,7 @@ def _registered(
 
 
 def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleView, SingleView]:
-    """Open both views; one of two may be a cloud, for which a camera means nothing."""
+    """Open both views; one of them may be a cloud, which needs no camera."""
     views: list[SingleView] = []
     refusals: list[InputError] = []
     for name in (source, target):
@@ -128,10 +128,10 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
 def _near_origin(
     source: SingleView, target: SingleView, guess: Float64 | None
 ) -> tuple[LocalView, LocalView]:
-    """Move clouds that lie far out near the origin.
+    """Move clouds that are far from the origin near it.
 
-    Without a guess, clouds that lie near each other are moved by the same, so that the identity
-    stays what it is; else each goes to its own middle, where the registration starts.
+    Without a guess, clouds near each other are shifted equally, so that the identity keeps its
+    meaning; else each is centred, where the registration starts.
     """
     boxes = [_box(view) for view in (source, target)]
     if not any(np.abs(box).max() > FAR_M for box in boxes):
@@ -145,16 +145,16 @@ def _near_origin(
         reach = np.ptp(boxes[0], axis=0).max() + np.ptp(boxes[1], axis=0).max()
         if np.linalg.norm(centers[0] - centers[1]) <= reach:
             centers[0] = centers[1]
-    return _moved(source, centers[0]), _moved(target, centers[1])
+    return _shifted(source, centers[0]), _shifted(target, centers[1])
 
 
 def _box(view: SingleView) -> Float64:
-    """Corners (2, 3) around the middle of a view's points, in the coordinates of its file."""
-    middle: Float64 = np.percentile(view.frame.points.astype(float), [5, 95], axis=0)
-    return middle + view.shift
+    """Return the corners (2, 3) of the box of 90 % of the points, in the file's coordinates."""
+    box: Float64 = np.percentile(view.frame.points.astype(float), [5, 95], axis=0)
+    return box + view.shift
 
 
-def _moved(view: SingleView, center: Float64) -> LocalView:
+def _shifted(view: SingleView, center: Float64) -> LocalView:
     frame = view.frame
     if isinstance(frame, CloudFrame):
         step = view.shift - center

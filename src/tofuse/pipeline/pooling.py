@@ -1,4 +1,4 @@
-"""One estimate from several that differ by more than their noise."""
+"""Robust pooling of estimates that differ by more than their noise."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tofuse.arrays import Float64
 _FREEDOM = 4.0
 # Grid of the pooled value, in spreads of the estimates, and of both deviations.
 _VALUES, _DEVIATIONS = 121, 14
-_WIDE, _NARROW, _BROAD = 6.0, 0.02, 5.0
+_VALUE_RANGE, _MIN_DEVIATION, _MAX_DEVIATION = 6.0, 0.02, 5.0
 
 
 def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
-    """Pool estimates by a random-effects model with Student's t, which outliers hardly move.
+    """Pool estimates by a random-effects model with Student's t, which is robust to outliers.
 
     The k-th estimate is t-distributed about the pooled value, with the squared scale ``tau^2 +
     s^2 / information_k``: tau is how much the estimates truly differ, s the unit of the noise
@@ -39,11 +39,11 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     if not spread:
         return centre, 0.0
     known = information / float(np.median(information))
-    # No further than the estimates themselves, but for what is as good as one of them.
-    lowest = max(centre - _WIDE * spread, float(estimates.min()) - spread)
-    highest = min(centre + _WIDE * spread, float(estimates.max()) + spread)
+    # Within the range of the estimates, extended by their spread.
+    lowest = max(centre - _VALUE_RANGE * spread, float(estimates.min()) - spread)
+    highest = min(centre + _VALUE_RANGE * spread, float(estimates.max()) + spread)
     values = np.linspace(lowest, highest, _VALUES)
-    scales = spread * np.geomspace(_NARROW, _BROAD, _DEVIATIONS)
+    scales = spread * np.geomspace(_MIN_DEVIATION, _MAX_DEVIATION, _DEVIATIONS)
     value, tau, s = np.meshgrid(values, scales, scales, indexing="ij")
     logs = np.zeros(value.shape)
     for estimate, share in zip(estimates, known, strict=True):

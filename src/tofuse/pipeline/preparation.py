@@ -1,4 +1,4 @@
-"""What is made of a frame before it is tracked: corrected, filtered, and prepared for alignment."""
+"""Preparation of a frame for tracking: corrected, filtered, and prepared for alignment."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from tofuse.registration.prepared_view import PreparedView
 
 @dataclass(frozen=True, eq=False)
 class Ready:
-    """A frame as corrected, as filtered for tracking, and as cleaned for the model.
+    """A frame as corrected, as filtered for tracking, and as filtered for the model.
 
     Attributes
     ----------
+    frame, filtered, clean
+        Corrected; filtered for tracking; filtered for the model.
     removals
         What each filter removed.
     surface
-        The filtered view prepared for tracking, where that could be done before its turn.
+        The filtered view prepared for tracking, if that was done in advance.
     """
 
     frame: Frame
@@ -36,14 +38,16 @@ class Ready:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What can be made of a frame before its turn.
+    """The result of preparing a frame in advance.
 
     Attributes
     ----------
     frame
-        Corrected by so many (`corrected`) of the corrections: those up to the first that must wait.
+        The frame after the first `corrected` corrections, up to one that depends on other frames.
+    corrected
+        Number of corrections that were applied.
     ready
-        What was made of it then, if none had to.
+        The prepared frame, if no step depends on other frames.
     """
 
     frame: Frame
@@ -53,13 +57,13 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Counts:
-    """How many points filters saw and removed, by name."""
+    """Number of points that each filter saw and removed, by its name."""
 
     seen: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
 
     def add(self, removal: Removal) -> None:
-        """Count what a filter removed of a frame."""
+        """Count the points that a filter removed from a frame."""
         self.seen[removal.name] = self.seen.get(removal.name, 0) + removal.seen
         self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
@@ -70,17 +74,19 @@ class Counts:
 
 
 class Preparation:
-    """Corrections and filters at work on one recording.
+    """Corrects and filters the frames of one recording.
 
     Parameters
     ----------
+    config
+        Names the corrections and filters.
     counts
-        Of the recordings before, which these are added to.
+        Counts of earlier recordings, to add to.
 
     Attributes
     ----------
     counts
-        What filters removed so far.
+        Points removed by filters so far.
     """
 
     def __init__(self, config: Config, counts: Counts | None = None) -> None:
@@ -90,9 +96,9 @@ class Preparation:
         self._history: deque[Frame] = deque(maxlen=config.window - 1)
 
     def ahead(self, frame: Frame, tracker: Tracker) -> Prepared | None:
-        """Make what can be made of a frame before its turn; None if nothing can.
+        """Prepare a frame in advance, as far as that depends on it alone; None if it doesn't.
 
-        Other threads may call it while frames before it are tracked; results don't depend on it.
+        May be called by other threads while earlier frames are tracked; results don't depend on it.
         """
         if not isinstance(frame, RangeFrame):
             return None
@@ -117,16 +123,18 @@ class Preparation:
         history: Sequence[Frame] | None,
         prepared: Prepared | None,
     ) -> Ready:
-        """Correct and filter the frame whose turn it is.
+        """Correct and filter the next frame.
 
         Parameters
         ----------
+        frame
+            As recorded.
         T_expected
-            (4, 4) where the camera is expected, in the frame of the present component.
+            (4, 4) predicted pose in the present component.
         history
-            Unfiltered frames just before this one, oldest first; those of before unless given.
+            Unfiltered frames just before this one, oldest first; None for those pushed before.
         prepared
-            What `ahead` made of it.
+            The result of `ahead`, if it was called.
         """
         past = tuple(self._corrected(f) for f in (self._history if history is None else history))
         frame = self._corrected(frame, T_expected, prepared)
@@ -139,19 +147,19 @@ class Preparation:
         return ready
 
     def placed(self, frame: Frame, T_component_camera: Float64) -> None:
-        """Tell the corrections where a frame is, in the frame of the present component."""
+        """Pass the pose (4, 4) of a frame in the present component to the corrections."""
         for corrector in self._correctors:
             corrector.add_pose(frame, T_component_camera)
 
     def begin_component(self) -> None:
-        """Forget what corrections know of places: their frame is another one now."""
+        """Reset the maps of corrections: the coordinate frame is a new one."""
         for corrector in self._correctors:
             corrector.reset_poses()
 
     def _corrected(
         self, frame: Frame, T_expected: Float64 | None = None, prepared: Prepared | None = None
     ) -> Frame:
-        """Correct a frame, unless it is among those that were corrected last."""
+        """Correct a frame, unless it is among the last corrected ones."""
         for before in self._history:
             if before.index == frame.index:
                 return before

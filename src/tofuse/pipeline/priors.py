@@ -1,7 +1,7 @@
-"""What sensors beside the depth camera know of the poses, used as far as it agrees with tracking.
+"""Priors of external sensors, used as far as they agree with tracking.
 
-Gravity comes from an accelerometer; poses from odometry beside the images, or from the device that
-recorded them, as phones do (`recordings.phones`).
+Gravity comes from an accelerometer; poses from an odometry file next to the images, or from the
+device that recorded them, as phones do (`recordings.phones`).
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ Prior = Literal["auto", "none", "device"]
 
 
 def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Recording, Config]:
-    """Return the recording and the configuration that use what the device knows of its poses.
+    """Return the recording and the configuration with the chosen priors.
 
     Parameters
     ----------
+    recording, config
+        The recording and its configuration.
     prior
-        "none": nothing; "device": gravity if it is known, and the poses of the odometry or of the
-        device; "auto": what the configuration says, and where that listens to gravity, the poses of
-        the device as well.
+        "none": no external sensor; "device": gravity if known, and the poses of the odometry or of
+        the device; "auto": those of the configuration, and if it uses gravity, also the poses of
+        the device.
 
     Raises
     ------
     InputError
-        If the poses of the device are asked for, and there are none.
+        If the prior is "device" and the recording has no poses of its device.
     """
     if prior not in get_args(Prior):
         raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
@@ -42,24 +44,24 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         return recording, replace(config, outside=())
     if any(isinstance(sensor, OdometryEdges) for sensor in config.outside):
         return recording, config
-    listens = any(isinstance(sensor, GravityEdges) for sensor in config.outside)
+    uses_gravity = any(isinstance(sensor, GravityEdges) for sensor in config.outside)
     poses = recording.reference if POSES_BY in recording.metadata else None
-    if prior == "auto" and (not listens or poses is None):
+    if prior == "auto" and (not uses_gravity or poses is None):
         return recording, config
     if recording.odometry is None:
         if poses is None:
             raise InputError(
-                "is device, and the recording comes with no poses of its device",
+                "is device, and the recording has no poses of its device",
                 where="--prior",
-                remedy="put an odometry.txt beside the images, or use --prior auto",
+                remedy="put an odometry.txt next to the images, or use --prior auto",
             )
         recording = with_odometry(recording, poses)
-    gravity = () if listens else (GravityEdges(),)
+    gravity = () if uses_gravity else (GravityEdges(),)
     return recording, replace(config, outside=(*config.outside, *gravity, OdometryEdges()))
 
 
 @dataclass
-class _Led:
+class _WithOdometry:
     """A source with other odometry."""
 
     source: Source
@@ -70,8 +72,8 @@ class _Led:
 
 
 def with_odometry(recording: Recording, poses: Float64) -> Recording:
-    """The recording with poses (N, 4, 4) as its odometry."""
+    """Return the recording with poses (N, 4, 4) as its odometry."""
     of_source = np.full((len(recording.source.timestamps), 4, 4), np.nan)
     of_source[recording.indices] = poses
-    source: Any = _Led(recording.source, of_source)
+    source: Any = _WithOdometry(recording.source, of_source)
     return replace(recording, source=source)

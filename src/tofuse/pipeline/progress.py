@@ -1,4 +1,4 @@
-"""What a long job tells while it works."""
+"""Progress of long jobs: stages, steps, notes, and wall times."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from tofuse.results.types import FrameRecord
 
 
 class Progress(Protocol):
-    """Hears what a long job does; a terminal shows it, a test ignores it."""
+    """Receives the progress of a long job."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage of `total` steps (None: unknown)."""
         ...
 
     def advance(self, record: FrameRecord | None = None) -> None:
-        """Finish one step of the stage; `record` says what became of a frame."""
+        """Finish one step of the stage; with the record of a frame if it is one."""
         ...
 
     def note(self, text: str) -> None:
-        """Say something that a person should know."""
+        """Show a message to the user."""
         ...
 
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Show where a frame, as it is for the model, lies by what is known so far."""
+        """Show a frame of the model at its pose (4, 4) as known so far."""
         ...
 
 
 class Silent:
-    """Hears and says nothing."""
+    """Ignores all progress."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """See `Progress`."""
@@ -51,7 +51,7 @@ class Silent:
 
 @dataclass(frozen=True)
 class Both:
-    """Tells two who listen."""
+    """Forwards progress to two receivers."""
 
     first: Progress
     second: Progress
@@ -79,7 +79,7 @@ class Both:
 
 @dataclass
 class Stopwatch:
-    """Wall time of each stage, summed over its visits."""
+    """Wall time of each stage in s, summed over its blocks."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 

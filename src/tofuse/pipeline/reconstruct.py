@@ -1,4 +1,4 @@
-"""From a recording to a model."""
+"""Reconstruction of a recording: adapt the configuration, track, finish, self-calibrate."""
 
 from __future__ import annotations
 
@@ -13,28 +13,24 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float32, Float64
-from tofuse.corrections.noise import Noise
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
-from tofuse.filters.confidence import Confidence
 from tofuse.geometry import se3
-from tofuse.pipeline.checkpoint import NotKept, Stages
+from tofuse.pipeline.adaptation import adapted
+from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
-from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.self_calibration import self_calibrated
 from tofuse.pipeline.state_checks import check_tracked
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
-from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.phones import ARKIT_UP, POSES_BY
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
-from tofuse.sensor.noise import NOISE, NoiseModel
 
 _TRACKING = "tracking"
-# So many frames are read and prepared in advance; each takes some of its images' size.
+# Frames that are read and prepared in advance; each takes a multiple of its images' size.
 _AHEAD = 6
 
 
@@ -55,39 +51,47 @@ def reconstruct(
     Parameters
     ----------
     recording
-        What `tofuse.open` gives.
+        The recording, from `tofuse.open`.
     config
         A configuration or the name of one ("default", "thesis").
     seed
-        One seed, one result.
+        The result is reproducible for each seed.
     threads
-        How many threads to use; None: all cores. The result does not depend on it.
+        Number of threads; None: all cores. The result does not depend on it.
     loops
-        Loops known beforehand, in frame indices.
+        Given loops, in frame indices.
+    progress
+        Receives stages, frames and notes.
     stages
-        Keeps what there is after each stage, and knows what a stopped job had: of the same
+        Stores the result of each stage, and provides those of an interrupted job with the same
         recording, configuration and seed.
 
     Raises
     ------
     InputError
         If no frame can be read, or none has enough valid points for a pose; or if a filter can't
-        learn what it has to.
+        learn from the recording.
     """
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
-    config = learnt(fitted(config, recording), recording, threads, progress)
+    config = adapted(config, recording, threads, progress)
 
-    def once(by: Config, stages: Stages) -> Reconstruction:
-        return _once(recording, by, seed, threads, loops, progress, stages)
+    def reconstruct_with(config: Config, stages: Stages) -> Reconstruction:
+        # BLAS sums differ with its number of threads; ours don't.
+        with threadpool_limits(1):
+            mapper = _track(recording, config, seed, threads, loops, progress, stages)
+            result = mapper.finish(stages)
+        return _with_facts(result, recording, config)
 
-    result = once(config, stages or NotKept())
+    result = reconstruct_with(config, stages or NoCheckpoints())
     if not config.self_calibration:
         return result
-    return self_calibrated(result, config, lambda by: once(by, NotKept()), progress)
+    return self_calibrated(
+        result, config, lambda config: reconstruct_with(config, NoCheckpoints()), progress
+    )
 
 
-def _once(
+def _track(
     recording: Recording,
     config: Config,
     seed: int,
@@ -95,30 +99,32 @@ def _once(
     loops: Sequence[GivenLoop],
     progress: Progress,
     stages: Stages,
-) -> Reconstruction:
-    """Reconstruct a recording; see `reconstruct`."""
+) -> Mapper:
+    """Push all frames to a new mapper, or the remaining ones to that of an interrupted job."""
     progress.stage("tracking", len(recording))
-    # BLAS sums differ with its number of threads; ours don't.
-    with threadpool_limits(1):
-        tracked = stages.load(_TRACKING)
-        if tracked is None:
-            tracked = Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
-        else:
-            check_tracked(tracked, recording)
-        if tracked.done:
-            progress.note(f"goes on after frame {tracked.done} of a run that was stopped")
-        tracked.mapper.go_on(threads, progress)
-        if tracked.done < len(recording):
-            push_frames(tracked, recording, config.window, stages)
-            tracked.mapper.end()
-            _save(tracked, stages)
-        if len(tracked.unreadable) == len(recording):
-            raise InputError(
-                f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
-                where=recording.path,
-                remedy="check that the files are complete, or give --format",
-            )
-        result = tracked.mapper.finish(stages)
+    tracked: Tracked | None = stages.load(_TRACKING)
+    if tracked is None:
+        tracked = Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
+    else:
+        check_tracked(tracked, recording)
+    if tracked.done:
+        progress.note(f"resumes after frame {tracked.done} of an interrupted run")
+    tracked.mapper.resume(threads, progress)
+    if tracked.done < len(recording):
+        push_frames(tracked, recording, config.window, stages)
+        tracked.mapper.end()
+        _save(tracked, stages)
+    if len(tracked.unreadable) == len(recording):
+        raise InputError(
+            f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
+            where=recording.path,
+            remedy="check that the files are complete, or give --format",
+        )
+    return tracked.mapper
+
+
+def _with_facts(result: Reconstruction, recording: Recording, config: Config) -> Reconstruction:
+    """Add the facts about the recording, and the device's vertical where no sensor gave it."""
     result = described(result, describe(recording))
     if result.up is None and config.outside:
         result = replace(result, up=device_up(recording, result))
@@ -126,7 +132,7 @@ def _once(
 
 
 def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
-    """Say what a result, and those of its components, were made of."""
+    """Add facts about the recording to a result, and to those of its components."""
     components = tuple(
         c if c.result is None else replace(c, result=described(c.result, recording))
         for c in result.components
@@ -136,7 +142,7 @@ def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstructi
 
 @dataclass(eq=False)
 class Tracked:
-    """How far tracking has come: the mapper, how many frames it saw, and why some can't be read."""
+    """State of tracking: the mapper, the number of frames done, and errors of unreadable ones."""
 
     mapper: Mapper
     done: int = 0
@@ -144,14 +150,18 @@ class Tracked:
 
 
 def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Stages) -> None:
-    """Give the mapper the frames of a recording that it has not seen.
+    """Push the remaining frames of a recording to the mapper.
 
     Parameters
     ----------
+    tracked
+        The state of tracking, which is updated.
+    recording
+        The recording.
     window
-        How many frames the filters look at, the current one included.
+        Number of frames that filters look at, the current one included.
     stages
-        Is offered what there is, whenever it is due.
+        Stores the state whenever that is due.
     """
     mapper, odometry, gravity = tracked.mapper, recording.odometry, recording.gravity
     recent: dict[int, Frame] = {}
@@ -187,38 +197,6 @@ def _save(tracked: Tracked, stages: Stages) -> None:
         stages.save(_TRACKING, tracked)
 
 
-def fitted(config: Config, recording: Recording) -> Config:
-    """Return the configuration with what it leaves to the recording filled in.
-
-    Levels of confidence are put on the recording's own scale, and its noise model is chosen.
-
-    Raises
-    ------
-    InputError
-        If the recording has a noise.json that makes no sense.
-    """
-    corrections = tuple(
-        replace(c, model=_known_noise(recording)) if isinstance(c, Noise) and not c.model else c
-        for c in config.corrections
-    )
-    config = replace(config, corrections=corrections)
-    highest = recording.metadata.get("confidence_max")
-    if not isinstance(highest, int | float) or not 1 <= highest <= 255:
-        return config
-    scaled = (
-        tuple(f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in filters)
-        for filters in (config.filters, config.model_filters)
-    )
-    filters, model_filters = scaled
-    return replace(config, filters=filters, model_filters=model_filters)
-
-
-def _known_noise(recording: Recording) -> NoiseModel | None:
-    """Noise that the recording states, or its camera's family is known for."""
-    model = noise_model_for(recording)
-    return None if model == NOISE["unknown"] else model
-
-
 def view_kind(recording: Recording) -> ViewKind:
     """Return the kind of the recording's views: that of the first one that can be read."""
     frame = recording.first_readable()
@@ -228,10 +206,19 @@ def view_kind(recording: Recording) -> ViewKind:
 def past_frames(
     recording: Recording, index: int, count: int, known: Mapping[int, Frame] = MappingProxyType({})
 ) -> list[Frame]:
-    """Return the `count` readable frames of the source just before frame `index`, oldest first.
+    """Return readable frames just before a frame, oldest first.
 
-    They are the recording's own neighbours, whatever was selected of it, and of several joined
-    recordings those of the same one; `known` are frames that need not be read again.
+    They are neighbours in the source, whatever is selected of the recording, and of several joined
+    recordings those of the same one.
+
+    Parameters
+    ----------
+    recording, index
+        The recording, and the index of the frame.
+    count
+        Maximum number of frames.
+    known
+        Frames that need not be read again, by index.
     """
     first = part_start(recording, index)
     past = []
@@ -244,7 +231,7 @@ def past_frames(
 
 
 def part_start(recording: Recording, index: int) -> int:
-    """Return the first frame of the recording, of several joined ones, that frame `index` is of."""
+    """Return the index of the first frame of the part that frame `index` is in, if joined."""
     joined = recording.metadata.get("parts", ())
     starts = accumulate((part["frames"] for part in joined), initial=0)
     return max(start for start in starts if start <= index)
@@ -261,9 +248,9 @@ def describe(recording: Recording) -> dict[str, Any]:
 
 
 def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
-    """Return the unit vector (3,) against gravity in the result's world, as a phone's poses say.
+    """Return the upward unit vector (3,) in the result's world, by the poses of a phone.
 
-    None where the poses of the recording come from no such device, or share no frame with these.
+    None if the recording has no poses of such a device, or none of a frame with a pose here.
     """
     if recording.metadata.get(POSES_BY) != "ARKit" or recording.reference is None:
         return None
@@ -285,10 +272,9 @@ def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
 
 
 def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:
-    """Return the reference poses (N, 4, 4) in the result's world, NaN where there is none.
+    """Return the reference poses (N, 4, 4) in the result's world, NaN for frames without one.
 
-    The world is the first frame with a pose; where that has no reference, the first frame with
-    both decides.
+    They are aligned at the first frame with a pose in both.
     """
     reference = recording.reference
     if reference is None:

@@ -15,19 +15,19 @@ from tofuse.corrections.raw_amplitude import range_and_amplitude
 from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
+from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.budget import voxels_mb
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.judging import device_sentence
-from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.paint import TEXTURE, paint
 from tofuse.pipeline.priors import Prior, with_prior
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import (
-    fitted,
     past_frames,
     reconstruct,
     reference_in_world,
@@ -35,6 +35,7 @@ from tofuse.pipeline.reconstruct import (
     view_kind,
 )
 from tofuse.posegraph.given import read_loops
+from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
@@ -49,10 +50,17 @@ from tofuse.results.output import plain, read_run_json, write_result
 from tofuse.results.types import Reason, Reconstruction, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
-_CLOUDS = 12  # views drawn, where they are clouds
-# What may come of a state that was changed.
-_STRANGE = (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError)
-_LOOKED_AT = 8  # frames, for what they hold
+_DRAWN_CLOUDS = 12  # views in the report, if they are clouds
+# Errors that a modified checkpoint may cause.
+_STATE_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
+_SAMPLED = 8  # frames that are checked for what --unwrap needs
 
 
 @dataclass(frozen=True)
@@ -102,79 +110,118 @@ def run(
     progress = progress or Silent()
     if folder is None:
         check_free(options.out)
-    seed = _seed(options)
     watch = Stopwatch()
     with watch.timing("opening"):
-        opening = _opening(inputs, options)
-        recording = opening.open()
-        _preview(recording, progress)
-        config = resolve(options, view_kind(recording))
-        if not options.object:  # of an object that is the world no sensor knows the motion
-            recording, config = with_prior(recording, config, options.prior)
-        _check_guess(options, recording)
-        if options.unwrap:
-            _check_unwrap(recording)
-        config = learnt(fitted(config, recording), recording, options.threads, progress)
-        loops = (
-            read_loops(options.loops, frozenset(recording.indices.tolist()))
-            if options.loops
-            else ()
-        )
-        # At the start: what is wrong with a recording is told before hours of work.
-        findings = _findings(recording, turning=options.object)
-        if any(isinstance(part, Unwrap) for part in config.corrections):
-            findings = tuple(f for f in findings if f.code != "phase_wrap")
-        for warning in (*recording.warnings, *(str(f) for f in findings)):
-            progress.note(warning)
-    kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
-    overwrite = options.overwrite or bool(kept.fresh)
+        job = _open(inputs, options, progress)
+    checkpoints = Checkpoints(options.out, _key(inputs, options, job), progress.note)
+    overwrite = options.overwrite or bool(checkpoints.fresh)
     with (
         OutputFolder(options.out, overwrite=overwrite) if folder is None else nullcontext(folder)
     ) as out:
-        kept.begin(not is_result(options.out))
+        checkpoints.begin(not is_result(options.out))
         try:
             result = reconstruct(
-                recording,
-                config,
-                seed=seed,
+                job.recording,
+                job.config,
+                seed=job.seed,
                 threads=options.threads,
-                loops=loops,
+                loops=job.loops,
                 progress=progress,
-                stages=kept,
+                stages=checkpoints,
             )
-            size = config.fusion.texture
-            texture = None
-            if size:
-                with watch.timing("texture"):
-                    texture = paint(recording, result, size, options.threads, progress)
-            if size and texture is None:
-                progress.note("no texture: there is no surface, or neither colour nor amplitude")
-            result = with_findings(result, findings, turning=options.object)
-            result = replace(result, recording={**result.recording, "opening": opening.to_dict()})
-            if device := device_sentence(recording, result):
+            texture = _texture(job, result, options, progress, watch)
+            result = _with_job(result, job, options, watch)
+            if device := device_sentence(job.recording, result):
                 progress.note(device)
-            seconds = {**watch.seconds, **result.diagnostics.seconds}
-            result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
             progress.stage("writing")
             # BLAS sums differ with its number of threads, and its threads wait by spinning.
             with threadpool_limits(1):
                 write_result(
-                    result, out, lambda r, f: write_report_files(recording, config, r, f), texture
+                    result,
+                    out,
+                    lambda r, f: write_report_files(job.recording, job.config, r, f),
+                    texture,
                 )
-            kept.finish()
-        except _STRANGE as error:
-            kept.give_up(error)
-            if kept.used:  # somebody changed it; without it, an error is ours
-                raise kept.unusable(error) from error
+            checkpoints.finish()
+        except _STATE_ERRORS as error:
+            checkpoints.give_up(error)
+            if checkpoints.used:  # it was modified; without a checkpoint, an error is ours
+                raise checkpoints.unusable(error) from error
             raise
         except BaseException as error:
-            kept.give_up(error)
+            checkpoints.give_up(error)
             raise
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A recording and how it is reconstructed.
+
+    `findings` are problems of the recording that a quick inspection found.
+    """
+
+    opening: Opening
+    recording: Recording
+    config: Config
+    seed: int
+    loops: tuple[GivenLoop, ...]
+    findings: tuple[Finding, ...]
+
+
+def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) -> _Job:
+    """Open and inspect the recording, and resolve its configuration."""
+    seed = _seed(options)
+    opening = _opening(inputs, options)
+    recording = opening.open()
+    _preview(recording, progress)
+    config = resolve(options, view_kind(recording))
+    if not options.object:  # no sensor measures the motion relative to a moving object
+        recording, config = with_prior(recording, config, options.prior)
+    _check_guess(options, recording)
+    if options.unwrap:
+        _check_unwrap(recording)
+    config = adapted(config, recording, options.threads, progress)
+    indices = frozenset(recording.indices.tolist())
+    loops = tuple(read_loops(options.loops, indices)) if options.loops else ()
+    # At the start, so that problems of the recording are reported before hours of work.
+    findings = _findings(recording, turning=options.object)
+    if any(isinstance(part, Unwrap) for part in config.corrections):
+        findings = tuple(f for f in findings if f.code != "phase_wrap")
+    for warning in (*recording.warnings, *(str(f) for f in findings)):
+        progress.note(warning)
+    return _Job(opening, recording, config, seed, loops, findings)
+
+
+def _texture(
+    job: _Job, result: Reconstruction, options: Options, progress: Progress, watch: Stopwatch
+) -> Textured | None:
+    """Make the texture if one is configured, and note if there is nothing to make it of."""
+    size = job.config.fusion.texture
+    if not size:
+        return None
+    with watch.timing("texture"):
+        texture = paint(job.recording, result, size, options.threads, progress)
+    if texture is None:
+        progress.note("no texture: there is no surface, or neither colour nor amplitude")
+    return texture
+
+
+def _with_job(
+    result: Reconstruction, job: _Job, options: Options, watch: Stopwatch
+) -> Reconstruction:
+    """Add findings, how the recording was opened, and times to the result."""
+    result = with_findings(result, job.findings, turning=options.object)
+    seconds = {**watch.seconds, **result.diagnostics.seconds}
+    return replace(
+        result,
+        recording={**result.recording, "opening": job.opening.to_dict()},
+        diagnostics=replace(result.diagnostics, seconds=seconds),
+    )
+
+
 def _opening(inputs: Sequence[str | Path], options: Options) -> Opening:
-    """How the recording is opened, which the result remembers."""
+    """Return how the recording is opened, which the result states."""
     return Opening(
         tuple(Path(path) for path in inputs),
         options.format,
@@ -188,35 +235,29 @@ def _opening(inputs: Sequence[str | Path], options: Options) -> Opening:
 
 
 def _preview(recording: Recording, progress: Progress) -> None:
-    """Show the first frame before any work begins: there the first pose will be."""
+    """Show the first frame before any work begins, at the first pose."""
     frame = recording.first_readable()
     if frame is not None:
         progress.placed(frame, np.eye(4))
 
 
-def _key(
-    inputs: Sequence[str | Path],
-    options: Options,
-    recording: Recording,
-    config: Config,
-    seed: int,
-) -> str:
-    """Digest of all that decides the result: what is read and how, and the program."""
+def _key(inputs: Sequence[str | Path], options: Options, job: _Job) -> str:
+    """Return a digest of everything that determines the result: input, options, program."""
     facts = {
-        "config": plain(config.to_dict()),
-        "seed": seed,
-        "format": recording.format,
+        "config": plain(job.config.to_dict()),
+        "seed": job.seed,
+        "format": job.recording.format,
         "topic": options.topic,
-        "frames": recording.indices.tolist(),
+        "frames": job.recording.indices.tolist(),
         "average_still": options.average_still,
     }
-    beside = (options.camera, options.loops)
-    files = [Path(path) for path in (*inputs, *beside) if path is not None]
+    option_files = (options.camera, options.loops)
+    files = [Path(path) for path in (*inputs, *option_files) if path is not None]
     return digest(facts, files, without=options.out)
 
 
 def _findings(recording: Recording, *, turning: bool) -> tuple[Finding, ...]:
-    """What a quick look finds; nothing, if the frames that it looks at can't be read."""
+    """Return the findings of a quick inspection; none if its frames can't be read."""
     try:
         return inspect_recording(recording, turning=turning, quick=True).findings
     except InputError:
@@ -226,19 +267,18 @@ def _findings(recording: Recording, *, turning: bool) -> tuple[Finding, ...]:
 def with_findings(
     result: Reconstruction, findings: Sequence[Finding], *, turning: bool = False
 ) -> Reconstruction:
-    """Return the result with what a look at the recording found, which may change the verdict.
+    """Return the result with the findings of an inspection, which may change the verdict.
 
-    Behind a turning object it does not matter that what is far is measured as if it were near: the
-    background is left out.
+    Wrapped background behind a turning object does not matter, as it is left out.
     """
     indices = [f.index for f in result.diagnostics.frames]
-    everything = ((indices[0], indices[-1]),)
-    told = [
-        Reason("faulty_recording", everything, f"{f.text} {f.remedy}")
+    whole = ((indices[0], indices[-1]),)
+    severe = [
+        Reason("faulty_recording", whole, f"{f.text} {f.remedy}")
         for f in findings
         if f.severity == "severe" and not (turning and f.code == "phase_wrap")
     ]
-    reasons = ranked((*result.diagnostics.reasons, *told))
+    reasons = ranked((*result.diagnostics.reasons, *severe))
     verdict = verdict_of(reasons)
     recording = {
         **result.recording,
@@ -282,7 +322,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         low = options.min_depth or 0.0
         if options.max_depth is not None and options.max_depth <= low:
             raise InputError(
-                f"is {options.max_depth} m and the least depth {low} m",
+                f"is {options.max_depth} m and the minimum depth {low} m",
                 where="--max-depth",
                 remedy="give a larger one",
             )
@@ -293,11 +333,11 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     if options.object:
         if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
             front.append({"part": "background"})
-        # What the lens scatters stays where it is in the image, and holds the object back.
+        # Scattered light of the background is fixed to the image, and drags the object along.
         names = [item["part"] for item in corrections]
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
-        # The world is the object, of which neither gravity nor the camera's odometry knows.
+        # Neither gravity nor the camera's odometry applies to the frame of a moving object.
         config = changed(config, {"outside": []}, where="--object")
     if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
         corrections.insert(0, {"part": "unwrap"})
@@ -308,8 +348,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
 
 
 def _check_unwrap(recording: Recording) -> None:
-    """Refuse what can't be unwrapped before work starts."""
-    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_LOOKED_AT)):
+    """Raise InputError if the recording can't be unwrapped."""
+    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_SAMPLED)):
         raise InputError(
             "the recording can't be unwrapped: that needs its amplitude, and the range after which "
             "the phase of its camera repeats",
@@ -331,9 +371,9 @@ def _seed(options: Options) -> int:
 def _check_guess(options: Options, recording: Recording) -> None:
     if options.guess == "odometry" and recording.odometry is None:
         raise InputError(
-            "is odometry, and the recording holds none",
+            "is odometry, and the recording has none",
             where="--guess",
-            remedy="put an odometry.txt beside the images, or use --guess previous",
+            remedy="put an odometry.txt next to the images, or use --guess previous",
         )
 
 
@@ -346,7 +386,7 @@ def exit_status(result: Reconstruction) -> int:
 def write_report_files(
     recording: Recording, config: Config, result: Reconstruction, folder: Path
 ) -> None:
-    """Write what of a result is for people into a folder: `report.html`, and the viewer's data."""
+    """Write `report.html` and the data of the viewer into a folder."""
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw
@@ -357,14 +397,14 @@ def write_report_files(
     component = component_number(folder)
     if component is not None:
         title += f", component {component}"
-        truth = None  # nothing connects it to the world of this component
+        truth = None  # its pose relative to this component is unknown
         recording = _frames_of(recording, result)
     pictures = draw(result.diagnostics.samples)
-    clouds = () if pictures else recording.sample(_CLOUDS)
+    clouds = () if pictures else recording.sample(_DRAWN_CLOUDS)
     extras = ReportExtras(
         title=title,
         headline=device_sentence(recording, result) if component is None else "",
-        filter_steps=_filter_steps(_used(config, result), recording, result),
+        filter_steps=_filter_steps(_final_config(config, result), recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth,
         pictures=pictures,
@@ -375,26 +415,26 @@ def write_report_files(
 
 
 def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
-    """The frames of a recording that a result is of."""
+    """Select the frames of a result."""
     frames = [record.index for record in result.diagnostics.frames]
     return replace(recording, indices=recording.indices[np.isin(recording.indices, frames)])
 
 
 def _title(path: Path) -> str:
-    """What a recording is called: by its folder, where its own name says nothing."""
+    """Return the name of a recording; that of its folder for a native recording in a result."""
     return (path.parent.name if path.name == RECORDING else "") or path.name
 
 
-def _used(config: Config, result: Reconstruction) -> Config:
-    """The configuration with the corrections that the result was made with, its camera's too."""
-    made = {"corrections": result.config["corrections"]}
-    return changed(config, made, where="the result's config")
+def _final_config(config: Config, result: Reconstruction) -> Config:
+    """Return the configuration with the corrections of the result, after self-calibration."""
+    final = {"corrections": result.config["corrections"]}
+    return changed(config, final, where="the result's config")
 
 
 def _filter_steps(
     config: Config, recording: Recording, result: Reconstruction
 ) -> tuple[tuple[str, Frame], ...]:
-    """One frame, raw and after each filter in turn (figure 3.2)."""
+    """Return one frame, raw and after each filter (figure 3.2)."""
     posed = np.flatnonzero(result.has_pose)
     k = int(posed[len(posed) // 2])
     frame = recording[k]

@@ -13,10 +13,9 @@ from tofuse.errors import InputError
 from tofuse.odometry.base import Status
 from tofuse.odometry.given import GivenPoses, StatedPose
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config, changed, from_method, kind_of
-from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.progress import Progress
-from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
@@ -204,7 +203,7 @@ def _config(
             odometry.keyframe_distance,
         )
     config = replace(config, odometry=given)
-    return learnt(fitted(config, recording), recording, threads, progress)
+    return adapted(config, recording, threads, progress)
 
 
 def _check_different(one: Session, other: Session) -> None:

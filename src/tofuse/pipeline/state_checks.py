@@ -1,8 +1,8 @@
-"""What the objects of a state must be like before anything works on them.
+"""Validation of the objects of a state before they are used.
 
-A state is filled, not constructed, and compiled code does not look whether an index lies within an
-array. So what a constructor refuses is refused here too, and arrays must have the types and shapes
-that their classes promise.
+Objects of a state are filled, not constructed, and compiled code does not check array bounds. So
+the checks of constructors are repeated here, and arrays must have the types and shapes that their
+classes declare.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tofuse.files.spill import _Entry
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.range_view import RangeView
 from tofuse.geometry import se3
 from tofuse.kernels.alignment import PIXEL_SIZE, POINT_SIZE
 from tofuse.odometry.base import Step
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from tofuse.pipeline.reconstruct import Tracked
     from tofuse.recordings.recording import Recording
 
-# Type and sizes of arrays; letters stand for any, within one object the same. An exclamation mark:
-# all are finite. Attributes that an object lacks, or that are None, are not looked at.
+# Type and shape of arrays; letters stand for sizes, equal within one object. Exclamation mark: all
+# values are finite. Attributes that an object lacks, or that are None, are not checked.
 _ARRAYS: dict[type, dict[str, str]] = {
     PreparedView: {
         "rays": "f4 H W 2", "z": "f4 H W", "sigma": "f4 H W", "planes": "f4 H W 4",
@@ -64,7 +64,7 @@ _ARRAYS: dict[type, dict[str, str]] = {
 
 
 def check_objects(items: Iterable[Any]) -> None:
-    """Refuse objects of ours that their classes would not have made.
+    """Refuse objects of ours that their constructors would not have made.
 
     Raises
     ------
@@ -92,12 +92,12 @@ def check_objects(items: Iterable[Any]) -> None:
 
 
 def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
-    """Refuse arrays of a class that are not of the types and shapes that it promises.
+    """Refuse attributes of a class that do not have the declared types and shapes.
 
     Raises
     ------
     ValueError, InputError
-        Which of them, and what it is.
+        With the name of the attribute.
     """
     sizes: dict[str, int] = {}
     for name, promised in _ARRAYS.get(kind, {}).items():
@@ -120,12 +120,12 @@ def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
 
 
 def check_tracked(tracked: Tracked, recording: Recording) -> None:
-    """Refuse what was tracked of another recording than this one.
+    """Refuse a state of tracking of another recording.
 
     Raises
     ------
     ValueError
-        What does not agree.
+        With the difference.
     """
     entries = tracked.mapper.log.entries
     done = tracked.done

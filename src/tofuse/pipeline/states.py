@@ -1,11 +1,11 @@
-"""Objects of our own types as plain data and arrays, and back: what a checkpoint holds.
+"""Serialisation of our own types to plain data and arrays, for checkpoints.
 
-No code and no name of anything else comes out of such data. A class is found by its name in a list
-of those that these rooms define, and is filled, not called; what its constructor checks is checked
-then (`state_checks`). What is shared stays shared.
+Such data can't execute code or name other types. A class is looked up by its name among those that
+the rooms below define, and is filled, not called; then the checks of its constructor are repeated
+(`state_checks`). Shared objects stay shared.
 
-The data is a list of nodes. A value is a plain number, text or nothing; or the number of a node, in
-a list of its own. A node is its kind and what belongs to it.
+The data is a list of nodes. A value is a plain number, text or None; or the number of a node, in a
+list of one element. A node is its kind and its content.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tofuse.pipeline.state_checks import check_objects
 
 Arrays = dict[str, NDArray[Any]]
 
-# Whose classes may take part.
+# Packages and modules whose classes can be serialised.
 _ROOMS = (
     "corrections",
     "evaluation",
@@ -40,12 +40,12 @@ _ROOMS = (
     "lab.methods",
     "odometry",
     "pipeline.backend",
-    "pipeline.behind",
+    "pipeline.background_queue",
     "pipeline.components",
     "pipeline.config",
     "pipeline.frame_log",
     "pipeline.intake",
-    "pipeline.live",
+    "pipeline.live_poses",
     "pipeline.mapper",
     "pipeline.observations",
     "pipeline.preparation",
@@ -59,13 +59,13 @@ _ROOMS = (
     "sensor",
 )
 _KINDS = "biufcSU"  # of arrays
-# How names of arrays begin that are pieces of a temporary file, of which memory may not hold all.
+# Prefix of arrays that are pieces of a temporary file, which may exceed the memory.
 PIECE = "piece-"
-_SMALL = 1 << 14  # bytes; smaller arrays of a type lie in one
+_SMALL = 1 << 14  # bytes; smaller arrays of one type are stored together
 
 
 class StateError(Exception):
-    """Says what can't be kept, or what is wrong with what was kept."""
+    """A state that can't be serialised, or is invalid."""
 
 
 def encode(state: Any) -> tuple[list[Any], Arrays]:
@@ -74,7 +74,7 @@ def encode(state: Any) -> tuple[list[Any], Arrays]:
     Raises
     ------
     StateError
-        If something in it is of no type that may take part.
+        If it contains an object of a type that can't be serialised.
     """
     return _Encoder().run(state)
 
@@ -84,25 +84,27 @@ def decode(
     arrays: Mapping[str, NDArray[Any]],
     piece: Callable[[str], NDArray[Any]] | None = None,
 ) -> Any:
-    """Return the state of some nodes and arrays.
+    """Return the state from its nodes and arrays.
 
     Parameters
     ----------
+    nodes, arrays
+        As returned by `encode`.
     piece
-        Gives arrays whose names begin with `PIECE`, which are needed one at a time; where they are
-        not given, they are among the others.
+        Reads arrays whose names begin with `PIECE`, which are needed one at a time; None if they
+        are among the others.
 
     Raises
     ------
     StateError
-        If they are no state.
+        If they are not a valid state.
     """
     return _Decoder(nodes, arrays, piece or arrays.__getitem__).run()
 
 
 @cache
 def known_types() -> dict[str, type]:
-    """Return the classes that may take part, by their names."""
+    """Return the classes that can be serialised, by their names."""
     found: dict[str, type] = {}
     for module in _modules():
         for item in vars(module).values():
@@ -120,7 +122,7 @@ def _modules() -> Iterator[ModuleType]:
 
 
 def _is_plain(cls: type) -> bool:
-    """Whether what an instance is lies in its attributes alone, and making one calls nothing."""
+    """Whether the state of an instance is its attributes, and creating one calls nothing."""
     ours = all(base.__module__.split(".")[0] in _BASES for base in cls.__mro__)
     made = _member(cls, "__new__") is object.__new__ and not hasattr(cls, "__del__")
     return ours and made and hasattr(cls, "__dict__") and not getattr(cls, "_is_protocol", False)
@@ -136,7 +138,7 @@ def _name(cls: type) -> str:
 class _Encoder:
     def __init__(self) -> None:
         self._numbers: dict[int, int] = {}
-        self._held: list[Any] = []  # so that no number of an object is used twice
+        self._referenced: list[Any] = []  # so that no id of an object is used twice
         self._nodes: list[Any] = []
         self._arrays: Arrays = {}
         self._small: dict[str, list[NDArray[Any]]] = {}
@@ -144,7 +146,7 @@ class _Encoder:
 
     def run(self, state: Any) -> tuple[list[Any], Arrays]:
         self._value([state])
-        for number, item in enumerate(self._held):  # which grows meanwhile
+        for number, item in enumerate(self._referenced):  # which grows meanwhile
             self._nodes.append(self._node(item))
             assert len(self._nodes) == number + 1
         pools = {name: np.concatenate(parts) for name, parts in self._small.items()}
@@ -156,8 +158,8 @@ class _Encoder:
             return item
         number = self._numbers.get(id(item))
         if number is None:
-            number = self._numbers[id(item)] = len(self._held)
-            self._held.append(item)
+            number = self._numbers[id(item)] = len(self._referenced)
+            self._referenced.append(item)
         return [number]
 
     def _node(self, item: Any) -> list[Any]:
@@ -188,7 +190,7 @@ class _Encoder:
         raise StateError(f"{_name(kind)} is no part of a state")
 
     def _pieces(self, file: SpillFile) -> list[str]:
-        """Names of the pieces of a temporary file: arrays that are read when they are written."""
+        """Return names of the pieces of a temporary file: arrays read when they are written."""
         names = []
         for piece in file.pieces():
             names.append(f"{PIECE}{len(self._arrays)}")
@@ -197,7 +199,7 @@ class _Encoder:
         return names
 
     def _placed(self, flat: NDArray[Any]) -> list[Any]:
-        """Where the values of an array are: in which of those that are written, and from where."""
+        """Return the written array that contains the values, their start, and their number."""
         if flat.dtype.kind not in _KINDS:
             raise StateError(f"an array of {flat.dtype} is no part of a state")
         if flat.nbytes > _SMALL:
@@ -273,7 +275,7 @@ class _Decoder:
         return self._made[number]
 
     def _container(self, number: int, kind: str, rest: list[Any]) -> None:
-        """Fill what may hold itself: it is there before what is in it."""
+        """Fill a container after creating it, as it may contain itself."""
         made: Any = deque(maxlen=rest[0]) if kind == "deque" else _FILLED[kind]()
         self._made[number] = made
         if kind in ("dict", "ordered"):

@@ -1,17 +1,15 @@
-"""Whether a correction may stay: a trial on some views of a recording, which knows no truth.
+"""The trial of a correction: whether overlapping views show the error that it corrects.
 
-The error that a correction takes off changes with the view, so that overlapping views disagree
-about where surfaces are, and the correction says beforehand where and by how much. The trial asks
-for its strength: which share of the predicted disagreement is there. Some views of a run are laid
-over each other as they are; how far their surfaces are apart is regressed on what the correction
-would change of that, with the poses of all views free to follow. The noise of the pixels is the
-same on both sides, so it does not bend the answer, and the spread between places all over the
-recording says how far it is known.
+The error that a correction removes changes with the view, so that overlapping views disagree about
+surfaces, where and by how much as the correction predicts. The trial estimates the strength of the
+error: the fraction of the predicted disagreement that is present. Views of short runs are aligned
+uncorrected; the distances between their surfaces are regressed on the change of these distances by
+the correction, jointly with the poses of all views. The noise of the pixels is the same in both, so
+that it causes no bias, and the spread between runs all over the recording gives the standard error.
 
-What is predicted has errors of its own, and differences between views have more of them than of
-the truth. So the strength comes out too small where all of the error is there (regression
-dilution): 0.2 to 0.5 in simulated rooms. It tells whether there is anything to take off, not how
-much.
+The prediction has errors of its own, which differences between views amplify. So the strength is
+underestimated (regression dilution): 0.2 to 0.5 in simulated rooms with the full error. It shows
+whether there is an error to correct, not how much.
 """
 
 from __future__ import annotations
@@ -38,32 +36,32 @@ from tofuse.registration.projective import (
     align,
 )
 
-# Runs of so many views each, each of them one piece of evidence; where in the recording they begin.
+# Views per run, each run being one sample; and starts of the runs as fractions of the recording.
 _VIEWS = 4
-_PLACES = tuple(k / 11 for k in range(12))
-# Motion between the views of a run that is wanted: rad, or as a share of the depth; and by which
-# factor a guess is mended at once.
+_STARTS = tuple(k / 11 for k in range(12))
+# Desired motion between the views of a run: rad, or as a fraction of the depth; and the largest
+# factor by which the stride is changed at once.
 _ANGLE, _DISTANCE = 0.17, 0.085
-_TOO_FAR = 3.0
+_MAX_CHANGE = 3.0
 # Largest number of frames from one view of a run to the next.
-_FARTHEST = 64
-# Least share of the points that meet a surface of the other view, and fit it; an alignment that
-# holds fewer directions is none.
-_FITS, _LEAST_HELD = 0.3, 3
-# Fewest runs that can tell, and the chance that they do by luck.
-_LEAST_RUNS, _LUCK = 4, 0.05
-# Strength that other errors fake: what lens and smoothing do to corners looks like indirect light.
+_MAX_STRIDE = 64
+# An alignment needs this fraction of the points on a surface of the other view, and this number of
+# constrained directions.
+_MIN_INLIERS, _MIN_CONSTRAINED = 0.3, 3
+# Minimum number of runs, and the significance level.
+_MIN_RUNS, _SIGNIFICANCE = 4, 0.05
+# Strength that other errors mimic: lens and smoothing change corners similarly to indirect light.
 # In simulated rooms without any it is up to 0.12, with it 0.2 and more.
-_FAKED = 0.15
-# Points: every so manieth pixel, and the fewest that a pair needs.
-_STRIDE, _LEAST_POINTS = 3, 100
-# Surfaces that differ more in direction (cosine) are not the same one.
+_MIMICKED = 0.15
+# Every n-th pixel is compared; and the minimum number of points of a pair.
+_STRIDE, _MIN_POINTS = 3, 100
+# Minimum cosine between normals of the same surface.
 _SAME_SIDE = 0.88
-# Residuals beyond so many robust deviations, and these are at least so large (m), are outliers.
-_ROBUST, _LEAST_DEVIATION_M = 4.0, 0.005
-# The fit of a plane is no better than this, m, however many pixels it has.
+# Residuals beyond this multiple of the robust deviation, which is at least this (m), are outliers.
+_CUT, _MIN_DEVIATION_M = 4.0, 0.005
+# Standard deviation of a fitted plane, m, however many pixels it has.
 _PLANE_M = 0.003
-# Neighbouring pixels share what is wrong with a prediction: each pixel is told so much more of it.
+# Neighbouring pixels share errors of the prediction: variance factor of that of a single pixel.
 _SHARED = 10.0
 _ITERATIONS = 3
 _ALIGNMENT = ProjectiveOptions(
@@ -80,15 +78,15 @@ Prepare = Callable[[Frame], Frame]
 
 @dataclass(frozen=True)
 class Trial:
-    """What a trial found.
+    """The result of a trial.
 
     Attributes
     ----------
     explained, predicted
-        Of each run: the product of the disagreement that is there with the predicted one, and the
-        square of the predicted one, each as a weighted mean. Their ratio is the run's strength.
-        Runs differ by more than noise, and one with bad poses may be far off, so their strengths
-        are pooled by a robust random-effects model (`pooling`).
+        Of each run: the product of the measured disagreement and the predicted one, and the square
+        of the predicted one, each as a weighted mean. Their ratio is the run's strength. Runs
+        differ by more than noise, and one with bad poses is an outlier, so their strengths are
+        pooled by a robust random-effects model (`pooling`).
     """
 
     explained: tuple[float, ...]
@@ -96,43 +94,40 @@ class Trial:
 
     @cached_property
     def _pooled(self) -> tuple[float, float]:
-        """Strength and standard error of all runs together."""
-        if len(self.predicted) < _LEAST_RUNS:
+        """Pooled strength and standard error of all runs."""
+        if len(self.predicted) < _MIN_RUNS:
             return float("nan"), float("inf")
         predicted = np.array(self.predicted)
         return pooled(np.array(self.explained) / predicted, predicted)
 
     @property
     def strength(self) -> float:
-        """Share of the predicted disagreement that is there; NaN where too few runs tell."""
+        """Fraction of the predicted disagreement that is present; NaN with too few runs."""
         return self._pooled[0]
 
     @property
     def error(self) -> float:
-        """Standard error of the strength, from how much the runs differ."""
+        """Standard error of the strength, from the spread between runs."""
         return self._pooled[1]
 
     @property
     def relative_error(self) -> float:
-        """Of the strength, as a share of it."""
+        """Standard error relative to the strength."""
         return self.error / self.strength if self.strength > 0 else float("inf")
 
     @property
     def helps(self) -> bool:
-        """Whether the error that the correction takes off is clearly there.
-
-        Not by luck, and more of it than other errors fake.
-        """
+        """Whether the error is significant, and stronger than what other errors mimic."""
         n = len(self.predicted)
-        if n < _LEAST_RUNS:
+        if n < _MIN_RUNS:
             return False
-        # Student's, as the spread is known from as few runs.
-        least = max(_FAKED, float(stdtrit(n - 1, 1 - _LUCK)) * self.error)
-        return self.strength > least
+        # Student's t, as the spread is estimated from few runs.
+        threshold = max(_MIMICKED, float(stdtrit(n - 1, 1 - _SIGNIFICANCE)) * self.error)
+        return self.strength > threshold
 
     def in_words(self) -> str:
-        """What was found, in words."""
-        if len(self.predicted) < _LEAST_RUNS or not np.isfinite(self.strength):
+        """Describe the result."""
+        if len(self.predicted) < _MIN_RUNS or not np.isfinite(self.strength):
             return "too few views overlap to tell"
         found = f"strength {self.strength:.2f}, standard error {self.error:.2f}"
         if self.helps:
@@ -141,36 +136,39 @@ class Trial:
 
 
 def trial(recording: Recording, without: Prepare, corrected: Prepare, doubt: float = 0.2) -> Trial:
-    """Ask views whether the error is there that a correction takes off.
+    """Estimate the strength of the error that a correction removes.
 
     Parameters
     ----------
+    recording
+        The recording.
     without, corrected
-        Make of a frame what would be tracked. Called with the same frames, run by run.
+        Prepare a frame for tracking without and with the correction. Called with the same frames,
+        run by run.
     doubt
-        Standard deviation of the correction, as a share of it.
+        Standard deviation of the correction, as a fraction of it.
     """
-    if len(recording) < _VIEWS + _LEAST_RUNS - 1:
+    if len(recording) < _VIEWS + _MIN_RUNS - 1:
         return Trial((), ())
-    bench = _Bench(recording, without, corrected)
-    stride, seen, told = 1, set(), []
-    for place in _PLACES:
+    views = _AlignedViews(recording, without, corrected)
+    stride, done, results = 1, set(), []
+    for fraction in _STARTS:
         last = len(recording) - 1 - (_VIEWS - 1) * stride
-        start = max(0, round(place * last))
-        stride = bench.stride(start, stride)
-        if (start, stride) in seen:
+        start = max(0, round(fraction * last))
+        stride = views.stride(start, stride)
+        if (start, stride) in done:
             continue
-        seen.add((start, stride))
-        found = _asked(*bench.run(start, stride), doubt)
-        if found is not None:
-            told.append(found)
-    explained, predicted = np.array(told).reshape(-1, 2).T.tolist()
+        done.add((start, stride))
+        result = _regressed(*views.run(start, stride), doubt)
+        if result is not None:
+            results.append(result)
+    explained, predicted = np.array(results).reshape(-1, 2).T.tolist()
     return Trial(tuple(explained), tuple(predicted))
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A view without the correction, and by which share of z (H, W) that would move its points."""
+    """A view without the correction, and the relative change of its z (H, W) by the correction."""
 
     surface: PreparedView
     change: Float32
@@ -179,14 +177,14 @@ class _View:
     def of(cls, without: RangeFrame, corrected: RangeFrame) -> _View:
         surface = prepare_view(without, _VIEW)
         both = without.valid & corrected.valid
-        share = np.where(both, corrected.z / np.where(both, without.z, 1) - 1, np.nan)
+        change = np.where(both, corrected.z / np.where(both, without.z, 1) - 1, np.nan)
         rows, columns = surface.z.shape
-        step = share.shape[1] // columns
-        return cls(surface, share[step // 2 :: step, step // 2 :: step][:rows, :columns])
+        step = change.shape[1] // columns
+        return cls(surface, change[step // 2 :: step, step // 2 :: step][:rows, :columns])
 
 
-class _Bench:
-    """Views of a recording, made ready when they are first asked for."""
+class _AlignedViews:
+    """Views of a recording and alignments between them, cached."""
 
     def __init__(self, recording: Recording, without: Prepare, corrected: Prepare) -> None:
         self._recording = recording
@@ -212,39 +210,42 @@ class _Bench:
         return _View.of(without, corrected) if len(without) else None
 
     def _step(self, i: int, j: int) -> Aligned | None:
-        """View j in view i; None where they do not fit."""
+        """Align view j to view i; None if they do not fit."""
         if (i, j) not in self._steps:
             target, source = self._view(i), self._view(j)
-            found = None
+            aligned = None
             if target is not None and source is not None:
-                ends = source.surface, [Target(target.surface, np.eye(4))]
-                found = align(*ends, np.eye(4), _ALIGNMENT)
-                fits = found.inlier_share * found.overlap >= _FITS
-                if not fits or len(found.unobservable) > 6 - _LEAST_HELD:
-                    found = None
-            self._steps[i, j] = found
+                pair = source.surface, [Target(target.surface, np.eye(4))]
+                aligned = align(*pair, np.eye(4), _ALIGNMENT)
+                fits = aligned.inlier_share * aligned.overlap >= _MIN_INLIERS
+                if not fits or len(aligned.unobservable) > 6 - _MIN_CONSTRAINED:
+                    aligned = None
+            self._steps[i, j] = aligned
         return self._steps[i, j]
 
     def stride(self, start: int, stride: int) -> int:
-        """Frames from one view to the next, for the motion that is wanted; from that before."""
-        farthest = max(1, min(_FARTHEST, (len(self._recording) - 1) // _VIEWS))
+        """Return the frames from one view to the next with the desired motion; iterated."""
+        max_stride = max(1, min(_MAX_STRIDE, (len(self._recording) - 1) // _VIEWS))
         tried = set()
         while stride not in tried:
             tried.add(stride)
             step = self._step(start, start + stride)
-            # What does not fit is farther away than it should be.
-            moved = _TOO_FAR if step is None else max(self._moved(start, step), 1 / _TOO_FAR)
-            stride = min(max(1, round(stride / moved)), farthest)
+            # Views that do not fit are too far apart.
+            ratio = _MAX_CHANGE
+            if step is not None:
+                ratio = max(self._relative_motion(start, step), 1 / _MAX_CHANGE)
+            stride = min(max(1, round(stride / ratio)), max_stride)
         return stride
 
-    def _moved(self, k: int, step: Aligned) -> float:
+    def _relative_motion(self, k: int, step: Aligned) -> float:
+        """Return the motion relative to the desired one."""
         view, T = self._view(k), step.T_world_source
         depth = 1.0 if view is None else view.surface.depth
-        far = float(np.linalg.norm(T[:3, 3]))
-        return max(float(se3.angle(T)) / _ANGLE, far / (_DISTANCE * depth))
+        distance = float(np.linalg.norm(T[:3, 3]))
+        return max(float(se3.angle(T)) / _ANGLE, distance / (_DISTANCE * depth))
 
     def run(self, start: int, stride: int) -> tuple[list[_View], Float64]:
-        """Views from `start` on that hang together, and their poses (N, 4, 4) in the first one."""
+        """Return aligned views from `start` on, and their poses (N, 4, 4) in the first one."""
         first = self._view(start)
         if first is None:
             return [], np.zeros((0, 4, 4))
@@ -258,10 +259,10 @@ class _Bench:
         return views, np.array(poses)
 
 
-def _asked(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[float, float] | None:
-    """What a run says of the strength, when the poses of its views follow: see `Trial`."""
+def _regressed(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[float, float] | None:
+    """Regress the disagreement of a run jointly with its poses: see `Trial`."""
     n = len(views)
-    if n < 3:  # a pair takes nearly all of it for motion
+    if n < 3:  # the pose of a pair absorbs nearly all of it
         return None
     poses = poses.copy()
     pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
@@ -275,12 +276,12 @@ def _asked(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[float,
             at = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6, 6 * n]
             A[np.ix_(at, at)] += J.T @ (weight[:, None] * J)
             g[at] += J.T @ (weight * residual)
-        # The first view stays; directions that nothing holds do as well.
+        # The first view is fixed; damping fixes unconstrained directions.
         free = A[6:-1, 6:-1]
         free = free + np.diag(1e-6 * np.diag(free) + 1e-12)
         solved = np.linalg.solve(free, np.stack([g[6:-1], A[6:-1, -1]], 1))
         poses[1:] = poses[1:] @ se3.exp(-solved[:, 0].reshape(-1, 6))
-    # Of the prediction what no motion of the views explains (the Schur complement).
+    # The part of the prediction that no motion of the views explains (the Schur complement).
     predicted = A[-1, -1] - A[-1, 6:-1] @ solved[:, 1]
     explained = -(g[-1] - A[-1, 6:-1] @ solved[:, 0])
     return (float(explained), float(predicted)) if predicted > 0 else None
@@ -289,17 +290,19 @@ def _asked(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[float,
 def _compared(
     target: _View, source: _View, T: Float64, doubt: float
 ) -> tuple[Float64, Float64, Float64] | None:
-    """Distances of the points of a view from another's planes.
+    """Return the distances of a view's points from another's planes, with derivatives.
 
     Parameters
     ----------
     T
         (4, 4) T_target_source.
+    doubt
+        Standard deviation of the correction, as a fraction of it.
 
     Returns
     -------
     (M, 13) derivatives by the right perturbations of target and source (m, rad), and by the
-    strength of the correction; (M,) distances in m; (M,) weights. None where hardly any are left.
+    strength of the correction; (M,) distances in m; (M,) weights. None with too few points.
     """
     s, t = source.surface, target.surface
     thin = np.s_[::_STRIDE, ::_STRIDE]
@@ -311,8 +314,8 @@ def _compared(
     z = 1 / plane[:, 3]
     point = ray * z[:, None]
     R = T[:3, :3]
-    moved = point @ R.T + T[:3, 3]
-    v, u, inside = _landed(t, moved)
+    transformed = point @ R.T + T[:3, 3]
+    v, u, inside = _projected(t, transformed)
     facing = t.planes[v, u].astype(float)
     target_change = target.change[v, u].astype(float)
     length = np.linalg.norm(facing[:, :3], axis=1)
@@ -321,15 +324,17 @@ def _compared(
     normal = facing[:, :3] / length[:, None]
     own = plane[:, :3] / np.linalg.norm(plane[:, :3], axis=1, keepdims=True)
     known &= np.einsum("ki,ki->k", normal, own @ R.T) > _SAME_SIDE
-    distance = np.einsum("ki,ki->k", normal, moved) - 1 / length
+    distance = np.einsum("ki,ki->k", normal, transformed) - 1 / length
     known &= np.isfinite(distance)
-    if np.count_nonzero(known) < _LEAST_POINTS:
+    if np.count_nonzero(known) < _MIN_POINTS:
         return None
     deviation = 1.4826 * float(np.median(np.abs(distance[known])))
-    known &= np.abs(distance) < _ROBUST * max(deviation, _LEAST_DEVIATION_M)
-    if np.count_nonzero(known) < _LEAST_POINTS:
+    known &= np.abs(distance) < _CUT * max(deviation, _MIN_DEVIATION_M)
+    if np.count_nonzero(known) < _MIN_POINTS:
         return None
-    normal, moved, point, distance = (x[known] for x in (normal, moved, point, distance))
+    normal, transformed, point, distance = (
+        x[known] for x in (normal, transformed, point, distance)
+    )
     z, variance, v, u = z[known], variance[known], v[known], u[known]
     target_z = 1 / facing[known, 3]
     target_ray = np.concatenate([t.rays[v, u], np.ones((len(v), 1))], 1).astype(float)
@@ -339,7 +344,7 @@ def _compared(
     J = np.concatenate(
         [
             -normal,
-            -np.cross(moved, normal),
+            -np.cross(transformed, normal),
             along,
             np.cross(point, along),
             (by_source + by_target)[:, None],
@@ -347,22 +352,22 @@ def _compared(
         axis=1,
     )
     noise = variance * z**4 + t.plane_variance[v, u] * target_z**4
-    vague = _SHARED * doubt**2 * (by_source**2 + by_target**2)
-    # Neighbours share nearly everything: a pair counts as much however many points it has.
-    weight = 1 / (2 * noise + _PLANE_M**2 + vague) / len(distance)
+    prediction_variance = _SHARED * doubt**2 * (by_source**2 + by_target**2)
+    # Errors of neighbours are correlated: a pair has the same weight for any number of points.
+    weight = 1 / (2 * noise + _PLANE_M**2 + prediction_variance) / len(distance)
     return J, distance, weight
 
 
-def _landed(view: PreparedView, points: Float64) -> tuple[Intp, ...]:
-    """Row and column (M,) of the pixels of a view that points (M, 3) land on, and if they do."""
+def _projected(view: PreparedView, points: Float64) -> tuple[Intp, ...]:
+    """Project points (M, 3): row and column (M,) of their pixels, and whether they are inside."""
     grid = view.projection
     ahead = points[:, 2] > 1e-3
     xy = points[:, :2] / np.where(ahead, points[:, 2], 1)[:, None]
     x0, y0, per_x, per_y = grid.frame
     nodes = np.stack([(xy[:, 1] - y0) * per_y, (xy[:, 0] - x0) * per_x], 1)
-    most = np.array(grid.lookup.shape[:2]) - 1
-    inside = ahead & ((nodes >= 0) & (nodes <= most)).all(1)
-    a, b = np.rint(np.clip(nodes, 0, most)).astype(np.intp).T
+    last = np.array(grid.lookup.shape[:2]) - 1
+    inside = ahead & ((nodes >= 0) & (nodes <= last)).all(1)
+    a, b = np.rint(np.clip(nodes, 0, last)).astype(np.intp).T
     u, v = np.rint(grid.lookup[a, b]).T
     rows, columns = view.z.shape
     inside &= (u >= 0) & (v >= 0) & (u < columns) & (v < rows)

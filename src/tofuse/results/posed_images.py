@@ -16,7 +16,7 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
 from tofuse.files.ply import read_ply
-from tofuse.fusion.texture import LitView
+from tofuse.fusion.texture import TextureView
 from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
@@ -193,7 +193,7 @@ class _ImageRenderer:
         """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
-        view = LitView.of(replace(frame, color_image=None))
+        view = TextureView.of(replace(frame, color_image=None))
         if view is None:
             return None
         light = view.light[..., 0]

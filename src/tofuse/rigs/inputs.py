@@ -11,8 +11,8 @@ import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
+from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.config import Config, from_method
-from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
@@ -35,7 +35,7 @@ class Camera:
         Corrections that are tried first are left out: the trial asks how neighbouring views of a
         moving camera fit.
         """
-        config = fitted(from_method("default", "range"), self.recording)
+        config = with_recording_defaults(from_method("default", "range"), self.recording)
         kept = tuple(c for c in config.corrections if not c.needs_trial)
         return replace(config, corrections=kept)
 

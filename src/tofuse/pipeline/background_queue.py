@@ -1,4 +1,4 @@
-"""Jobs that nobody waits for: done in order, on another thread, and never many at once."""
+"""A bounded queue of jobs that run in order on a background thread."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 
 from tofuse.kernels.threads import job_pool, thread_count
 
-# What waits to be done holds on to frames.
-_MOST = 4
+# Bounds memory, as waiting jobs reference frames.
+_MAX_WAITING = 4
 
 
-class Behind:
-    """Does jobs in the order in which they come, beside what comes next.
+class BackgroundQueue:
+    """Runs jobs in order on a background thread; with a single thread, immediately.
 
-    With one thread they are done at once. An error is raised by one of the next calls.
+    An error of a job is raised by one of the next calls.
     """
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
         self._jobs: deque[Future[None]] = deque()
 
-    def do(self, job: Callable[[], None]) -> None:
-        """Do a job, soon; waits where several are under way."""
+    def submit(self, job: Callable[[], None]) -> None:
+        """Queue a job; waits while the queue is full."""
         if thread_count() == 1:
             self.wait()
             job()
@@ -32,22 +32,22 @@ class Behind:
         if self._pool is None:
             self._pool = job_pool(1, "tofuse-behind")
         self._jobs.append(self._pool.submit(job))
-        while len(self._jobs) > _MOST:
+        while len(self._jobs) > _MAX_WAITING:
             self._jobs.popleft().result()
 
     def wait(self) -> None:
-        """Wait until all is done."""
+        """Wait for all jobs."""
         while self._jobs:
             self._jobs.popleft().result()
 
     def finish(self) -> None:
-        """Wait until all is done, and let the thread go."""
+        """Wait for all jobs, and end the thread."""
         self.wait()
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """As it begins, once all is done: the jobs changed what others hold."""
+        """Return an empty queue, after all jobs: they change objects of the same state."""
         self.wait()
         return {"_pool": None, "_jobs": deque()}

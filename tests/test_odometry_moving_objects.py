@@ -16,10 +16,9 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.odometry.moving import (
+from tofuse.odometry.moving_objects import (
     Moving,
     MovingObjects,
-    MovingOptions,
     _robust_scale,
     without_pixels,
 )
@@ -37,7 +36,7 @@ NEAR = 1.3  # m
 def followed(objects: MovingObjects, *pair: object) -> Moving:
     """Compare a view with a reference, and keep what came of it."""
     moving = objects.compare(*pair)
-    objects.learn(moving)
+    objects.update(moving)
     return moving
 
 
@@ -97,10 +96,10 @@ def trajectory(motion, cover, frame):
     return (1 - t) * np.array(start) + t * np.array(end), np.array([side, side, 0.1])
 
 
-def segment(frames, poses, options=None):
+def segment(frames, poses):
     """Segment each frame against keyframes as a tracker takes them; views and what was found."""
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
-    objects, key, found = MovingObjects(options), 0, []
+    objects, key, found = MovingObjects(), 0, []
     for n in range(1, len(frames)):
         predicted = objects.predicted_mask(poses[n], views[n])
         found.append(
@@ -279,7 +278,7 @@ def test_keyframes_keep_what_was_learnt_and_are_forgotten_when_there_are_too_man
     centres, half = trajectory("sideways", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(10)]
     views = [prepare_view(frame, SurfaceOptions()) for frame in made]
-    objects = MovingObjects(MovingOptions(keyframes=1))
+    objects = MovingObjects(max_references=1)
     for n in range(1, 9):
         moving = followed(objects, views[n], poses[n], views[0], poses[0])
     np.testing.assert_array_equal(objects.reference_mask(views[0]), moving.reference)
@@ -296,7 +295,7 @@ def test_threads_change_nothing(room, monkeypatch):
     frames, poses, noise = room
     centres, half = trajectory("away", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(8)]
-    monkeypatch.setattr("tofuse.odometry.moving._CHUNK_ROWS", 10)
+    monkeypatch.setattr("tofuse.odometry.moving_objects._CHUNK_ROWS", 10)
     results = []
     for count in (1, 2):
         with threads(count):
@@ -332,24 +331,6 @@ def test_pixels_left_out_have_no_surface_but_free_space_up_to_them(room):
     assert agreement(rest, other, T).violation <= agreement(view, other, T).violation + 0.01
     with pytest.raises(ValueError, match="the mask is"):
         without_pixels(view, mask[1:])
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"columns": 4},
-        {"misregistration": -1},
-        {"reach": 11},
-        {"keyframes": 0},
-        {"prior": 0.0},
-        {"outliers": 1.0},
-        {"decay": 1.5},
-        {"detect": -1.0},
-    ],
-)
-def test_options_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        MovingOptions(**wrong)
 
 
 def test_the_robust_scale_ignores_outliers():

@@ -15,7 +15,7 @@ from tofuse.geometry import se3
 from tofuse.odometry.base import Step, Tracker
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.frame_log import FrameLog
-from tofuse.pipeline.live import DELAY, LiveLoops, LivePoses
+from tofuse.pipeline.live_poses import DELAY, LiveLoops, LivePoses
 from tofuse.pipeline.mapper import Mapper
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import ClosedLoop
@@ -129,7 +129,7 @@ def scripted(pairs):
 
 def test_what_is_found_counts_so_many_frames_later():
     loops = LiveLoops(scripted([(0, 3)]))
-    new = [loops.step() for _ in range(3 + DELAY + 3)]
+    new = [loops.advance() for _ in range(3 + DELAY + 3)]
     assert [k for k, known in enumerate(new) if known] == [3 + DELAY]
     assert [(c.record.i, c.record.j) for c in loops.closed] == [(0, 3)]
     loops.finish()
@@ -144,10 +144,10 @@ def test_an_error_in_a_job_is_not_swallowed():
             return work
 
     loops = LiveLoops(Broken())
-    assert not loops.step()
-    assert not any(loops.step() for _ in range(DELAY - 1))
+    assert not loops.advance()
+    assert not any(loops.advance() for _ in range(DELAY - 1))
     with pytest.raises(ZeroDivisionError):
-        loops.step()
+        loops.advance()
 
 
 class _AlwaysClosing:
@@ -166,7 +166,7 @@ def test_the_graph_is_solved_less_often_the_longer_it_is():
     for k in range(3000):
         step = Step("tracked", "", np.eye(4))
         log.add(FrameRecord(k, float(k), "tracked", ""), step)
-        if live.follow(step, log):
+        if live.update(step, log):
             solved.append(k)
     live.finish()
     gaps = np.diff(solved)

@@ -1,6 +1,6 @@
-"""Poses while frames arrive: components that were connected so far, and loops that closed.
+"""Poses while frames arrive, with the components connected and the loops closed so far.
 
-A loop counts later than its frame, but always equally late.
+A loop takes effect a fixed number of frames after it was searched for.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
 from tofuse.registration.base import Link
 
-# A job begins at one frame and counts this many frames later, however soon it was done: the poses
-# are then the same on every machine. A slow machine waits there.
+# The loops of a search take effect this many frames after it started, even if it was done earlier,
+# so that poses are the same on every machine. A slow machine waits there.
 DELAY = 10
-# The graph is solved anew at the earliest after this fraction of the frames that it has, so that
-# what a frame costs does not grow with those before it.
-_LATER = 0.01
+# The graph is optimised again after this fraction of new frames at the earliest, so that the cost
+# per frame is constant.
+_MIN_NEW_FRACTION = 0.01
 
 
 class LiveLoops:
-    """Looks for loops on another thread.
+    """Searches for loops on another thread.
 
     Attributes
     ----------
     closed
-        Accepted loops that count already.
+        Accepted loops that are in effect.
     """
 
     def __init__(self, loops: Loops) -> None:
@@ -44,8 +44,8 @@ class LiveLoops:
         self._frames = 0
         self._due = 0
 
-    def step(self) -> bool:
-        """Go on by a frame with a pose, already known to the loops; True if new loops count now."""
+    def advance(self) -> bool:
+        """Advance by a frame with a pose, already pushed to the loops; whether new loops closed."""
         self._frames += 1
         found: list[ClosedLoop] = []
         if self._job is not None and self._frames >= self._due:
@@ -62,12 +62,12 @@ class LiveLoops:
         return bool(found)
 
     def wait(self) -> None:
-        """Wait for the job that is under way; what it found counts when it is due."""
+        """Wait for the running search; its loops take effect when they are due."""
         if self._job is not None:
             self._job.result()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the thread, with what the job found."""
+        """Return everything but the thread, with the result of the running search."""
         found = None if self._job is None else self._job.result()
         return {**self.__dict__, "_pool": None, "_job": found}
 
@@ -79,52 +79,52 @@ class LiveLoops:
             self._job.set_result(found)
 
     def finish(self) -> None:
-        """Wait for the job that is under way, and let the thread go."""
+        """Wait for the running search, and end the thread."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool, self._job = None, None
 
 
 class LivePoses:
-    """Where the camera is in the frame of the first component, as known so far.
+    """Poses in the frame of the first component, as known so far.
 
-    The end decides anew which components are connected, and closes all loops.
+    At the end of the recording components are joined and loops are closed anew.
     """
 
     def __init__(self, loops: Loops) -> None:
         self._loops = LiveLoops(loops)
         self._component = 0
-        self._waiting = False  # loops that count, but have moved nothing yet
-        self._since = 0  # frames of this component since the graph was solved
+        self._pending = False  # whether there are closed loops that moved no pose yet
+        self._since = 0  # frames of this component since the last optimisation
         self._size = 0  # frames of this component
-        # Of the components that are connected to the first one, and what loops that closed on the
-        # way have moved in the present one.
+        # Poses of the components that are connected to the first one, and the correction of the
+        # present one by loops.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
 
-    def follow(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
-        """Take the next frame; returns the loops of its component if new ones count now."""
+    def update(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
+        """Add the next frame; return the loops of its component if optimisation is due, else []."""
         if step.component != self._component:
             self._component, self._T_closed_tracked = step.component, np.eye(4)
-            self._waiting, self._since, self._size = False, 0, 0
+            self._pending, self._since, self._size = False, 0, 0
         for link in step.links:
             self._connect(link, log)
         if step.T_component_camera is None:
             return []
         self._size, self._since = self._size + 1, self._since + 1
-        self._waiting |= self._loops.step()
-        if not self._waiting or self._since < _LATER * self._size:
+        self._pending |= self._loops.advance()
+        if not self._pending or self._since < _MIN_NEW_FRACTION * self._size:
             return []
-        self._waiting, self._since = False, 0
+        self._pending, self._since = False, 0
         here = {e.record.index for e in log.of_component(step.component).posed}
         return [c for c in self._loops.closed if {c.record.i, c.record.j} <= here]
 
-    def close(self, tracked: PoseGraph, optimised: PoseGraph) -> None:
-        """Move what follows by as much as loops moved the last pose of a graph."""
+    def apply_loops(self, tracked: PoseGraph, optimised: PoseGraph) -> None:
+        """Correct the following poses as loops corrected the last pose of a graph."""
         self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
 
     def pose(self, step: Step) -> Float64 | None:
-        """T_world_camera (4, 4); None where it is lost, or not connected to the first component."""
+        """Return T_world_camera (4, 4); None if lost, or not connected to the first component."""
         T_world_component = self._T_world_component.get(step.component)
         if step.T_component_camera is None or T_world_component is None:
             return None
@@ -142,9 +142,9 @@ class LivePoses:
         known[b.component] = known[a.component] @ T_a_b
 
     def wait(self) -> None:
-        """Wait for loops that are being measured."""
+        """Wait for the running search."""
         self._loops.wait()
 
     def finish(self) -> None:
-        """Wait, and let the thread go."""
+        """Wait for the running search, and end the thread."""
         self._loops.finish()

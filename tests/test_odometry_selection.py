@@ -104,7 +104,7 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
     ]
     steps = run(frames)
     assert [step.component for step in steps] == [0] * 12 + [1] * 12
-    assert "nothing predicted it" not in steps[13].reason
+    assert "no prediction" not in steps[13].reason
     for step, pose in zip(steps[12:], WALK[12:], strict=True):
         assert off(step, pose, WALK[12])[0] < 0.03
 

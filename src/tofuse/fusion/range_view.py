@@ -1,4 +1,4 @@
-"""Range images as fusion keeps them: small, until the poses are final."""
+"""Compact range images, as stored until they are fused at their final poses."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ from tofuse.registration.prepared_view import (
     with_extended_planes,
 )
 
-# Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
-_STEPS, _LEAST = 6.0, -14.0
-DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS + _LEAST)].astype(np.float32)
-# Below this cosine of the incidence a pixel's light comes from too much of the surface.
-_LEAST_COSINE = 0.1
-# Size of what surfaces have of relief within a window of a few pixels, as a share of the depth.
+# Weights, in 1/m^2, are stored as logarithms: six steps per octave, from 2^-14 on.
+_STEPS, _MIN_LOG2 = 6.0, -14.0
+DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS + _MIN_LOG2)].astype(np.float32)
+# Minimum cosine of the incidence: beyond, the footprint of a pixel is too large.
+_MIN_COSINE = 0.1
+# Relief of surfaces within a window of a few pixels, as a fraction of the depth.
 _DETAIL = 0.002
-# Two neighbours differ by more than so many sigmas only where there are two surfaces.
+# A depth jump between neighbours exceeds this multiple of sigma.
 _JUMP_SIGMAS = 4.0
-# Pixels near a jump count so many times: they are wanted where nothing else was seen.
+# Weight factor of pixels near a jump: they matter only where nothing else was seen.
 _RIM = 0.1
-# Sigmas within which a pixel measured a plane. A filter that thins out a noisy surface is overruled
-# there, next to what it left; what it cuts off stays away.
+# Sigmas within which a pixel is on the plane of its neighbours. Such a pixel next to valid ones is
+# restored, if a filter removed it from a noisy surface.
 _ON_PLANE = 3.0
-# Planes where the tracker has none: of windows that may be less full, and less even.
+# Options of planes in addition to those of the tracker: minimum fill of windows, and offset.
 _FILL, _OFFSET = 0.4, 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class RangeView:
-    """What fusion needs of a range image, at most 320 columns, 8 to 10 bytes a pixel.
+    """A range image for fusion, of at most 320 columns and 8 to 10 bytes per pixel.
 
     Attributes
     ----------
     index, timestamp
         Of the frame.
     projection
-        Rays of the pixels, and where points land.
+        Rays of the pixels, and projection of points.
     z
-        (H, W) uint16, z in counts of `unit` m, 0 where there is none.
+        (H, W) uint16, z in counts of `unit` m, 0 where invalid.
     normals
         (H, W, 3) int8, 127 times the unit normals away from the camera.
     strength
-        (H, W) uint8 code of the weight, see `weights`; 0 where nothing is to be believed.
+        (H, W) uint8 code of the weight, see `DECODED`; 0 for pixels that are not integrated.
     light
         (H, W) float16, root of the albedo in the recording's counts times m^2; or (H, W, 3) uint8
-        RGB; None where neither is known.
+        RGB; None if neither is known.
     sigma_m
         Typical standard deviation of z.
     """
@@ -80,12 +80,21 @@ class RangeView:
         surface: PreparedView | None = None,
         options: SurfaceOptions | None = None,
     ) -> RangeView:
-        """Keep what of `frame` is valid; `surface` is the same image before filters, if there is.
+        """Reduce the valid pixels of a frame.
 
         A pixel's weight is one over the variance of the distance from its plane: that of its depth
-        times the squared cosine of the incidence. It is 0 next to jumps in depth, where light of
-        both sides mixes, unless the pixel measured the plane of its neighbours. Its depth is drawn
+        times the squared cosine of the incidence. It is 0 next to depth jumps, where pixels mix
+        both sides, unless the pixel is on the plane of its neighbours. Its depth is smoothed
         towards its plane, the more the noisier it is.
+
+        Parameters
+        ----------
+        frame
+            The filtered frame.
+        surface
+            The same image as prepared for tracking, before filters of the model, if it was.
+        options
+            How it is prepared otherwise.
         """
         options = options or SurfaceOptions()
         if surface is None:
@@ -100,7 +109,7 @@ class RangeView:
         )  # fmt: skip
         mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
-        valid |= measured & _widened(valid.view(np.uint8), 1) & (jump == 0)
+        valid |= measured & _dilated(valid.view(np.uint8), 1) & (jump == 0)
         z = np.where(valid, smoothed, np.float32(0))
         good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
         normals = np.empty((*shape, 3), np.int8)
@@ -111,11 +120,11 @@ class RangeView:
             surface.projection.lengths2,
             variance,
             good,
-            _LEAST_COSINE,
+            _MIN_COSINE,
             normals,
             weight,
         )
-        weight[_widened(jump, options.edge_margin)] *= _RIM
+        weight[_dilated(jump, options.edge_margin)] *= _RIM
         good = weight > 0
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535
@@ -126,20 +135,20 @@ class RangeView:
             np.round(z / unit).astype(np.uint16),
             unit,
             normals,
-            _encoded(weight),
-            _light(frame, shape),
+            _weight_codes(weight),
+            _image_light(frame, shape),
             _typical_sigma(variance, good),
         )
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the view's own images take."""
+        """Size of the view's own images."""
         light = 0 if self.light is None else self.light.nbytes
         return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + light
 
     @property
     def depth(self) -> float:
-        """Median z in m, of every fourth pixel if any of these is valid; 0 where nothing is."""
+        """Median z in m, of every fourth pixel if any of these is valid; 0 without valid ones."""
         for step in (2, 1):
             some = self.z[::step, ::step]
             known = some[some > 0]
@@ -160,9 +169,9 @@ class RangeView:
         return 3 if self.light.ndim == 3 else 1
 
     def as_cloud(self, pixels: int | None = None) -> CloudFrame:
-        """Return the valid pixels as a cloud; its amplitude falls with the square of the range.
+        """Return the valid pixels as a cloud, with amplitude that is not range-compensated.
 
-        Of an image with more than so many pixels every n-th of every n-th row is taken.
+        Of an image with more than `pixels` pixels every n-th of every n-th row is taken.
         """
         valid = (self.z > 0) & np.isfinite(self.projection.rays).all(-1)
         if pixels is not None:
@@ -184,7 +193,7 @@ class RangeView:
 
 
 def _typical_sigma(variance: Float32, good: Bool) -> float:
-    """Of every fourth pixel, or of all if none of these is good."""
+    """Return the median sigma of every fourth pixel, or of all if none of these is good."""
     for step in (2, 1):
         some = variance[::step, ::step][good[::step, ::step]]
         if len(some):
@@ -192,15 +201,15 @@ def _typical_sigma(variance: Float32, good: Bool) -> float:
     return 0.0
 
 
-def _widened(mask: UInt8, margin: int) -> Bool:
+def _dilated(mask: UInt8, margin: int) -> Bool:
     size = 2 * margin + 1
     return cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0
 
 
-def without_camera_errors(
+def with_camera_correction(
     views: Iterable[RangeView], errors: Mapping[str, float]
 ) -> Iterator[RangeView]:
-    """Views as they would be, did the camera not err like this; see `Refinement.errors`."""
+    """Yield views corrected for these errors of the camera; see `Refinement.errors`."""
     stretch = 1 + errors.get("focal", 0.0)
     straight: dict[int, Projection] = {}  # shared, as it was before
     for view in views:
@@ -220,27 +229,27 @@ def without_camera_errors(
         yield replace(view, z=counts, unit=unit, projection=straight[id(old)])
 
 
-def _encoded(weight: Float32) -> UInt8:
+def _weight_codes(weight: Float32) -> UInt8:
     known = weight > 0
-    code = 1 + np.round(_STEPS * (np.log2(np.where(known, weight, 1)) - _LEAST))
+    code = 1 + np.round(_STEPS * (np.log2(np.where(known, weight, 1)) - _MIN_LOG2))
     return np.where(known, np.clip(code, 1, 255), 0).astype(np.uint8)
 
 
-def _light(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
+def _image_light(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
     if frame.color_image is not None:
         return np.round(_reduced(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
     if frame.amplitude_image is None:
         return None
     amplitude = frame.amplitude_image
     if frame.amplitude_kind != "range_compensated":
-        # Light falls off with the square of the range: this is nearly the surface's albedo.
+        # Compensated for the falloff with the squared range: proportional to the albedo.
         amplitude = amplitude * np.square(frame.z * ray_lengths(frame.camera))
     light = np.sqrt(np.maximum(_reduced(np.nan_to_num(amplitude), shape), 0))
     return np.minimum(light, 65000).astype(np.float16)
 
 
 def _reduced(image: Float32, shape: tuple[int, ...]) -> Float32:
-    """Means over the blocks of pixels that make the (H, W) of a reduced image."""
+    """Return means over blocks of pixels, an image of shape (H, W)."""
     step = image.shape[1] // shape[1]
     if step == 1:
         return image

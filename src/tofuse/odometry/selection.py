@@ -1,0 +1,191 @@
+"""Selection of a pose hypothesis: among alignments, moving objects and quick motions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tofuse.geometry import se3
+from tofuse.odometry.hypotheses import Hypotheses, Hypothesis
+from tofuse.odometry.motion import Moment, MotionModel, is_small
+from tofuse.odometry.motion_segmentation import MotionSegmentation
+from tofuse.odometry.relocalization import Relocalizer
+from tofuse.registration.agreement import AgreementOptions, agreement
+from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
+
+# Weight of the deviation from the predicted motion, as a fraction of the points: small, as a wrong
+# pose loses more where the scene constrains it.
+_MOTION_WEIGHT = 0.05
+# Smallest difference of the scores of different poses, as a fraction of the points.
+_MIN_LEAD = 0.03
+# Degenerate directions of a view of a plane: two translations and a rotation.
+_PLANE = 3
+
+
+class HypothesisSelector:
+    """Selects the pose hypothesis that explains a view."""
+
+    def __init__(
+        self,
+        usual: UsualFit,
+        motion: MotionModel,
+        segmentation: MotionSegmentation,
+        relocalizer: Relocalizer,
+    ) -> None:
+        self._usual, self._motion = usual, motion
+        self._segmentation, self._relocalizer = segmentation, relocalizer
+        self._degenerate = 0  # number of degenerate directions of the last view
+
+    def best(self, hypotheses: Hypotheses, now: Moment, *, in_sequence: bool) -> Hypothesis | None:
+        """Return the hypothesis to accept; None if all are contradicted.
+
+        A poor fit is accepted only in sequence, near the predicted pose; never after a gap.
+        """
+        best = self._first_usual(hypotheses, now)
+        if best is None and in_sequence:
+            best = self._best_doubtful(hypotheses, now) or self._by_search(hypotheses, now)
+        elif best is not None and in_sequence and self._lost_constraints(best):
+            best = self._better_constrained(best, hypotheses, now)
+        self._degenerate = 0 if best is None else len(best.aligned.unobservable)
+        return best
+
+    def _lost_constraints(self, hypothesis: Hypothesis) -> bool:
+        """Whether a view is less constrained than the one before.
+
+        What constrains it may be outside the convergence basin of a wrong start, and the rest fits
+        anywhere along a wall.
+        """
+        return len(hypothesis.aligned.unobservable) > self._degenerate
+
+    def _better_constrained(
+        self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
+    ) -> Hypothesis:
+        """Return the result of a search, if it is better constrained and has a better score."""
+        other = self._by_search(hypotheses, now)
+        if other is None or len(other.aligned.unobservable) >= len(hypothesis.aligned.unobservable):
+            return hypothesis
+        poses = (
+            self._explanation_score(other, hypotheses, now),
+            self._explanation_score(hypothesis, hypotheses, now),
+        )
+        return other if poses[0] > poses[1] else hypothesis
+
+    def _first_usual(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
+        """Return the first alignment with a usual fit and a motion inside of the gate.
+
+        While the usual fit of the camera is unknown, both images must agree as well. So they must
+        where a fit is only noisier than usual: a view farther from the keyframe shares less of its
+        systematic errors, and a chain of nearer references would drift. Where a reference
+        contradicts, moving objects may explain it; else another pose must explain all references
+        as well: an alignment with the last frame may follow what moves since then.
+        """
+        rival = -np.inf
+        for hypothesis in hypotheses:
+            usual, predicted = hypothesis.assessment.usual, self._is_predicted(hypothesis, now)
+            if self._violates_gate(hypothesis, now):
+                continue
+            if not usual and (hypothesis.assessment.conflict or not predicted):
+                if predicted:
+                    for static in self._segmentation.alternatives(hypothesis, hypotheses):
+                        if static.assessment.usual and not self._violates_gate(static, now):
+                            return static
+                    rival = max(rival, self._explanation_score(hypothesis, hypotheses, now))
+                continue
+            if not predicted and not self._is_verified(hypothesis, hypotheses):
+                continue
+            if (
+                np.isfinite(rival)
+                and self._explanation_score(hypothesis, hypotheses, now) < rival - _MIN_LEAD
+            ):
+                continue
+            if (usual and self._usual.is_known) or self._agreement(hypothesis) > 0:
+                return hypothesis
+        return None
+
+    def _best_doubtful(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
+        """Return the alignment that explains the view best, unless both images contradict it."""
+        best, best_score = None, -np.inf
+        made = list(hypotheses)
+        segmented = [a for m in made for a in self._segmentation.alternatives(m, hypotheses)]
+        for hypothesis in (*segmented, *made):
+            if not np.isfinite(hypothesis.aligned.rms_m) or self._violates_gate(hypothesis, now):
+                continue
+            if not (self._is_predicted(hypothesis, now) or _is_small(hypothesis, hypotheses)):
+                continue
+            if len(hypothesis.aligned.unobservable) >= _PLANE and hypothesis.assessment.conflict:
+                continue  # mostly predicted, and the prediction explains the view badly
+            if self._agreement(hypothesis, finely_scaled(self._usual)) <= 0:
+                continue
+            score = self._explanation_score(hypothesis, hypotheses, now)
+            if score > best_score:
+                best, best_score = hypothesis, score
+        return best
+
+    def _by_search(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
+        """Return a quick, unpredicted motion of which a search is certain."""
+        for r in hypotheses.references:
+            link = self._relocalizer.link(hypotheses.view, r.keyframe, adjacent=False)
+            if link is None or not link.certain:
+                continue
+            T = r.keyframe.T_component_camera @ link.T_i_j
+            found = hypotheses.realigned(T, hypotheses.view, r, predicted=False)
+            if found.assessment.usual and self._motion.is_feasible(found.T_component_camera, now):
+                return replace(found, note=f"the prediction did not fit: {link.how}")
+        return None
+
+    def _explanation_score(
+        self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
+    ) -> float:
+        """Return how well a pose explains the view against all references, and the motion.
+
+        A doubtful reference counts only if there is no other: its own pose may follow a moving
+        object.
+        """
+        T, compare = hypothesis.T_component_camera, finely_scaled(self._usual)
+        references = [
+            hypothesis.reference if r.keyframe is hypothesis.keyframe else r
+            for r in hypotheses.references
+        ]
+        sure = [r for r in references if not r.keyframe.doubtful] or references
+        fits = [
+            agreement(hypothesis.view, r.target.view, r.target.T_target_world @ T, compare).score
+            for r in sure
+        ]
+        off = self._motion.normalised_deviation(T, now)
+        return float(np.mean(fits) - _MOTION_WEIGHT * np.log1p(off * off))
+
+    def _agreement(self, hypothesis: Hypothesis, compare: AgreementOptions | None = None) -> float:
+        """Return support minus contradiction of an alignment, of both images."""
+        target = hypothesis.reference.target.view
+        compare = compare or self_scaled(self._usual)
+        return agreement(hypothesis.view, target, hypothesis.T_keyframe_camera, compare).score
+
+    def _violates_gate(self, hypothesis: Hypothesis, now: Moment) -> bool:
+        """Whether the motion to a pose is outside of the gate."""
+        violation = self._motion.gate_violation(hypothesis.T_component_camera, now)
+        return bool(violation) and not self._motion.velocity_is_inherited
+
+    def _is_predicted(self, hypothesis: Hypothesis, now: Moment) -> bool:
+        """Whether an alignment began at the predicted pose, and ended near it if inherited."""
+        motion = self._motion
+        violation = motion.velocity_is_inherited and motion.gate_violation(
+            hypothesis.T_component_camera, now
+        )
+        return hypothesis.predicted and not violation
+
+    def _is_verified(self, hypothesis: Hypothesis, hypotheses: Hypotheses) -> bool:
+        """Whether an unpredicted motion is small, or confirmed by a search."""
+        if _is_small(hypothesis, hypotheses):
+            return True
+        if not hypothesis.aligned.converged or len(hypothesis.aligned.unobservable):
+            return False
+        k, T = hypothesis.keyframe, hypothesis.T_keyframe_camera
+        return self._agreement(hypothesis) > 0 and bool(
+            self._relocalizer.agrees(hypothesis.view, k, T)
+        )
+
+
+def _is_small(hypothesis: Hypothesis, hypotheses: Hypotheses) -> bool:
+    """Whether the camera hardly moved since the last frame."""
+    return is_small(se3.inverse(hypotheses.T_last) @ hypothesis.T_component_camera)
