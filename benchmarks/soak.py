@@ -233,7 +233,7 @@ def live(
     print(f"{sent}, {done.frames} recorded, {done.dropped} dropped; ended: {done.ended_by}")
     good &= (done.frames, done.dropped) == (sent.frames, 0)
     recording = open_recording(base / "recorded")
-    warned = any("time goes back" in line for line in recording.warnings)
+    warned = any("time decreases" in line for line in recording.warnings)
     good &= len(recording) == sent.frames and warned == (sent.late > 0)
     if not mapped:
         return good

@@ -66,12 +66,12 @@ def test_facts_of_a_simulated_recording(room_recording) -> None:
 def test_numbers_of_a_made_recording() -> None:
     frames = [image(2.0, k, valid=600) for k in range(11)]
     facts = inspect_recording(of(frames)).facts
-    assert facts["time"] == "1.00 s, 10.0 frames a second"
+    assert facts["time"] == "1.00 s, 10.0 frames per second"
     assert facts["depth"] == "2.00 to 2.00 m, median 2.00 m"
     assert facts["valid points"] == "50%"
     assert facts["images"].startswith("40 x 30, 52 x 40 degrees")
     assert facts["depth is"] == "z"
-    assert facts["with"] == "nothing but depth"
+    assert facts["with"] == "depth only"
     one = inspect_recording(of([image(2.0, depth_kind="range")])).facts
     assert (one["time"], one["depth is"]) == ("a single moment", "radial range")
 

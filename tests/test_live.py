@@ -102,7 +102,7 @@ def test_realsense_refusals(install: Install) -> None:
         device("realsense", {}).open()
     assert package.stopped == 1  # not left running
     package.plugged_in = False
-    with pytest.raises(DeviceError, match="no camera is plugged in"):
+    with pytest.raises(DeviceError, match="no camera is connected"):
         device("realsense", {}).open()
     with pytest.raises(DeviceError, match="no camera f999 is plugged in"):
         device("realsense", {"serial": "f999"}).open()

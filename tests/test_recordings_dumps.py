@@ -246,7 +246,7 @@ def test_hololens_takes_long_throw_of_both(tmp_path: Path) -> None:
         shutil.copy(path, tmp_path / "scan")
     recording = open_recording(tmp_path / "scan")
     assert "Long Throw" in recording.metadata["sensor"]
-    assert any("Depth AHaT is left out" in line for line in recording.warnings)
+    assert any("Depth AHaT is ignored" in line for line in recording.warnings)
 
 
 def test_pgm() -> None:
@@ -280,7 +280,7 @@ def test_kinect2(tmp_path: Path, size: tuple[int, int], serial: str, scale: floa
 def test_kinect2_that_lacks_something(tmp_path: Path) -> None:
     made.make_kinect2(tmp_path / "scan")
     (tmp_path / "scan" / "calib_ir.yaml").write_text("%YAML:1.0\ncameraMatrix:\n data: [1, x]")
-    with pytest.raises(InputError, match="holds no cameraMatrix of 9 numbers"):
+    with pytest.raises(InputError, match="has no cameraMatrix of 9 numbers"):
         open_recording(tmp_path / "scan")
     for path in (tmp_path / "scan").glob("*.yaml"):
         path.unlink()

@@ -47,7 +47,7 @@ def test_a_point_for_each_pixel_becomes_an_image(tmp_path: Path, name: str) -> N
             assert frame.amplitude_image is None
         else:
             np.testing.assert_array_equal(frame.amplitude_image, made.amplitudes()[k])
-    moved = [line for line in recording.warnings if "in front of where" in line]
+    moved = [line for line in recording.warnings if "in front of the camera" in line]
     assert len(moved) == (name == "helios")
     if moved:
         told = float(moved[0].split(" mm ")[0].rsplit(" ", 1)[1])

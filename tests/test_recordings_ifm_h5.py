@@ -39,7 +39,7 @@ def test_it_is_what_the_stream_of_the_head_is(tmp_path: Path, model: int) -> Non
 def test_one_of_several_heads(tmp_path: Path) -> None:
     made.make_h5(tmp_path / "a.h5", heads=2)
     recording = open_recording(tmp_path / "a.h5")
-    assert any("there are also o3r_tof_1: choose by --topic" in w for w in recording.warnings)
+    assert any("others are o3r_tof_1: choose with --topic" in w for w in recording.warnings)
     other = open_recording(tmp_path / "a.h5", topic="o3r_tof_1")
     a, b = recording[0], other[0]
     assert isinstance(a, RangeFrame)

@@ -128,7 +128,7 @@ def test_stray_with_video_and_a_lens_for_each_frame(tmp_path: Path) -> None:
     assert recording.warnings == []
     data = Path(path).read_bytes()
     Path(path).write_bytes(data[: len(data) // 2])
-    assert any("colour is left out" in line for line in open_recording(tmp_path / "scan").warnings)
+    assert any("colour is ignored" in line for line in open_recording(tmp_path / "scan").warnings)
 
 
 def test_stray_without_rows_or_lens(tmp_path: Path) -> None:

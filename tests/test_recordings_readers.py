@@ -188,7 +188,7 @@ def test_redwood_with_some_colour_or_other_names(tmp_path: Path) -> None:
     for path in (tmp_path / "color").iterdir():
         path.rename(path.with_name(f"photo {path.name}"))
     recording = open_recording(tmp_path, format="redwood")
-    assert any("their names don't tell which belong together" in w for w in recording.warnings)
+    assert any("their names don't show which belong together" in w for w in recording.warnings)
 
 
 def test_redwood_without_a_camera_is_unsure(tmp_path: Path) -> None:
@@ -388,7 +388,7 @@ def test_clouds_too_far_apart_for_one_shift_warn(tmp_path: Path) -> None:
     recording = open_recording(tmp_path)
     recording[1]
     (warning,) = recording.warnings
-    assert "kept only to 0.25 m" in warning
+    assert "rounded to 0.25 m" in warning
 
 
 def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
@@ -408,7 +408,7 @@ def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
     # 3DTK turns z forward into x right at +90 degrees about y.
     np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-15)
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-    assert "no truth" in recording.warnings[0]
+    assert "not ground truth" in recording.warnings[0]
 
 
 def test_slam6d_pose_that_is_none(tmp_path: Path) -> None:

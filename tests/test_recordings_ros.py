@@ -469,7 +469,7 @@ def test_color_without_its_place_is_left_out(tmp_path: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
     assert frame.color_image is None
-    assert ["colour is left out" in line for line in recording.warnings] == [True]
+    assert ["colour is ignored" in line for line in recording.warnings] == [True]
 
 
 @pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])
@@ -566,7 +566,7 @@ def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
-    with pytest.raises(InputError, match=r"has no CameraInfo beside .*; give .* --camera"):
+    with pytest.raises(InputError, match=r"has no CameraInfo for .*; give .* --camera"):
         open_recording(bag.close())
     (tmp_path / "b").mkdir()
     bag = Bag(tmp_path / "b", "ros1")
@@ -610,7 +610,7 @@ def test_without_rosbags_it_is_said_how_to_get_it(
         return found(name)
 
     monkeypatch.setattr(bags.importlib, "import_module", missing)
-    with pytest.raises(InputError, match=r"is a ROS bag; give `pip install 'tofuse\[ros\]'`"):
+    with pytest.raises(InputError, match=r"is a ROS bag; run `pip install 'tofuse\[ros\]'`"):
         open_recording(tmp_path / "a.bag")
 
 
@@ -690,7 +690,7 @@ def test_colour_without_a_place_is_left_out(tmp_path: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
     assert frame.color_image is None
-    assert any(f"colour is left out: how {COLOR_TOPIC} shows" in w for w in recording.warnings)
+    assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -275,7 +275,7 @@ def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
     data = path.read_bytes()
     for wrong in (b"", data[:300], data.replace(b'"SCALAR"', b'"MATRIX"'), b"glTF" + data[5:]):
         path.write_bytes(wrong)
-        with pytest.raises(InputError, match="no mesh of ours"):
+        with pytest.raises(InputError, match="not a mesh written by tofuse"):
             read_glb(path)
     write_glb(path, GeometryRecord(np.zeros((0, 3)), np.zeros((0, 3), int)))
     assert len(read_glb(path).faces) == 0

@@ -1,4 +1,4 @@
-"""What a recording is, in words."""
+"""Facts about a recording, as text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.recordings.recording import Recording
 
 
 def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
-    """Say in words what a recording is, by some of its frames."""
+    """Return facts about a recording by name, as text, from some of its frames."""
     facts = {
         "recording": recording.path,
         "format": recording.format,
@@ -23,8 +23,8 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
         "time": _time(recording.timestamps),
         **_view_facts(recording, frames[0]),
         **_depth_facts(frames),
-        "reference poses": _share(recording.reference),
-        "odometry": _share(recording.odometry),
+        "reference poses": _coverage(recording.reference),
+        "odometry": _coverage(recording.odometry),
     }
     facts |= {
         name: str(value)
@@ -38,7 +38,7 @@ def _time(times: Float64) -> str:
     if len(times) < 2:
         return "a single moment"
     step = float(np.median(np.diff(times)))
-    rate = f", {1 / step:.1f} frames a second" if step > 0 else ""
+    rate = f", {1 / step:.1f} frames per second" if step > 0 else ""
     return f"{times[-1] - times[0]:.2f} s{rate}"
 
 
@@ -53,7 +53,7 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     wide, high = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
     model = getattr(frame.camera, "model", type(frame.camera).__name__)
     also = [
-        name + ("" if name != "colour" or frame.color_registered else " (beside depth)")
+        name + ("" if name != "colour" or frame.color_registered else " (not registered)")
         for name, image in (
             ("amplitude", frame.amplitude_image),
             ("confidence", frame.confidence_image),
@@ -67,13 +67,13 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     out = {
         "images": f"{frame.camera.width} x {frame.camera.height}, {wide:.0f} x {high:.0f} degrees, "
         f"{model} camera",
-        "noise as of": family if family != "unknown" else "no camera that is known",
+        "noise as of": family if family != "unknown" else "unknown camera",
     }
     if isinstance(lens, Pinhole):
         out["lens"] = f"f {lens.fx:.1f}, {lens.fy:.1f} pixels, centre {lens.cx:.1f}, {lens.cy:.1f}"
     return out | {
         "depth is": "z" if frame.depth_kind == "z" else "radial range",
-        "with": ", ".join(also) or "nothing but depth",
+        "with": ", ".join(also) or "depth only",
     }
 
 
@@ -81,23 +81,23 @@ def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
     depths = np.concatenate([depths_of(f) for f in frames])
     valid = np.mean([len(f) / max(f.valid.size, 1) for f in frames])
     if len(depths) == 0:
-        return {"depth": "no valid point in the frames looked at"}
-    low, middle, high = np.percentile(depths, [1, 50, 99])
+        return {"depth": "no valid point in the sampled frames"}
+    low, median, high = np.percentile(depths, [1, 50, 99])
     extent = np.median([_extent(f) for f in frames if len(f)], axis=0)
     return {
-        "depth": f"{low:.2f} to {high:.2f} m, median {middle:.2f} m",
+        "depth": f"{low:.2f} to {high:.2f} m, median {median:.2f} m",
         "a view spans": " x ".join(f"{size:.2f}" for size in extent) + " m",
         "valid points": f"{valid:.0%}",
     }
 
 
 def _extent(frame: Frame) -> Float64:
-    """Size (3,) in m of the box that holds nearly all points of a view."""
+    """Size (3,) in m of the box around 98 % of the points of a view, per axis."""
     low, high = np.percentile(frame.points, [1, 99], axis=0)
     return high - low
 
 
-def _share(poses: Float64 | None) -> str:
+def _coverage(poses: Float64 | None) -> str:
     if poses is None:
         return "none"
     return f"for {int(np.isfinite(poses[:, 0, 0]).sum())} frames"

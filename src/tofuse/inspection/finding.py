@@ -1,4 +1,4 @@
-"""What a check says of a recording."""
+"""Faults that checks of a recording report."""
 
 from __future__ import annotations
 
@@ -9,46 +9,49 @@ Severity = Literal["severe", "warning", "note"]
 
 SEVERITIES: tuple[Severity, ...] = ("severe", "warning", "note")
 
-# The closed list of codes: the severity that each has, and what it means.
+# The closed list of codes, with severity and meaning.
 CODES: dict[str, tuple[Severity, str]] = {
-    "depth_unit": ("severe", "Depths are such as no ToF camera measures, or have another unit."),
-    "range_taken_for_z": ("severe", "Radial ranges are said to be z: walls bulge."),
-    "z_taken_for_range": ("severe", "z depths are said to be radial ranges: walls are hollow."),
+    "depth_unit": ("severe", "Depths are implausible for a ToF camera, or in another unit."),
+    "range_taken_for_z": ("severe", "Radial ranges are declared as z: walls bulge."),
+    "z_taken_for_range": ("severe", "z depths are declared as radial ranges: walls are concave."),
     "focal_length": ("severe", "The focal length is not that of these images."),
     "other_intrinsics": ("severe", "The intrinsics are of another resolution or another camera."),
-    "lens_distortion": ("severe", "Straight walls bend as under a lens that is not corrected."),
-    "mirrored": ("severe", "Depth and amplitude or colour are mirrored or turned to each other."),
-    "color_unregistered": ("severe", "Colour is said to be registered to depth, and is not."),
-    "time_unsorted": ("severe", "Time stamps go back."),
-    "phase_wrap": ("severe", "Surfaces beyond the ambiguity are measured as near ones."),
-    "little_overlap": ("severe", "Consecutive frames see too little in common."),
-    "time_repeated": ("warning", "Time stamps occur more than once."),
-    "frames_missing": ("warning", "The time stamps have gaps."),
-    "frames_repeated": ("warning", "Images are the same as the one before, to the last pixel."),
+    "lens_distortion": ("severe", "Planes are distorted as by an uncorrected lens."),
+    "mirrored": (
+        "severe",
+        "Depth and amplitude or colour are mirrored or rotated relative to each other.",
+    ),
+    "color_unregistered": ("severe", "Colour is declared as registered to depth, and is not."),
+    "time_unsorted": ("severe", "Timestamps decrease."),
+    "phase_wrap": ("severe", "Surfaces beyond the ambiguity range are measured as near ones."),
+    "little_overlap": ("severe", "Consecutive frames overlap too little."),
+    "time_repeated": ("warning", "Timestamps are repeated."),
+    "frames_missing": ("warning", "The timestamps have gaps."),
+    "frames_repeated": ("warning", "Images are identical to the previous one."),
     "saturated": ("warning", "Many pixels are saturated."),
-    "few_valid": ("warning", "Few pixels hold a measurement."),
-    "flying_pixels": ("warning", "Many pixels lie between surfaces, where nothing is."),
+    "few_valid": ("warning", "Few pixels are valid."),
+    "flying_pixels": ("warning", "Many pixels are between surfaces, at depth edges."),
     "moving_objects": ("warning", "Something moves in front of the camera."),
     "fast_motion": ("warning", "The camera moves fast for the frame rate."),
     "static": ("note", "The camera does not move."),
-    "wall_only": ("note", "Most frames see a single plane, which does not hold the camera."),
+    "wall_only": ("note", "Most frames show a single plane, which does not constrain the camera."),
 }
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault, with the numbers that show it.
+    """One fault, with numeric evidence.
 
     Attributes
     ----------
     code
         One of `CODES`.
     evidence
-        Numbers by name; SI units, shares from 0 to 1, in the names where they are others.
+        Numbers by name, in SI units, fractions from 0 to 1; other units are in the names.
     text
-        What is wrong, one sentence.
+        The fault, in one sentence.
     remedy
-        What to do, one sentence.
+        What to do, in one sentence.
     """
 
     code: str
@@ -58,7 +61,7 @@ class Finding:
 
     @property
     def severity(self) -> Severity:
-        """How bad it is: a severe one spoils a model, a note tells what to expect."""
+        """ "severe" makes a model wrong; "note" states what to expect."""
         return CODES[self.code][0]
 
     def __str__(self) -> str:

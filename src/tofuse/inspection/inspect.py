@@ -1,4 +1,4 @@
-"""What a recording is, and what is wrong with it."""
+"""Inspection of a recording: facts and faults."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 
-# Pairs of neighbours that are read, by `inspect` and at the start of a run.
+# Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
 PAIRS, QUICK_PAIRS = 8, 4
 
 Check = Callable[[Sample], Iterable[Finding]]
 
-# In the order in which they are told, within one severity.
+# In the order in which findings of one severity are reported.
 QUICK: tuple[Check, ...] = (
     values.check_unit,
     values.check_valid,
@@ -47,18 +47,18 @@ CHECKS: tuple[Check, ...] = (*QUICK, focal.check_focal)
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What a recording is, and what is wrong with it.
+    """The facts and faults of a recording.
 
     Attributes
     ----------
     recording
-        What was looked at.
+        The recording.
     findings
-        The gravest first.
+        The most severe first.
     notes
-        What reading it told, one line each.
+        Warnings of the reader, one line each.
     frames
-        Those that were looked at.
+        The frames that were checked.
     """
 
     recording: Recording
@@ -68,12 +68,12 @@ class Inspection:
 
     @cached_property
     def facts(self) -> dict[str, str]:
-        """What it is, by name, for people."""
+        """Facts by name, as text."""
         return facts.facts_of(self.recording, self.frames)
 
     @property
     def severe(self) -> bool:
-        """Whether a model of it would be spoilt."""
+        """Whether a finding is severe: a model would be wrong."""
         return any(f.severity == "severe" for f in self.findings)
 
     @property
@@ -105,16 +105,16 @@ class Inspection:
 def inspect_recording(
     recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
 ) -> Inspection:
-    """Say what a recording is and what is wrong with it.
+    """Collect the facts of a recording, and check it for faults.
 
     Parameters
     ----------
     recording
-        What `tofuse.open` gives, or the path of one.
+        As returned by `tofuse.open`, or its path.
     turning
-        Whether an object turns before a still camera: then nothing is said of motion.
+        Whether an object turns in front of a stationary camera: then motion is not checked.
     quick
-        Read fewer frames and leave out what takes longer than a moment: what a run does.
+        Whether to read fewer frames and skip slow checks, as at the start of a run.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def inspect_recording(
     notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
     if not sample.frames:
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
-    # BLAS sums differ with its number of threads; ours don't.
+    # Results of BLAS depend on its number of threads.
     with threadpool_limits(1):
         findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))

@@ -1,4 +1,4 @@
-"""How the camera moved from one frame to the next, and what else moved."""
+"""Camera motion between pairs of frames, and the part of the image that moved by itself."""
 
 from __future__ import annotations
 
@@ -14,74 +14,73 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.view_points import landing_pixels
 
-# Views are small, so nearly all pixels take part from the start.
+# Views are small, so nearly all pixels are used at all levels.
 _OPTIONS = ProjectiveOptions(
     levels=(Level(2, 8, 0.03, 0.1), Level(2, 3, 0.005, 0.02), Level(1, 2, 0.0, 0.0))
 )
-# An alignment that reaches this score from where it started needs no other start.
+# An alignment with this score needs no other start.
 _GOOD_SCORE = 0.7
-# Starts, in shares of the field of view, to the sides and up and down.
+# Rotations of further starts, as fractions of the field of view, in all four directions.
 _STARTS = (0.2, 0.4, 0.6)
-# Points in front of what the other view saw by so many sigmas and this share of z have moved.
-_MOVED_SIGMAS, _MOVED_SHARE = 4.0, 0.05
-_FEWEST_COMPARED = 200
-# Edges that smoothing widens, or that a pose misses by a little, are narrower than this, pixels.
-_WIDEST_EDGE = 5
+# Points that are before the other view's surface by this number of sigmas and fraction of z moved.
+_MOVED_SIGMAS, _MOVED_FRACTION = 4.0, 0.05
+_MIN_COMPARED = 200
+# Largest width in pixels of false detections at edges, from smoothing and pose errors.
+_MAX_EDGE = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two neighbours.
+    """Two aligned views.
 
     Attributes
     ----------
     i, j
-        Their positions in the sample.
+        Positions of their frames in the sample.
     first, second
-        Their surfaces.
-    found
-        The best alignment, of the second to the first.
+        The views.
+    alignment
+        The best alignment of the second to the first.
     """
 
     i: int
     j: int
     first: PreparedView
     second: PreparedView
-    found: Aligned
+    alignment: Aligned
 
     @property
-    def T(self) -> Float64:
-        """(4, 4) T_first_second."""
-        return self.found.T_world_source
+    def T_first_second(self) -> Float64:
+        """(4, 4) pose of the second camera in the frame of the first."""
+        return self.alignment.T_world_source
 
     @cached_property
     def angle(self) -> float:
-        """Turn of the camera in rad."""
-        return float(se3.angle(self.T))
+        """Rotation angle of the camera, rad."""
+        return float(se3.angle(self.T_first_second))
 
     @cached_property
     def shift(self) -> float:
-        """How far the image moved, as a share of the field of view: by turn and by way."""
-        wide = field_of_view(self.first)
-        way = float(np.linalg.norm(self.T[:3, 3])) / self.first.depth
-        return (self.angle + way) / wide
+        """Image motion by rotation and translation, as a fraction of the field of view."""
+        distance = float(np.linalg.norm(self.T_first_second[:3, 3])) / self.first.depth
+        return (self.angle + distance) / field_of_view(self.first)
 
     @property
     def fits(self) -> bool:
-        """Whether the two views agree where they overlap."""
-        return self.found.score > 0.5 and self.found.inlier_share > 0.7
+        """Whether the two views are consistent where they overlap."""
+        return self.alignment.score > 0.5 and self.alignment.inlier_share > 0.7
 
     @cached_property
-    def moved_share(self) -> float:
-        """Share of what both see that stands where the other saw through."""
+    def moved_fraction(self) -> float:
+        """Fraction of the overlap where one view has a surface in the free space of the other."""
         return max(
-            _in_front(self.second, self.first, self.T),
-            _in_front(self.first, self.second, se3.inverse(self.T)),
+            _in_front(self.second, self.first, self.T_first_second),
+            _in_front(self.first, self.second, se3.inverse(self.T_first_second)),
         )
 
 
 def field_of_view(view: PreparedView) -> float:
-    """Smaller angle of the field of view, rad."""
+    """Return the smaller angle of the field of view, rad."""
     rays = view.rays
     x = np.arctan(rays[rays.shape[0] // 2, :, 0])
     y = np.arctan(rays[:, rays.shape[1] // 2, 1])
@@ -89,15 +88,15 @@ def field_of_view(view: PreparedView) -> float:
 
 
 def aligned_pair(first: PreparedView, second: PreparedView, i: int, j: int) -> Pair:
-    """Align two views, from no motion, and if that fails from turns to all sides."""
+    """Align views of frames `i` and `j`, from no motion, and if that fails from rotations."""
     best = aligned(second, first, np.eye(4))
     if best.score < _GOOD_SCORE:
         wide = field_of_view(first)
-        for share in _STARTS:
+        for fraction in _STARTS:
             for axis in (1, 0):
                 for sign in (1, -1):
                     xi = np.zeros(6)
-                    xi[3 + axis] = sign * share * wide
+                    xi[3 + axis] = sign * fraction * wide
                     other = aligned(second, first, se3.exp(xi))
                     best = max(best, other, key=lambda a: a.score)
             if best.score >= _GOOD_SCORE:
@@ -106,14 +105,14 @@ def aligned_pair(first: PreparedView, second: PreparedView, i: int, j: int) -> P
 
 
 def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64) -> Aligned:
-    """Align two small views from a start; by their shape alone where light does not settle."""
+    """Align two small views from a start; without photometric terms if that fails."""
     targets = [Target(target, np.eye(4))]
     for options in (_OPTIONS, replace(_OPTIONS, photometric=False)):
         try:
             return align(source, targets, T_target_source, options)
         except np.linalg.LinAlgError:
             continue
-    # Nothing of the one is seen by the other.
+    # The views do not overlap.
     nothing = np.zeros((6, 6))
     return Aligned(
         T_world_source=T_target_source, converged=False, iterations=0, information=nothing,
@@ -123,9 +122,9 @@ def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64
 
 
 def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float64) -> float:
-    """Share of the points of the source that stand where the target saw through.
+    """Fraction of the source's points that are in the free space of the target.
 
-    Single pixels and thin edges don't count: they fly, or the pose is off by a little.
+    Single pixels and thin edges are ignored: they are flying pixels, or due to pose errors.
     """
     rows, columns = target.z.shape
     on = source.z > 0
@@ -139,17 +138,17 @@ def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float
         & (pixels[:, 1] < rows)
     )
     u, v = pixels[inside].T
-    # The nearest around: an edge may be a pixel off. Where something is unknown, nothing is said.
+    # The nearest in 3 x 3 pixels, as edges may be off by one; 0 where any is unknown.
     known = np.where(target.z > 0, target.z, 0).astype(np.float32)
     behind = ndimage.minimum_filter(known, 3, mode="nearest")[v, u]
     sigma = np.hypot(target.sigma[v, u], source.sigma[on][inside])
     gap = behind - points[inside, 2]
-    front = gap > np.maximum(_MOVED_SIGMAS * sigma, _MOVED_SHARE * behind)
+    front = gap > np.maximum(_MOVED_SIGMAS * sigma, _MOVED_FRACTION * behind)
     compared = int(np.count_nonzero(behind > 0))
-    if compared < _FEWEST_COMPARED:
+    if compared < _MIN_COMPARED:
         return 0.0
     image = np.zeros(source.z.shape, bool)
     where = np.flatnonzero(on.ravel())[inside]
     image.ravel()[where[front]] = True
-    opened: Bool = ndimage.binary_opening(image, np.ones((_WIDEST_EDGE,) * 2, bool))
+    opened: Bool = ndimage.binary_opening(image, np.ones((_MAX_EDGE,) * 2, bool))
     return float(np.count_nonzero(opened)) / compared

@@ -1,4 +1,4 @@
-"""How the camera moves, and what moves in front of it."""
+"""Checks of the camera's motion, of moving objects, and of single-plane views."""
 
 from __future__ import annotations
 
@@ -12,67 +12,67 @@ from tofuse.inspection.finding import Finding
 from tofuse.inspection.motion import Pair
 from tofuse.inspection.sample import Sample
 
-# A camera that moved by no more than this stood still.
+# Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)
-_FEWEST_FRAMES = 3
-# Neighbours that share less than this part of the image, or move by more than this part of it.
+_MIN_FRAMES = 3
+# Smallest overlap of neighbours, and largest image motion, as fractions of the image.
 _OVERLAP, _FAST = 0.5, 0.2
-# Part of the image that something new stands in, in this part of the pairs.
+# Fraction of the image in which something moved, and fraction of the pairs with it.
 _MOVED, _OFTEN = 0.015, 0.5
 _FITS_WELL = 0.65
-# Part of the pixels of a view of a single plane that are on it.
-_WALL_SHARE = 0.8
-# Misfit of a plane, as a share of the depth.
+# Fraction of the pixels of a view that are on its largest plane, for a single-plane view.
+_WALL_FRACTION = 0.8
+# Largest misfit of a plane, relative to the depth.
 _FLAT = 0.02
 
 
 def check_still(sample: Sample) -> Iterator[Finding]:
-    """Does the camera move at all?"""
-    if sample.turning or len(sample.maps) < _FEWEST_FRAMES or not sample.pairs:
+    """Check whether the camera moves at all."""
+    if sample.turning or len(sample.views) < _MIN_FRAMES or not sample.pairs:
         return
     if _stands_still(sample):
         yield Finding(
             "static",
-            f"The camera does not move in the {len(sample.maps)} frames looked at: the model will "
-            "be what one view sees.",
-            "Move the camera; average still frames by --average-still; or, if a thing turns in "
-            "front of it, give --object.",
-            {"frames": len(sample.maps)},
+            f"The camera does not move in the {len(sample.views)} sampled frames: the model will "
+            "contain only what one view shows.",
+            "Move the camera; average still frames by --average-still; or, if an object turns in "
+            "front of it, use --object.",
+            {"frames": len(sample.views)},
         )
 
 
 def _stands_still(sample: Sample) -> bool:
-    """Whether neither neighbours nor frames far from each other tell of a motion."""
+    """Whether neither neighbouring nor distant frames show motion."""
     if not sample.pairs or not all(_still(p) for p in sample.pairs):
         return False
-    if not all(_still(p) for p in sample.apart):
+    if not all(_still(p) for p in sample.distant_pairs):
         return False
-    # An alignment stays where it began where it sees no way to go; edges tell more.
+    # In degenerate directions an alignment stays at its start, so edges are compared too.
     images = sample.images
     return not any(channels.shifted(images[0], image) for image in images[1:])
 
 
 def _still(pair: Pair) -> bool:
-    way = float(np.linalg.norm(pair.T[:3, 3]))
-    return pair.found.overlap > _OVERLAP and way < _STILL_M and pair.angle < _STILL_RAD
+    distance = float(np.linalg.norm(pair.T_first_second[:3, 3]))
+    return pair.alignment.overlap > _OVERLAP and distance < _STILL_M and pair.angle < _STILL_RAD
 
 
 def check_motion(sample: Sample) -> Iterator[Finding]:
-    """Do neighbours overlap, and does the camera move slowly enough for the frame rate?"""
+    """Check that neighbours overlap, and that motion is slow enough for the frame rate."""
     pairs = sample.pairs
     if sample.turning or len(pairs) < 2:
         return
-    lost = [p for p in pairs if not p.fits or p.found.overlap < _OVERLAP]
+    lost = [p for p in pairs if not p.fits or p.alignment.overlap < _OVERLAP]
     if 2 * len(lost) >= len(pairs):
         yield Finding(
             "little_overlap",
-            f"{len(lost)} of {len(pairs)} pairs of consecutive frames see too little in common, or "
-            "don't fit each other.",
+            f"{len(lost)} of {len(pairs)} pairs of consecutive frames overlap too little, or are "
+            "inconsistent.",
             "Record at a higher rate or move more slowly; use a smaller --every.",
             {
                 "pairs": len(pairs),
                 "without_overlap": len(lost),
-                "median_overlap": float(np.median([p.found.overlap for p in pairs])),
+                "median_overlap": float(np.median([p.alignment.overlap for p in pairs])),
             },
         )
         return
@@ -89,53 +89,53 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
 
 
 def check_moving_objects(sample: Sample) -> Iterator[Finding]:
-    """Does something stand where the frame before, or the next, saw through?"""
+    """Check for objects that move by themselves."""
     if sample.turning or not sample.pairs:
         return
-    # What moves slowly shows after a while, if the camera stands still. Edges that moved do not
-    # tell whether it does: they may be those of the thing.
-    still = [p for p in sample.apart if _still(p)]
-    apart = _moved(still) if len(still) >= _OFTEN * len(sample.apart) else np.zeros(0)
+    # Slow motion shows in distant frames, if the camera stands still. Shifted edges are not used to
+    # decide that: they may be those of the object.
+    still = [p for p in sample.distant_pairs if _still(p)]
+    apart = _moved(still) if len(still) >= _OFTEN * len(sample.distant_pairs) else np.zeros(0)
     shares = max(
         _moved(sample.pairs),
         apart,
-        key=lambda found: np.mean(found > _MOVED) if len(found) else 0.0,
+        key=lambda moved: np.mean(moved > _MOVED) if len(moved) else 0.0,
     )
     often = float(np.mean(shares > _MOVED)) if len(shares) else 0.0
     if often >= _OFTEN:
         yield Finding(
             "moving_objects",
             f"Something moves in front of the camera: in {often:.0%} of the pairs of frames "
-            f"{np.median(shares):.1%} of the image stands where the other saw through.",
-            "Record while nothing moves, or cut it off (--max-depth); if it is the thing to be "
-            "modelled, turning before a still camera, give --object.",
+            f"{np.median(shares):.1%} of the image is in the other's free space.",
+            "Record while nothing moves, or crop it (--max-depth); if it is the object to be "
+            "modelled, turning in front of a stationary camera, use --object.",
             {"moved_share": float(np.median(shares)), "pairs_share": often},
         )
 
 
 def _moved(pairs: Sequence[Pair]) -> Float64:
-    """Of pairs that fit, how much of the image moved; nothing if too few do."""
-    fit = [p for p in pairs if p.found.score > _FITS_WELL and p.fits and p.shift < _FAST]
+    """Fraction of the image that moved, for each consistent pair; empty if these are too few."""
+    fit = [p for p in pairs if p.alignment.score > _FITS_WELL and p.fits and p.shift < _FAST]
     if len(fit) < max(2, _OFTEN * len(pairs)):
         return np.zeros(0)
-    return np.array([p.moved_share for p in fit])
+    return np.array([p.moved_fraction for p in fit])
 
 
 def check_walls(sample: Sample) -> Iterator[Finding]:
-    """Is there more to see than one plane?"""
-    if not sample.maps:
+    """Check for views of a single plane."""
+    if not sample.views:
         return
-    largest = dict.fromkeys(sample.maps, 0.0)
+    largest = dict.fromkeys(sample.views, 0.0)
     for region in sample.regions:
         if region.misfit > _FLAT:
             continue
-        largest[region.frame] = max(largest[region.frame], region.share)
-    bare = [share > _WALL_SHARE for share in largest.values()]
+        largest[region.frame] = max(largest[region.frame], region.fraction)
+    bare = [share > _WALL_FRACTION for share in largest.values()]
     if np.mean(bare) >= _OFTEN:
         yield Finding(
             "wall_only",
-            f"{sum(bare)} of {len(bare)} frames see a single plane, along which the camera can "
-            "slide and turn unnoticed.",
+            f"{sum(bare)} of {len(bare)} frames show a single plane, along which the motion of the "
+            "camera is not observable.",
             "Keep a corner, furniture or texture in view.",
             {"frames": len(bare), "single_plane": sum(bare)},
         )

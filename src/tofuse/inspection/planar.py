@@ -1,23 +1,23 @@
-"""Do planes stay planes? How surfaces bend says how rays and depth are wrong.
+"""Errors of rays and depth, estimated from how planes are distorted.
 
-In inverse depth ``w = 1/z`` a plane is linear in the ray coordinates: ``w = a x + b y + c``.
-What was recorded as z but is radial range has ``w = L^-1 (a x + b y + c)``, with the length L of
-the ray (x, y, 1) (eq 2.3 of the thesis), and the reverse; rays that are off by a factor
-``q = 1 + t1 rho^2 + t2 rho^4`` (Brown 1966; rho is the distance from the axis in units of the
-image's corner) bend ``a x + b y`` but leave a wall seen head-on as it is. So the two can be told
-apart. All regions that might be planes are fitted at once, each with its own plane, all with the
-same three numbers, by Gauss-Newton with the planes eliminated:
+In inverse depth ``w = 1/z`` a plane is linear in the ray coordinates: ``w = a x + b y + c``. What
+was recorded as z but is radial range has ``w = L^-1 (a x + b y + c)``, with the length L of the ray
+(x, y, 1) (eq 2.3 of the thesis), and the reverse; rays that are off by a factor ``q = 1 + t1 rho^2
++ t2 rho^4`` (Brown 1966; rho is the distance from the axis in units of the image's corner) distort
+``a x + b y`` but not a fronto-parallel wall. So the two can be distinguished. All smooth regions
+are fitted jointly, each with its own plane, all with the same three parameters, by Gauss-Newton
+with the planes eliminated:
 
     kind:   w L^alpha        = a x q + b y q + c      (alpha, t1, t2)
     range:  w L(x p) / L(x)  = a x p + b y p + c      (s, t1, t2), with p = s + q
 
 and "z" is the first with alpha = 0. The last is for radial range, whose z depends on the rays:
-there a wrong focal length bends planes too. z does not: a wrong focal length stretches the whole
-world, and planes stay planes. Along a corridor alpha and t1 are the same; then neither is known.
+there a wrong focal length distorts planes too. Not for z: a wrong focal length stretches the whole
+world, and planes stay planes. Along a corridor alpha and t1 are equivalent; then neither is known.
 
-How well the numbers are known comes from how the surfaces disagree (the sandwich estimator: White
-1980), which knows of all errors of a camera that noise does not explain, such as wiggling and
-rounded corners. What several frames see at the same place of the image is one surface.
+Their covariance is computed from the disagreement of the surfaces (sandwich estimator: White 1980),
+which includes errors of the camera beyond noise, such as wiggling and rounded corners. Regions at
+the same place in several frames count as one surface.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ from tofuse.registration.prepared_view import PreparedView
 
 Model = Literal["kind", "z", "range"]
 
-# Neighbouring pixels belong to one surface if their normals differ by less than this, and their
-# planes put each other's depth within so many sigmas or this share of it.
-_SAME_TURN = np.cos(np.radians(10.0))
-_SAME_SIGMAS, _SAME_SHARE = 3.0, 0.01
-# Smaller pieces, as a share of the image, don't bend enough to see it.
-_LEAST_SHARE = 0.02
-_MOST_POINTS = 1500
-# Errors of neighbours are alike over patches of about so many pixels.
-_ALIKE = 25.0
+# Neighbouring pixels belong to one surface if their normals differ by less than this angle, and
+# their planes predict each other's depth within this number of sigmas or this fraction of it.
+_SAME_NORMAL_COSINE = np.cos(np.radians(10.0))
+_SAME_SIGMAS, _SAME_FRACTION = 3.0, 0.01
+# Smaller regions, as a fraction of the image, are not distorted enough to be of use.
+_MIN_FRACTION = 0.02
+_MAX_POINTS = 1500
+# Errors are correlated over patches of about this number of pixels.
+_CORRELATED_PIXELS = 25.0
 _ITERATIONS = 6
-# Regions of different frames are of one surface if they are this near in ray coordinates, and
-# turned alike.
+# Regions of different frames are of one surface if they are this near in ray coordinates, with
+# similar normals.
 _SAME_PLACE, _SAME_PLACE_COSINE = 0.12, np.cos(np.radians(12.0))
 _ROBUST = 3.0
-# What is known of the three numbers beforehand: they are hardly larger than this.
+# Prior standard deviations of the three parameters.
 _PRIOR: dict[Model, Float64] = {
     "kind": np.array([3.0, 0.15, 0.15]),
     "z": np.array([1e-9, 0.15, 0.15]),
     "range": np.array([0.7, 0.15, 0.15]),
 }
-_LONGEST_STEP = 0.5
+_MAX_STEP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A piece of a view that might be a plane.
+    """A smooth region of a view, possibly planar.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Region:
         Its position in the sample.
     x, y, w, sigma
         (N,) ray coordinates, inverse z in 1/m and its standard deviation.
-    share
+    fraction
         Of the valid pixels of the view.
     normal
         (3,) mean unit normal away from the camera.
@@ -79,19 +79,19 @@ class Region:
     y: Float64
     w: Float64
     sigma: Float64
-    share: float
+    fraction: float
     normal: Float64
 
     @property
     def misfit(self) -> float:
-        """Robust deviation from a plane, as a share of the depth."""
+        """Robust deviation from a plane, relative to the depth."""
         B = np.stack([self.x, self.y, np.ones_like(self.x)], 1)
         e = self.w - B @ np.linalg.lstsq(B, self.w, rcond=None)[0]
         return _spread(e / self.w)
 
 
 def regions_of(view: PreparedView, frame: int) -> list[Region]:
-    """Smooth pieces of a view without edges or creases."""
+    """Return the smooth regions of a view, without edges and creases, for frame number `frame`."""
     planes = view.planes
     w = planes[..., 3]
     on = (w > 0) & (view.z > 0) & (view.sigma > 0) & np.isfinite(view.sigma)
@@ -100,9 +100,9 @@ def regions_of(view: PreparedView, frame: int) -> list[Region]:
     counts = np.bincount(labels[on]) if on.any() else np.zeros(0, int)
     out = []
     valid = max(int(np.count_nonzero(view.z > 0)), 1)
-    for label in np.flatnonzero(counts >= _LEAST_SHARE * on.size):
+    for label in np.flatnonzero(counts >= _MIN_FRACTION * on.size):
         v, u = np.nonzero(on & (labels == label))
-        step = -(-len(v) // _MOST_POINTS)
+        step = -(-len(v) // _MAX_POINTS)
         v, u = v[::step], u[::step]
         z = view.z[v, u].astype(float)
         x, y = view.rays[v, u].astype(float).T
@@ -114,18 +114,18 @@ def regions_of(view: PreparedView, frame: int) -> list[Region]:
 
 
 def _labels(view: PreparedView, on: Bool) -> Int64:
-    """(H, W) number of the piece that each pixel is of."""
+    """(H, W) label of the region of each pixel."""
     rows, columns = on.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     normals, planes, rays = view.normals, view.planes, view.rays
-    tolerance = np.hypot(_SAME_SHARE, _SAME_SIGMAS * view.sigma / np.maximum(view.z, 1e-3))
+    tolerance = np.hypot(_SAME_FRACTION, _SAME_SIGMAS * view.sigma / np.maximum(view.z, 1e-3))
     starts, ends = [], []
     for a, b in (
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
         ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
     ):
         same = on[a] & on[b]
-        same &= (normals[a] * normals[b]).sum(-1) > _SAME_TURN
+        same &= (normals[a] * normals[b]).sum(-1) > _SAME_NORMAL_COSINE
         here = planes[b][..., :2] * rays[a]
         there = here[..., 0] + here[..., 1] + planes[b][..., 2]
         same &= np.abs(there - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
@@ -137,19 +137,19 @@ def _labels(view: PreparedView, on: Bool) -> Int64:
 
 
 @dataclass(frozen=True, eq=False)
-class Bending:
-    """How the surfaces of a recording bend.
+class Distortion:
+    """The distortion of the planes of a recording.
 
     Attributes
     ----------
     values
-        (3,) the numbers of the module's text: alpha or s, then t1, t2.
+        (3,) parameters, see the module: alpha or s, then t1, t2.
     covariance
         (3, 3) of them.
     surfaces
-        How many different ones took part.
+        Number of different surfaces.
     rms_before, rms_after
-        Of the distances from the planes, as a share of z, before and after.
+        Of the distances from the planes relative to z, before and after the fit.
     """
 
     values: Float64
@@ -160,26 +160,30 @@ class Bending:
 
     @property
     def first(self) -> tuple[float, float]:
-        """Alpha, or s, and its standard deviation."""
+        """Alpha or s, and its standard deviation."""
         return float(self.values[0]), float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def stretch(self) -> tuple[float, float]:
-        """By what share the lens moves rays at the corner, and its standard deviation.
+        """Relative displacement of rays at the corner by distortion, and its standard deviation.
 
-        Of the model of the lens: beyond what the focal length does.
+        Without the effect of the focal length.
         """
         g = np.array([0.0, 1.0, 1.0])
         return float(g @ self.values), float(np.sqrt(g @ self.covariance @ g))
 
 
-def bending(regions: Sequence[Region], radius: float, model: Model) -> Bending | None:
-    """Fit the three numbers; None where no region is large enough.
+def fit_distortion(regions: Sequence[Region], radius: float, model: Model) -> Distortion | None:
+    """Fit the three parameters; None if there are no regions.
 
     Parameters
     ----------
+    regions
+        Of all views.
     radius
-        Largest distance of the camera's rays from the axis: the corner.
+        Largest distance of the camera's rays from the axis, at the corner of the image.
+    model
+        The kind of error, see the module.
     """
     if not regions:
         return None
@@ -201,18 +205,18 @@ def bending(regions: Sequence[Region], radius: float, model: Model) -> Bending |
         g += scores.sum(0)
         misfit.append(float(np.sqrt(squares / max(count, 1))))
         step = np.linalg.solve(H, g)
-        theta = theta + step * min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+        theta = theta + step * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-12))
     inverse = np.linalg.inv(H)
     group = _same_surface(regions)
     n = int(group.max()) + 1
     sums = np.zeros((n, 3))
     np.add.at(sums, group, scores)
-    spread = inverse @ (sums.T @ sums) @ inverse * (n / max(n - 3, 0.5))
-    return Bending(theta, inverse + spread, n, misfit[0], misfit[-1])
+    sandwich = inverse @ (sums.T @ sums) @ inverse * (n / max(n - 3, 0.5))
+    return Distortion(theta, inverse + sandwich, n, misfit[0], misfit[-1])
 
 
 def _same_surface(regions: Sequence[Region]) -> Int64:
-    """(R,) number of the surface of each region: neighbours in the image across frames are one."""
+    """(R,) surface number of each region; overlapping regions of different frames share one."""
     out = np.zeros(len(regions), np.int64)
     last: list[Region] = []
     for n, region in enumerate(regions):
@@ -260,12 +264,12 @@ def _residuals(
         by_stretch = bent * r2 * stretch / (1 + r2 * stretch**2) - slope
         first = by_stretch
     G = np.stack([first, by_stretch * rho2, by_stretch * rho2**2], 1)
-    # What a change of the plane would take up is none of the numbers' doing.
+    # Project out the plane's parameters.
     root = np.sqrt(weight)[:, None]
     G = G - B @ np.linalg.lstsq(B * root, G * root, rcond=None)[0]
-    # Noise as seen: what is stated may be wrong by a factor. Pixels near each other err alike.
+    # The actual noise, as the stated one may be wrong by a factor, and correlated between pixels.
     scale = max(_spread(e / region.sigma), 0.3)
-    return e, G, weight / (scale**2 * _ALIKE), _ROBUST * _spread(e)
+    return e, G, weight / (scale**2 * _CORRELATED_PIXELS), _ROBUST * _spread(e)
 
 
 def _spread(e: Float64) -> float:

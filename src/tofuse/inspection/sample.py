@@ -1,4 +1,4 @@
-"""The frames that the checks look at: evenly spaced ones, and the one after each."""
+"""The frames that are checked: evenly spaced ones, and the successor of each."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ import numpy as np
 from tofuse.arrays import Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.motion import Pair, aligned_pair
-from tofuse.inspection.planar import Bending, Region, bending, regions_of
+from tofuse.inspection.planar import Distortion, Region, fit_distortion, regions_of
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording, evenly
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
-# What is looked for is as wide as the image; more pixels would only take longer.
-MAP_COLUMNS = 128
+# The faults concern the whole image; a higher resolution would only take longer.
+VIEW_COLUMNS = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Some frames of a recording, and what is computed of them when a check asks for it.
+    """Some frames of a recording, with lazily computed views, pairs and regions.
 
     Attributes
     ----------
     recording
-        All of it, for its time stamps.
+        The whole recording, for its timestamps.
     frames
-        The frames that could be read, in order.
+        The readable ones, in order.
     steps
-        (i, j) positions in `frames` of frames that follow each other in the recording.
+        (i, j) positions in `frames` of consecutive frames of the recording.
     unreadable
-        Of those that could not be read.
+        Errors of the others.
     turning
-        Whether an object turns before a still camera, by the user's word.
+        Whether, according to the user, an object turns in front of a stationary camera.
     """
 
     recording: Recording
@@ -46,12 +46,16 @@ class Sample:
 
     @classmethod
     def of(cls, recording: Recording, count: int, *, turning: bool = False) -> Sample:
-        """Read up to `count` pairs of neighbours, evenly spaced, the first and the last among them.
+        """Read up to `count` pairs of neighbours, evenly spaced, including the first and the last.
 
         Parameters
         ----------
+        recording
+            The recording to sample.
+        count
+            Number of pairs.
         turning
-            Whether an object turns before a still camera.
+            Whether an object turns in front of a stationary camera.
         """
         n = len(recording)
         firsts = evenly(np.arange(max(n - 1, 1)), count)
@@ -76,13 +80,13 @@ class Sample:
 
     @cached_property
     def images(self) -> tuple[RangeFrame, ...]:
-        """The frames that are range images with something in them."""
+        """The range images with valid pixels."""
         return tuple(f for f in self.frames if isinstance(f, RangeFrame) and f.valid.any())
 
     @cached_property
-    def maps(self) -> dict[int, PreparedView]:
-        """Surfaces of the range images, by position in `frames`."""
-        options = SurfaceOptions(columns=MAP_COLUMNS)
+    def views(self) -> dict[int, PreparedView]:
+        """Prepared views of the range images, by position in `frames`."""
+        options = SurfaceOptions(columns=VIEW_COLUMNS)
         return {
             k: prepare_view(f, options)
             for k, f in enumerate(self.frames)
@@ -91,50 +95,50 @@ class Sample:
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
-        """Neighbours, and how the camera moved between them."""
+        """The aligned pairs of consecutive frames."""
         return tuple(
-            aligned_pair(self.maps[i], self.maps[j], i, j)
+            aligned_pair(self.views[i], self.views[j], i, j)
             for i, j in self.steps
-            if i in self.maps and j in self.maps
+            if i in self.views and j in self.views
         )
 
     @cached_property
-    def apart(self) -> tuple[Pair, ...]:
-        """The first view and each other one."""
-        first, *others = self.maps
-        return tuple(aligned_pair(self.maps[first], self.maps[k], first, k) for k in others)
+    def distant_pairs(self) -> tuple[Pair, ...]:
+        """The first view aligned with each other one."""
+        first, *others = self.views
+        return tuple(aligned_pair(self.views[first], self.views[k], first, k) for k in others)
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:
-        """Pieces of the views that might be planes."""
+        """The smooth regions of all views."""
         return tuple(
-            region for k, view in self.maps.items() for region in regions_of(view, frame=k)
+            region for k, view in self.views.items() for region in regions_of(view, frame=k)
         )
 
     @cached_property
     def radius(self) -> float:
-        """Largest distance of the rays of the first image from the axis."""
+        """Largest distance of the rays (x/z, y/z) of the first image from the axis."""
         rays = self.images[0].camera.rays()
         return float(np.sqrt(np.nanmax((rays * rays).sum(-1))))
 
     @cached_property
-    def bending(self) -> Bending | None:
-        """How surfaces bend, as z taken for range bends them."""
-        return bending(self.regions, self.radius, "kind")
+    def distortion(self) -> Distortion | None:
+        """The distortion of planes, in the model for a wrong depth kind."""
+        return fit_distortion(self.regions, self.radius, "kind")
 
     @cached_property
     def period_m(self) -> float | None:
-        """Range after which the phase repeats; None where not known."""
+        """Range in m after which the phase repeats; None if not known."""
         known = {f.ambiguity_m for f in self.images}
         period = known.pop() if len(known) == 1 else None
         if period is None:
-            told = self.recording.metadata.get("ambiguity_m")
-            period = float(told) if isinstance(told, int | float) and told > 0 else None
+            stated = self.recording.metadata.get("ambiguity_m")
+            period = float(stated) if isinstance(stated, int | float) and stated > 0 else None
         return period
 
 
 def part_starts(recording: Recording) -> list[int]:
-    """Positions in the recording at which another of several joined ones begins."""
+    """Return the positions in a recording at which further joined recordings begin."""
     joined = recording.metadata.get("parts", ())
     starts = list(accumulate(part["frames"] for part in joined))[:-1]
     indices: Intp = recording.indices

@@ -1,4 +1,4 @@
-"""The contact sheet: some frames of a recording on one picture, with what was found."""
+"""The contact sheet: some frames of a recording in one picture, with the findings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.arrays import UInt8
 from tofuse.errors import OutputError
-from tofuse.inspection.values import fliers
+from tofuse.inspection.values import flying_pixels
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 _COLUMNS = 5
-# Rows of a mask: what a pixel is, and its colour.
+# Kinds of pixels in the mask, and their colours.
 _MASK = (
     ("valid", (225, 228, 232)),
     ("no measurement", (60, 64, 70)),
@@ -89,7 +89,7 @@ def _lines(inspection: Inspection) -> list[str]:
         text = f"{finding.severity}: {finding.code}: {finding.text}"
         out += textwrap.wrap(text, _LINES, subsequent_indent="    ")
     if not inspection.findings:
-        out.append("no check found anything wrong")
+        out.append("all checks passed")
     return [line.replace("$", r"\$") for line in out]
 
 
@@ -102,7 +102,7 @@ def _limits(frames: list[Frame]) -> tuple[float, float]:
 
 
 def _draw(axes: list[Any], frame: Frame, limits: tuple[float, float]) -> Any:
-    """Draw range, light and mask of a frame; of a cloud, its view from above."""
+    """Draw range, amplitude or colour, and mask of a frame; or projections of a cloud."""
     for axis in axes:
         axis.set_xticks([])
         axis.set_yticks([])
@@ -115,21 +115,21 @@ def _draw(axes: list[Any], frame: Frame, limits: tuple[float, float]) -> Any:
     z = np.where(frame.valid, frame.radial_range, np.nan)
     shown = axes[0].imshow(z, vmin=limits[0], vmax=limits[1], cmap="viridis")
     axes[0].set_facecolor("#3c4046")
-    axes[1].imshow(_light(frame))
+    axes[1].imshow(_appearance(frame))
     axes[2].imshow(_mask(frame))
     return shown
 
 
-def _light(frame: RangeFrame) -> UInt8:
-    """Colour, or the logarithm of the amplitude, as an image (H, W, 3)."""
+def _appearance(frame: RangeFrame) -> UInt8:
+    """Colour, or the logarithm of the amplitude, as (H, W, 3)."""
     if frame.color_image is not None:
         return frame.color_image
-    light = frame.amplitude_image
-    if light is None:
+    amplitude = frame.amplitude_image
+    if amplitude is None:
         return np.full((*frame.depth.shape, 3), 128, np.uint8)
-    grey = np.log1p(np.minimum(light, SATURATED_AMPLITUDE))
-    lit = grey[(light > 0) & (light < SATURATED_AMPLITUDE)]
-    low, high = np.percentile(lit, [1, 99]) if len(lit) else (0.0, 1.0)
+    grey = np.log1p(np.minimum(amplitude, SATURATED_AMPLITUDE))
+    usable = grey[(amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)]
+    low, high = np.percentile(usable, [1, 99]) if len(usable) else (0.0, 1.0)
     value = np.clip((grey - low) / max(high - low, 1e-6), 0, 1) * 255
     return np.repeat(value.astype(np.uint8)[..., None], 3, -1)
 
@@ -138,7 +138,7 @@ def _mask(frame: RangeFrame) -> UInt8:
     kind = np.where(frame.valid, 0, 1)
     if frame.confidence_image is not None:
         kind[frame.valid & (frame.confidence_image == 0)] = 4
-    kind[fliers(frame)] = 3
+    kind[flying_pixels(frame)] = 3
     if frame.amplitude_image is not None:
         kind[frame.amplitude_image >= SATURATED_AMPLITUDE] = 2
     return np.array([colour for _, colour in _MASK], np.uint8)[kind]

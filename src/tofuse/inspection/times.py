@@ -1,4 +1,4 @@
-"""Time stamps: in order, each once, none missing; and images that are really new."""
+"""Checks of timestamps (order, repetition, gaps) and of repeated images."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from tofuse.inspection.finding import Finding
 from tofuse.inspection.sample import Sample, part_starts
 from tofuse.recordings.frames import RangeFrame
 
-# Steps within this share of the usual one are regular; with fewer than that many of them regular
-# the camera was triggered by hand, and there are no gaps to speak of.
-_REGULAR_WITHIN, _REGULAR_SHARE = 0.25, 0.75
+# Relative tolerance of regular intervals; with a smaller fraction of regular ones the camera was
+# triggered manually, and gaps are meaningless.
+_REGULAR_WITHIN, _REGULAR_FRACTION = 0.25, 0.75
 _GAP = 1.75
 _SAME_S = 1e-6
-_FEWEST_STEPS = 4
-# A frame lost now and then is usual.
-_MISSING_SHARE = 0.01
+_MIN_STEPS = 4
+# Fraction of missing frames that is tolerated.
+_MISSING_FRACTION = 0.01
 
 
 def check_times(sample: Sample) -> Iterator[Finding]:
-    """Look at all time stamps, of several joined recordings at each one's own."""
+    """Check all timestamps, separately for each of several joined recordings."""
     times = sample.recording.timestamps
     steps = np.concatenate(
         [np.diff(part) for part in np.split(times, part_starts(sample.recording))] or [np.zeros(0)]
@@ -33,39 +33,39 @@ def check_times(sample: Sample) -> Iterator[Finding]:
     if back:
         yield Finding(
             "time_unsorted",
-            f"{back} of {len(steps)} time stamps are earlier than the one before, by up to "
+            f"{back} of {len(steps)} timestamps are earlier than the previous one, by up to "
             f"{-steps.min():.3g} s.",
-            "Sort the frames by their time, or correct timestamps.txt; motion is predicted by it.",
+            "Sort the frames by time, or correct timestamps.txt: they are used to predict motion.",
             {"backward_steps": back, "largest_s": float(-steps.min())},
         )
     same = int(np.count_nonzero(steps == 0))
     if same:
         yield Finding(
             "time_repeated",
-            f"{same} of {len(steps)} time stamps are the same as the one before.",
-            "Correct timestamps.txt, or leave frames out that were stored twice.",
+            f"{same} of {len(steps)} timestamps are equal to the previous one.",
+            "Correct timestamps.txt, or remove frames that were stored twice.",
             {"repeated": same},
         )
     forward = steps[steps > 0]
-    if back or len(forward) < _FEWEST_STEPS:
+    if back or len(forward) < _MIN_STEPS:
         return
     usual = float(np.median(forward))
     regular = float(np.mean(np.abs(forward / usual - 1) < _REGULAR_WITHIN))
     gaps = forward[forward > _GAP * usual]
     missing = int(np.round(gaps / usual).sum()) - len(gaps)
-    if regular >= _REGULAR_SHARE and missing > _MISSING_SHARE * len(times):
+    if regular >= _REGULAR_FRACTION and missing > _MISSING_FRACTION * len(times):
         yield Finding(
             "frames_missing",
-            f"About {missing} frames are missing: the time stamps have {len(gaps)} "
-            f"gap{'s' if len(gaps) > 1 else ''} of up to {gaps.max():.3g} s, where {usual:.3g} s "
-            "are usual.",
-            "Record to a faster disk, or at a lower rate; the camera may be lost at the gaps.",
+            f"About {missing} frames are missing: the timestamps have {len(gaps)} "
+            f"gap{'s' if len(gaps) > 1 else ''} of up to {gaps.max():.3g} s; the median "
+            f"interval is {usual:.3g} s.",
+            "Record to a faster disk, or at a lower rate; tracking may fail at the gaps.",
             {"missing": missing, "gaps": len(gaps), "largest_s": float(gaps.max())},
         )
 
 
 def check_repeats(sample: Sample) -> Iterator[Finding]:
-    """Compare the images of neighbours to the last pixel."""
+    """Check for consecutive images that are identical."""
     same = compared = 0
     for i, j in sample.steps:
         a, b = sample.frames[i], sample.frames[j]
@@ -75,8 +75,7 @@ def check_repeats(sample: Sample) -> Iterator[Finding]:
     if same:
         yield Finding(
             "frames_repeated",
-            f"{same} of {compared} images looked at are the same as the one before, to the last "
-            "pixel.",
-            "Leave them out (--every), or find out why the camera or its driver froze.",
+            f"{same} of {compared} sampled images are identical to the previous one.",
+            "Skip them (--every), or find out why the camera or its driver froze.",
             {"repeated": same, "compared": compared},
         )

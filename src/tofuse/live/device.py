@@ -1,4 +1,4 @@
-"""The interface of a camera that is plugged in."""
+"""The interface of live cameras."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tofuse.geometry.cameras import Camera
 from tofuse.parts import discover, from_dict, known
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 
-TIMEOUT_S = 2.0  # a camera that is silent for so long has stopped
+TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
 
 
 class DeviceError(InputError):
@@ -26,22 +26,22 @@ class DeviceError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What holds for all frames of a camera, as in a recording's camera.json.
+    """Properties of all frames of a camera, as in a recording's camera.json.
 
     Attributes
     ----------
     sensor
-        Its name, as it states it.
+        The camera's name.
     camera
         Rays of the pixels.
     depth_unit_m
-        Metres of one count.
+        Metres per count.
     depth_kind
         "z" or "range".
     frame_rate_hz
-        As asked for.
+        As requested.
     amplitude_kind
-        What the amplitude counts; None where there is none.
+        See `RangeFrame`; None without amplitude.
     """
 
     sensor: str
@@ -53,32 +53,32 @@ class Settings:
 
 
 class Stream(ABC):
-    """A camera that is sending; closed at the end of its ``with`` block.
+    """A running camera; closed at the end of its ``with`` block.
 
     Attributes
     ----------
     settings
-        Known from the start.
+        Known when the stream is opened.
     """
 
     settings: Settings
 
     @abstractmethod
     def read(self, index: int) -> RangeFrame:
-        """Wait for the next frame, and give it an index.
+        """Wait for the next frame, and return it with this index.
 
         Raises
         ------
         DeviceError
-            If none comes within `TIMEOUT_S`.
+            If none arrives within `TIMEOUT_S`.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Stop sending."""
+        """Stop the camera."""
 
     def __iter__(self) -> Iterator[RangeFrame]:
-        """Frames without end: they can be pushed into a `Mapper`."""
+        """Yield frames endlessly, for example to push them into a `Mapper`."""
         index = 0
         while True:
             yield self.read(index)
@@ -94,12 +94,12 @@ class Stream(ABC):
 
 
 class Device(Protocol):
-    """A kind of camera. Registered by ``@part("device", name)`` in a module of `devices`.
+    """A kind of camera, registered by ``@part("device", name)`` in a module of `devices`.
 
     Attributes
     ----------
     package
-        What has to be installed, by pip's name, and imported, by Python's.
+        Name of the required package for pip, and for import.
     """
 
     part_kind: ClassVar[str] = "device"
@@ -111,18 +111,18 @@ class Device(Protocol):
         Raises
         ------
         DeviceError
-            If the package is missing, there is no camera, or it doesn't start.
+            If the package is missing, no camera is connected, or it doesn't start.
         """
         ...
 
 
 def device(name: str, options: Mapping[str, str]) -> Device:
-    """Make a kind of camera by its name, with options as text.
+    """Return a kind of camera by its name, with options as text.
 
     Raises
     ------
     InputError
-        For an unknown camera or option, or a value that isn't of the option's type.
+        For an unknown camera or option, or a value of the wrong type.
     """
     kinds = devices()
     if name not in kinds:
@@ -133,8 +133,8 @@ def device(name: str, options: Mapping[str, str]) -> Device:
     values: dict[str, Any] = {"part": name}
     for key, text in options.items():
         values[key] = _read(text, str(types.get(key)), f"--set {key}")
-    made: Device = from_dict(Device, values, where="--set")
-    return made
+    kind: Device = from_dict(Device, values, where="--set")
+    return kind
 
 
 def _read(text: str, kind: str, where: str) -> object:
@@ -162,12 +162,12 @@ def is_installed(device: type[Any]) -> bool:
 
 
 def vendor(package: tuple[str, str]) -> ModuleType:
-    """Import the maker's package, named as in `Device.package`.
+    """Import the maker's package, see `Device.package`.
 
     Raises
     ------
     DeviceError
-        Saying what to install.
+        Stating what to install.
     """
     pip, module = package
     try:
@@ -176,14 +176,16 @@ def vendor(package: tuple[str, str]) -> ModuleType:
         raise DeviceError(
             f"needs the package {pip}, which can't be imported ({error})",
             where="camera",
-            remedy=f"give `pip install {pip}`",
+            remedy=f"run `pip install {pip}`",
         ) from error
 
 
 def no_frame(sensor: str) -> DeviceError:
-    """Return the error of a camera that is silent."""
+    """Return the error of a camera that sends no frames."""
     return DeviceError(
-        f"sent no frame for {TIMEOUT_S:g} s", where=sensor, remedy="check its cable and its power"
+        f"sent no frame for {TIMEOUT_S:g} s",
+        where=sensor,
+        remedy="check its cable and power supply",
     )
 
 
@@ -192,5 +194,5 @@ def not_started(name: str, error: Exception) -> DeviceError:
     return DeviceError(
         f"does not start ({type(error).__name__}: {error})",
         where=name,
-        remedy="check that it is plugged in, and that no other program uses it",
+        remedy="check that it is connected, and not used by another program",
     )

@@ -1,4 +1,4 @@
-"""A recording played as if its camera were plugged in."""
+"""Playing a recording like a live camera."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Player:
             raise InputError(f"is {self.speed}", where="speed", remedy="give more than 0")
         if (np.diff(self.recording.timestamps) < 0).any():
             raise InputError(
-                "has timestamps that go back, so it can't be played",
+                "has timestamps that decrease, so it can't be played",
                 where=self.recording.path,
                 remedy="sort its frames by time",
             )
@@ -59,7 +59,7 @@ class Player:
         k = 0
         while k < len(due):
             now = self.clock() - start
-            # The newest frame that has come by now; if none is new, the next one is waited for.
+            # The newest frame that is due, or else the next one.
             newest = max(int(np.searchsorted(due, now, side="right")) - 1, k)
             self.dropped += self.recording.indices[k:newest].tolist()
             if due[newest] > now:

@@ -1,4 +1,4 @@
-"""From a camera into a native recording."""
+"""Recording a live camera to a native recording."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tofuse.live.device import DeviceError, Stream
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 
-WAITING = 64  # frames that may wait for the disk
+QUEUE_FRAMES = 64  # that may wait for the disk
 FINEST_SIGMA_M = 1e-5
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What came of it.
+    """The result of a recording.
 
     Attributes
     ----------
     folder
         The recording.
     frames
-        Written.
+        Number of frames written.
     dropped
-        That the disk was too slow for.
+        Number of frames dropped, as the disk was too slow.
     ended_by
-        Why it ended: "asked", or what the camera's error says.
+        Why it ended: "asked" as requested, or the camera's error.
     """
 
     folder: Path
@@ -54,38 +54,38 @@ def record(
     stopped: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] | None = None,
 ) -> Recorded:
-    """Write what a camera sends as a native recording.
+    """Write the frames of a camera as a native recording.
 
-    The camera is read on a thread of its own, so that a slow disk costs frames and not time.
-    What was recorded until the camera failed is kept. The folder appears when all is written.
+    The camera is read on its own thread, so that a slow disk drops frames without delaying others.
+    If the camera fails, the frames so far are kept. The folder appears when all is written.
 
     Parameters
     ----------
     stream
-        A camera that is sending.
+        A running camera.
     folder
-        Must not be there, or be empty.
+        Must not exist, or be empty.
     seconds, frames
-        When to end: by the camera's clock, and by count; None: no limit.
+        Limits by the camera's clock, and by count; None: no limit.
     stopped
-        Asked after each frame.
+        Called after each frame; recording ends if it returns true.
     progress
         Called with the number of frames written so far.
 
     Raises
     ------
     DeviceError
-        If the camera sent no frame at all.
+        If the camera sent no frame.
     OutputError
         If the folder isn't empty, or can't be written.
     """
     if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
-        raise InputError("nothing is to be recorded", remedy="give more seconds, or frames")
-    with new_folder(folder) as beside, _Reader(stream) as reader:
+        raise InputError("there is nothing to record", remedy="give more seconds, or frames")
+    with new_folder(folder) as temporary, _Reader(stream) as reader:
         first = reader.next()
         if first is None:
             raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)
-        writer = _writer(stream, first, beside)
+        writer = _writer(stream, first, temporary)
         frame: RangeFrame | None = first
         while frame is not None:
             if seconds is not None and frame.timestamp - first.timestamp >= seconds:
@@ -102,19 +102,19 @@ def record(
 
 
 class _Reader:
-    """Reads a camera on a thread, into a queue that forgets the newest when it is full."""
+    """Reads a camera on its own thread into a queue, and drops new frames while it is full."""
 
     def __init__(self, stream: Stream) -> None:
         self.dropped = 0
         self.error: DeviceError | None = None
         self._stream = stream
-        self._queue: queue.Queue[RangeFrame | None] = queue.Queue(WAITING)
+        self._queue: queue.Queue[RangeFrame | None] = queue.Queue(QUEUE_FRAMES)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="tofuse-camera", daemon=True)
         self._thread.start()
 
     def next(self) -> RangeFrame | None:
-        """Wait for the next frame; None when the camera has failed."""
+        """Wait for the next frame; None if the camera has failed."""
         return self._queue.get()
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""What ROS messages hold: images, compressed depth, lenses and clouds, as rosbags gives them."""
+"""Decoding of ROS messages from rosbags: images, compressed depth, lenses and clouds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MAX_SIDE = 16384
 
 
 def taken(raw: Any, is2: bool) -> float:
-    """Seconds at which a message was taken, by the header that it begins with; 0 if not told.
+    """Return the timestamp in s of the header at the beginning of a message; 0 if not given.
 
     After four bytes (ROS 1: the sequence number; ROS 2: the encoding) come seconds and nanoseconds.
     """
@@ -50,7 +50,7 @@ def taken(raw: Any, is2: bool) -> float:
 
 
 def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> NDArray[Any]:
-    """Return the (H, W) image of a message, with the padding of its rows left out.
+    """Return the (H, W) image of a message, without the padding of its rows.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> ND
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * kind.itemsize:
-        raise InputError(f"claims {width} x {height} pixels of {step} bytes a row", where=where)
+        raise InputError(f"declares {width} x {height} pixels of {step} bytes per row", where=where)
     if len(data) < step * height:
         raise InputError("is cut off", where=where, remedy="check the bag")
     rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
@@ -89,7 +89,7 @@ def color_image(message: Any, where: str) -> UInt8:
     channels, order = _ALL_COLORS[encoding]
     step = int(message.step)
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * channels:
-        raise InputError(f"claims {width} x {height} pixels of {step} bytes a row", where=where)
+        raise InputError(f"declares {width} x {height} pixels of {step} bytes per row", where=where)
     if len(data) < step * height:
         raise InputError("is cut off", where=where, remedy="check the bag")
     rows = np.frombuffer(data, np.uint8)[: step * height].reshape(height, step)

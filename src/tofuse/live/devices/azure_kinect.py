@@ -1,4 +1,4 @@
-"""Azure Kinect by pyk4a."""
+"""Azure Kinect, by the package pyk4a."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class AzureKinect:
     frame_rate_hz
         5, 15 or 30; at most 15 with WFOV_UNBINNED.
     device
-        Number of the camera, where several are plugged in.
+        Number of the camera, if several are connected.
     """
 
     package: ClassVar[tuple[str, str]] = ("pyk4a", "pyk4a")
@@ -73,7 +73,8 @@ class AzureKinectStream(Stream):
         except self._errors as error:
             raise not_started("Azure Kinect", error) from error
         try:
-            # The calibration does not say how large the image of this mode is; a frame does.
+            # The image size of the mode is not part of the calibration, so it is taken from a
+            # frame.
             depth = self._capture().depth
             lens = self._device.calibration
             K = np.asarray(lens.get_camera_matrix(k4a.CalibrationType.DEPTH), float)

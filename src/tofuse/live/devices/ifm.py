@@ -1,4 +1,4 @@
-"""Heads of ifm's O3R by ifm3dpy."""
+"""Heads of ifm's O3R, by the package ifm3dpy."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class IfmO3r:
     Attributes
     ----------
     address
-        Of the processing unit in the network.
+        Network address of the processing unit.
     port
-        Where the head is plugged in.
+        Port of the head.
     """
 
     package: ClassVar[tuple[str, str]] = ("ifm3dpy", "ifm3dpy")
@@ -110,6 +110,6 @@ class IfmO3rStream(Stream):
         return np.asarray(frame.get_buffer(getattr(self._id, name)))
 
     def _metres(self, image: NDArray[Any]) -> Float32:
-        """Return counts in m; some versions of the package have done that already."""
+        """Convert counts to m; some versions of the package return metres already."""
         out = image.astype(np.float32)
         return out if image.dtype.kind == "f" else out * np.float32(self._info.distance_unit_m)

@@ -1,4 +1,4 @@
-"""Orbbec's cameras (Femto, Gemini, Astra) by pyorbbecsdk."""
+"""Orbbec's cameras (Femto, Gemini, Astra), by the package pyorbbecsdk."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _POLL_MS = 100
 @part("device", "orbbec")
 @dataclass(frozen=True)
 class Orbbec:
-    """A camera of Orbbec: depth, and the infrared image of the same sensor where there is one.
+    """An Orbbec camera: depth, and the infrared image of the same sensor if it has one.
 
     Attributes
     ----------
     infrared
-        Whether to take that image too.
+        Whether to record the infrared image.
     """
 
     package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
@@ -102,7 +102,7 @@ class OrbbecStream(Stream):
         self._pipeline.stop()
 
     def _frames(self) -> Any:
-        """Wait for frames with depth: a camera that warms up, or a lost one, gives None."""
+        """Wait for frames with depth: a camera that is starting or disconnected returns None."""
         end = monotonic() + TIMEOUT_S
         while monotonic() < end:
             frames = self._pipeline.wait_for_frames(_POLL_MS)
@@ -116,7 +116,7 @@ def _default(pipeline: Any, sensor: Any) -> Any:
 
 
 def _add_infrared(ob: Any, pipeline: Any, config: Any, size: tuple[int, int]) -> bool:
-    """Ask for the infrared image, if the camera has one whose pixels are those of depth."""
+    """Enable the infrared image, if the camera has one with the pixels of depth."""
     try:
         profile = _default(pipeline, ob.OBSensorType.IR_SENSOR)
     except ob.OBError:

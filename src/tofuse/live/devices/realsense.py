@@ -1,4 +1,4 @@
-"""Cameras of Intel RealSense by pyrealsense2."""
+"""Intel RealSense cameras, by the package pyrealsense2."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from tofuse.recordings.lenses import inverse_brown
 @part("device", "realsense")
 @dataclass(frozen=True)
 class RealSense:
-    """A RealSense: depth, and the infrared image where it is a time-of-flight camera (L515).
+    """A RealSense: depth, and the infrared image of ToF models (L515).
 
     Attributes
     ----------
     serial
-        Of the camera, where several are plugged in.
+        Serial number of the camera, if several are connected.
     width, height
-        Of the depth image; 0 leaves the choice to the camera.
+        Of the depth image; 0 for the camera's default.
     frame_rate_hz
-        Whole number; as the camera offers it.
+        An integer rate that the camera supports.
     """
 
     package: ClassVar[tuple[str, str]] = ("pyrealsense2", "pyrealsense2")
@@ -108,7 +108,7 @@ class RealSenseStream(Stream):
 
 
 def _is_tof(rs: Any, serial: str) -> bool:
-    """Return whether the camera is of the L500 line: only there does infrared fit the depth."""
+    """Whether the camera is of the L500 line, whose infrared image has the pixels of depth."""
     cameras = [
         camera
         for camera in rs.context().query_devices()
@@ -116,9 +116,9 @@ def _is_tof(rs: Any, serial: str) -> bool:
     ]
     if not cameras:
         raise DeviceError(
-            f"no camera {serial} is plugged in" if serial else "no camera is plugged in",
+            f"no camera {serial} is connected" if serial else "no camera is connected",
             where="RealSense",
-            remedy="plug it in, or give its --serial",
+            remedy="connect it, or give its --serial",
         )
     return str(cameras[0].get_info(rs.camera_info.product_line)) == "L500"
 
@@ -136,5 +136,5 @@ def _camera(rs: Any, lens: Any) -> Camera:
     raise DeviceError(
         f"has a lens of the model {lens.model}",
         where="RealSense",
-        remedy="record the stream that is not distorted, or give a camera.json with rays",
+        remedy="record the undistorted stream, or give a camera.json with rays",
     )

@@ -1,4 +1,4 @@
-"""Reader of .mkv recordings of Azure Kinect, and of Orbbec's Femto through the same recorder."""
+"""Reader of .mkv recordings of Azure Kinect, and of Orbbec's Femto with the same recorder."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DEPTH_UNIT_M = 0.001
 
 @dataclass(frozen=True)
 class Window:
-    """What part of the calibrated image a mode gives, all (x, y) in pixels.
+    """The part of the calibrated image that a mode uses, all (x, y) in pixels.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ COLOR_MODES = {
     (3840, 2160): Window((3840, 2880), (0, 360), (3840, 2160)),
     (4096, 3072): Window((4096, 3072), (0, 0), (4096, 3072)),
 }
-# Where the calibration tells no radius up to which its polynomials hold.
+# Validity radius of the polynomials, if the calibration has none.
 METRIC_RADIUS = 1.7
 _LOCATIONS = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraLocationPV0"}
 _MODELS = {
@@ -85,7 +85,7 @@ class KinectLens(Rational):
     mixed: float = 2.0
 
     def project(self, points: ArrayLike) -> Float64:
-        """See `Camera.project`; NaN beyond the radius too."""
+        """See `Camera.project`; also NaN beyond the radius."""
         points = np.asarray(points, float)
         uv = super().project(points)
         with np.errstate(all="ignore"):
@@ -99,7 +99,7 @@ class KinectLens(Rational):
 
 @lru_cache(maxsize=8)
 def depth_camera(lens: KinectLens) -> Camera:
-    """Return the camera of depth images: the lens model where it is OpenCV's, else its rays."""
+    """Return the camera of depth images: the lens model if it is OpenCV's, else its rays."""
     rays = lens.rays()
     seen = np.hypot(rays[..., 0], rays[..., 1]) <= lens.metric_radius
     if seen.all() and lens.mixed == 2.0:
@@ -110,7 +110,7 @@ def depth_camera(lens: KinectLens) -> Camera:
 @part("reader", "azure-kinect", label="validated")
 @dataclass(frozen=True)
 class AzureKinect:
-    """A .mkv file of k4arecorder: depth, infrared, and colour where it is MJPG."""
+    """A .mkv file of k4arecorder: depth, infrared, and colour if it is MJPG."""
 
     joinable: ClassVar[bool] = False
 
@@ -130,7 +130,7 @@ class AzureKinect:
 
 
 class AzureKinectSource(FileSource):
-    """Depth frames, with the infrared image of the same moment and registered colour."""
+    """Depth frames, with the simultaneous infrared image and registered colour."""
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.file = Matroska(path)
@@ -139,7 +139,7 @@ class AzureKinectSource(FileSource):
         if depth is None or not depth.blocks:
             kind = "only infrared (passive IR)" if "IR" in tracks else "no depth"
             raise InputError(
-                f"holds {kind}", where=path, remedy="record it in one of the depth modes"
+                f"contains {kind}", where=path, remedy="record it in one of the depth modes"
             )
         self.depth = depth.blocks
         self.size = _image_size(depth, path)
@@ -147,7 +147,7 @@ class AzureKinectSource(FileSource):
         offset = _whole(self.file.tags.get("K4A_START_OFFSET_NS"))
         super().__init__((np.array([b.time_ns for b in self.depth]) + offset) / 1e9)
         if not self.file.complete:
-            self.warnings.append(f"{path} is cut off: {len(self.depth)} frames are left")
+            self.warnings.append(f"{path} is cut off: {len(self.depth)} frames remain")
         limit = (depth.duration_ns or 33_333_333) / 2e9
         self.infrared = self._beside(tracks.get("IR"), limit, 0)
         color = tracks.get("COLOR")
@@ -186,7 +186,7 @@ class AzureKinectSource(FileSource):
         data = self.file.read(block)
         if len(data) != 2 * width * height:
             raise InputError(
-                f"holds an image of {len(data)} bytes at byte {block.offset}, "
+                f"contains an image of {len(data)} bytes at byte {block.offset}, "
                 f"not of {width} x {height} pixels",
                 where=self.file.path,
             )
@@ -204,7 +204,7 @@ class AzureKinectSource(FileSource):
         return sampled_color(frame, image, self.color_camera, where)
 
     def _beside(self, track: Track | None, limit: float, delay: int) -> list[Block | None]:
-        """Return the block of another track at the time of each depth frame, or None."""
+        """The block of another track at the time of each depth frame, or None."""
         if track is None or not track.blocks:
             return [None] * len(self.depth)
         own = np.array([b.time_ns - delay for b in self.depth]) / 1e9
@@ -223,7 +223,7 @@ class AzureKinectSource(FileSource):
         if options.camera is None:
             self._read_own_cameras(color)
         else:
-            with suppress(InputError):  # which may be why another camera is given
+            with suppress(InputError):  # that may be why another camera is given
                 self._read_own_cameras(color)
             about, self.camera = load_camera(options.camera, self.size)
             self.unit, self.kind = about.depth_unit_m, about.depth_kind
@@ -243,7 +243,7 @@ class AzureKinectSource(FileSource):
     def _color_camera(self, track: Track, T_depth: Float64, where: str) -> ColorCamera | None:
         fourcc = track.private[16:20]
         if fourcc != b"MJPG":
-            self.warnings.append(f"colour is {fourcc!r}, not MJPG: left out")
+            self.warnings.append(f"colour is {fourcc!r}, not MJPG: ignored")
             return None
         try:
             size = _image_size(track, self.file.path)
@@ -251,7 +251,7 @@ class AzureKinectSource(FileSource):
                 raise InputError(f"is {size[0]} x {size[1]}, of no known mode", where=where)
             lens, T_color = _lens(self.calibration, "color", COLOR_MODES[size], where)
         except InputError as error:
-            self.warnings.append(f"colour is left out: {error}")
+            self.warnings.append(f"colour is ignored: {error}")
             return None
         return ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
 
@@ -262,7 +262,7 @@ class AzureKinectSource(FileSource):
 
 
 def _image_size(track: Track, path: Path) -> tuple[int, int]:
-    """Return (width, height) of a track's images, checked with the head of its bitmaps."""
+    """(width, height) of a track's images, checked against the header of its bitmaps."""
     if len(track.private) < 20:
         raise InputError(f"describes no images in its track {track.name}", where=path)
     width, height = struct.unpack_from("<ii", track.private, 4)
@@ -274,12 +274,12 @@ def _image_size(track: Track, path: Path) -> tuple[int, int]:
             remedy="record it with k4arecorder",
         )
     if not (2 <= width <= 8192 and 2 <= height <= 8192):
-        raise InputError(f"claims {width} x {height} pixels in {track.name}", where=path)
+        raise InputError(f"declares {width} x {height} pixels in {track.name}", where=path)
     return width, height
 
 
 def _mode(tags: dict[str, str], size: tuple[int, int], path: Path) -> str:
-    """Return the depth mode that fits the size of the images; each has its own."""
+    """The depth mode by the size of the images, which is unique."""
     named = tags.get("K4A_DEPTH_MODE", "")
     if named in DEPTH_MODES and DEPTH_MODES[named].size == size:
         return named
@@ -302,17 +302,17 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
         found = json.loads(data.rstrip(b"\0"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            "is broken JSON", where=where, remedy="give the depth camera by --camera"
+            "is invalid JSON", where=where, remedy="give the depth camera by --camera"
         ) from error
     if not isinstance(found, dict):
-        raise InputError("holds no JSON object", where=where, remedy="give --camera")
+        raise InputError("is not a JSON object", where=where, remedy="give --camera")
     return found
 
 
 def _lens(
     calibration: dict[str, Any], camera: str, window: Window, where: str
 ) -> tuple[KinectLens, Float64]:
-    """Return the lens in a mode, and the motion (4, 4) of points into this camera's frame."""
+    """The lens in a mode, and the transform (4, 4) of points into this camera's frame."""
     where = f"{where}: {camera}"
     remedy = "give the depth camera by --camera"
     cameras = _get(calibration, "CalibrationInformation", "Cameras")
@@ -336,11 +336,11 @@ def _lens(
         raise InputError("isn't made of numbers", where=where, remedy=remedy) from error
     good = p.shape == (14,) and np.isfinite(p).all() and (np.abs(p) < 1e4).all()
     if not good or not (0.01 < p[2] < 100 and 0.01 < p[3] < 100):
-        raise InputError("isn't 14 sensible ModelParameters", where=where, remedy=remedy)
+        raise InputError("isn't 14 plausible ModelParameters", where=where, remedy=remedy)
     if p[10] or p[11]:
         raise InputError("has a shifted centre of distortion", where=where, remedy=remedy)
     whole, corner = np.array(window.whole, float), np.array(window.corner, float)
-    # Stored as shares of the image, from its corner rather than from a pixel's centre.
+    # Stored relative to the image size, from its corner instead of a pixel's centre.
     cx, cy = p[:2] * whole - corner - 0.5
     fx, fy = p[2:4] * whole
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "p1": p[13], "p2": p[12]}
@@ -364,7 +364,7 @@ def _get(data: Any, *keys: str) -> Any:
 
 
 def _whole(text: str | None) -> int:
-    """Return the number of a tag, 0 where it is none or absurd."""
+    """The integer value of a tag, 0 if it is missing or invalid."""
     try:
         value = int(text or 0)
     except ValueError:

@@ -49,7 +49,7 @@ class Depth16:
         camera = options.camera or path / "camera.json"
         if not is_file(camera):
             raise InputError(
-                "is not there: such files hold neither size nor lens",
+                "is missing: such files contain neither size nor lens",
                 where=camera,
                 remedy="give a camera.json by --camera",
             )
@@ -57,7 +57,7 @@ class Depth16:
 
 
 class Depth16Source(FileSource):
-    """Depth with confidence; colour where an image lies beside."""
+    """Depth with confidence, and colour if there is an image of the same name."""
 
     concurrent = True
 
@@ -93,7 +93,7 @@ class Depth16Source(FileSource):
         samples = np.frombuffer(data, "<u2").reshape(height, width)
         counts = samples & ((1 << _BITS) - 1)
         depth = counts.astype(np.float32) * np.float32(self.description.depth_unit_m)
-        # 0 says nothing of confidence, and counts as sure; 1 is 0 %, 7 is six sevenths.
+        # 0 means unknown, and counts as full confidence; 1 is 0 %, 7 is six sevenths.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
         color = self.color[index]

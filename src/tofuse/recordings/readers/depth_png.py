@@ -19,7 +19,7 @@ from tofuse.recordings.reader import SURE, ReaderOptions, Sniff
 @part("reader", "depth-png")
 @dataclass(frozen=True)
 class DepthPng:
-    """A 16-bit .png, with a camera.json given or beside it."""
+    """A 16-bit .png, with a camera.json given or in its folder."""
 
     joinable: ClassVar[bool] = False
 
@@ -38,7 +38,7 @@ class DepthPng:
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
         if not is_file(path):
-            raise InputError("is no file", where=path, remedy="pass one depth .png")
+            raise InputError("is not a file", where=path, remedy="pass one depth .png")
         camera = options.camera
         if camera is None and is_file(path.parent / "camera.json"):
             camera = path.parent / "camera.json"
@@ -48,7 +48,7 @@ class DepthPng:
 
 
 def _remedy(path: Path) -> str:
-    """Name the frame where the image is one of a native folder, which holds more than depth."""
+    """The remedy; names the frame if the image is of a native folder, which has more channels."""
     folder = path.parent.parent
     if path.parent.name == "depth" and is_file(folder / "camera.json"):
         number = files_with(path.parent, ".png").index(path)

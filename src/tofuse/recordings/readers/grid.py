@@ -1,4 +1,4 @@
-"""Reader of clouds with a point for each pixel, as viewers of ToF cameras export them."""
+"""Reader of clouds with one point per pixel, as exported by viewers of ToF cameras."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from tofuse.recordings.sources import FARTHEST_M
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
 MAX_POINTS = 1 << 22
-# Nothing that a ToF camera sees is 50 m away on average, nor as near as 50 mm.
+# Mean distances of ToF cameras are below 50 m and above 50 mm.
 MM_FROM = 50.0
-# Points without a grid are on the ray of a pixel within this share of a pixel, most of them.
+# Points without a grid are within this fraction of a pixel of its ray, this fraction of them.
 _OFF_RAY, _ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
 @dataclass(frozen=True)
 class Grid:
-    """A folder of .ply, .csv or .pcd files with a point for each pixel, row by row; m or mm."""
+    """A folder of .ply, .csv or .pcd files with one point per pixel, row by row; m or mm."""
 
     joinable: ClassVar[bool] = False
 
@@ -91,17 +91,17 @@ class Grid:
         source.metadata |= {"depth_kind": "z"}
         if behind:
             source.warnings.append(
-                f"points are measured from {1000 * behind:.1f} mm in front of where the pixels' "
-                "rays meet; they are moved to be seen from there"
+                f"the origin is {1000 * behind:.1f} mm in front of the camera's centre of "
+                "projection; points are shifted to the centre"
             )
         if raster.turned:
-            source.warnings.append(f"{raster.turned} against the pixels, and turned around")
+            source.warnings.append(f"{raster.turned} against the pixels, and reversed")
         return source
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and its width if told."""
+    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and the width if stated."""
 
     points: Float32
     amplitude: Float32 | None = None
@@ -114,7 +114,7 @@ class Cells:
 
 
 def read_cells(path: Path) -> Cells:
-    """Read a file, NaN where a point is no measurement; raise InputError if it can't be."""
+    """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
     cells = _read(path)
     sound = np.asarray((np.abs(cells.points) < FARTHEST_M).all(1))
     return replace(cells, points=np.where(sound[:, None], cells.points, np.float32(np.nan)))
@@ -127,8 +127,8 @@ def _read(path: Path) -> Cells:
         return _cells(pcd.cloud, pcd.width if pcd.organised else None)
     if suffix == ".ply":
         ply = read_ply(path)
-        told = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
-        width = told.get("num_cols", "")
+        stated = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
+        width = stated.get("num_cols", "")
         return _cells(ply, int(width) if width.isdecimal() else None)
     return _read_csv(path)
 
@@ -144,7 +144,7 @@ def _read_csv(path: Path) -> Cells:
     named = {"x", "y", "z"} <= set(names)
     table = parse_numbers(text, path, skip=int(named))
     if table.ndim != 2 or table.shape[1] < 3:
-        raise InputError("has no x, y and z in a line", where=path, remedy="export x, y, z")
+        raise InputError("has no x, y and z per line", where=path, remedy="export x, y, z")
     columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if named else {}
     at = [columns.get(name, k) for k, name in enumerate("xyz")]
     light = next((columns[name] for name in _AMPLITUDES if name in columns), None)
@@ -158,7 +158,7 @@ def _read_csv(path: Path) -> Cells:
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """How the points of each file become an image."""
+    """Converts the points of each file to an image."""
 
     raster: Raster
     camera: Camera
@@ -183,7 +183,7 @@ class _Frames:
         )
 
     def _placed(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
-        """Put the points (n, 3) of a file without invalid ones where the rays of pixels are."""
+        """Assign the points (n, 3) of a file without invalid ones to the pixels with their rays."""
         from scipy.spatial import cKDTree
 
         rays = self.camera.rays().reshape(-1, 2)
@@ -192,15 +192,15 @@ class _Frames:
         off, near = cKDTree(rays[known]).query(points[seen, :2] / points[seen, 2:])
         pixel = self.raster.width * self.raster.height
         step = float(np.ptp(rays[known], axis=0).max()) / max(self.raster.width, self.raster.height)
-        # Pixels that never saw anything in the files looked at have no ray.
+        # Pixels without a measurement in the sampled files have no ray.
         on = off < _OFF_RAY * step
         at, seen = known[near[on]], seen[on]
         if len(points) > pixel or len(np.unique(at)) < len(at) or np.mean(on) < _ON_RAYS:
             raise InputError(
                 f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
-                "they are not on the rays of those before it",
+                "they are not on the rays of the previous files",
                 where=path,
-                remedy="export all points, invalid ones too",
+                remedy="export all points, including invalid ones",
             )
         image = np.full((pixel, 3), np.nan, np.float32)
         image[at] = points[seen]
@@ -216,7 +216,7 @@ class _Frames:
 
 
 def _moved(points: Float32, behind: float) -> Float32:
-    """Return points (..., 3) as seen from `behind` metres farther back; the origin stays."""
+    """Points (..., 3) relative to an origin `behind` metres farther back; invalid ones are kept."""
     z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(behind), points[..., 2])
     return np.concatenate([points[..., :2], z[..., None]], axis=-1)
 
@@ -229,15 +229,15 @@ def _median_z(image: Float32) -> float:
 
 def _refusal(path: Path) -> InputError:
     return InputError(
-        "doesn't hold a point for each pixel of a camera",
+        "doesn't contain one point per pixel of a camera",
         where=path,
-        remedy="export all points, invalid ones too, or give --format ply, pcd or xyz",
+        remedy="export all points, including invalid ones, or give --format ply, pcd or xyz",
     )
 
 
 @lru_cache(maxsize=4)
 def _first(file: Path, changed_ns: int, size: int) -> Raster | None:
-    """Return how a file's points lie in rows and columns; None if they don't, or pcd reads it."""
+    """The raster of a file's points; None if there is none, or if the reader pcd applies."""
     cells = read_cells(file)
     raster = cells.raster()
     if raster is None:

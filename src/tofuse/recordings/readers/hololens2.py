@@ -25,7 +25,7 @@ from tofuse.recordings.phones import POSES_BY, refuse_replacement
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, read_matrix_pose
 
-# The streams in the order in which they are taken, and after what range they repeat, m.
+# The streams in order of preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
 _NAME = re.compile(r"(?:.*/)?([0-9]{1,19})(_ab)?\.pgm", re.IGNORECASE)
 _TICKS = 1e7  # a second
@@ -55,7 +55,7 @@ class HoloLens2:
             )
         source = HoloLens2Source(path, found[0])
         if len(found) > 1:
-            source.warnings.append(f"{found[1]} is left out: {found[0]} reaches farther")
+            source.warnings.append(f"{found[1]} is ignored: {found[0]} reaches farther")
         return source
 
 
@@ -68,7 +68,7 @@ class HoloLens2Source(FileSource):
         self.images = _images(folder, stream)
         self.ticks = sorted(tick for tick, bright in self.images if not bright)
         if not self.ticks:
-            raise InputError("holds no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
+            raise InputError("contains no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
         super().__init__(np.array(self.ticks, float) / _TICKS)
         self.ambiguity_m = _STREAMS[stream]
         self.metadata |= {
@@ -96,11 +96,11 @@ class HoloLens2Source(FileSource):
         raise error
 
     def _read_poses(self, folder: Path, stream: str) -> None:
-        """Take T_world_rig of each frame, and where the camera is in the rig."""
+        """Read T_world_rig of each frame, and the pose of the camera in the rig."""
         fixed, moving = folder / f"{stream}_extrinsics.txt", folder / f"{stream}_rig2world.txt"
         if not is_file(fixed) or not is_file(moving):
             missing = moving if is_file(fixed) else fixed
-            self.warnings.append(f"{missing.name} is missing: there are no poses to compare with")
+            self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
             T_camera_rig = read_matrix_pose(read_numbers(fixed).reshape(4, 4), str(fixed))
@@ -108,9 +108,9 @@ class HoloLens2Source(FileSource):
             if table.shape[-1] != 17:
                 raise InputError("has no rows of 17 numbers", where=moving, remedy=_REMEDY)
         except (InputError, ValueError) as error:
-            self.warnings.append(f"no poses to compare with: {error}")
+            self.warnings.append(f"no reference poses: {error}")
             return
-        # Ticks have more digits than a float64 holds.
+        # Ticks have more digits than float64.
         rows = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
         order = np.argsort(rows, kind="stable")
         near = np.searchsorted(rows[order], np.array(self.ticks, float) - 64)
@@ -168,12 +168,12 @@ class HoloLens2Source(FileSource):
             raise input_error(error, path) from error
         image = parse_pgm(data, where)
         if image.dtype != np.uint16 or min(image.shape) < 2:
-            raise InputError("is no image of 16 bits", where=where, remedy=_REMEDY)
+            raise InputError("is not a 16-bit image", where=where, remedy=_REMEDY)
         return image
 
 
 def _streams(path: Path) -> list[str]:
-    """The depth streams of which there are a lens and images."""
+    """The depth streams with a lens and images."""
     if not is_folder(path):
         return []
     return [
@@ -184,12 +184,12 @@ def _streams(path: Path) -> list[str]:
     ]
 
 
-# Where the bytes of an image lie: file, first byte, count; by its time and whether it is the light.
+# Location of an image (file, offset, size), by its time and whether it is the amplitude.
 _Images = dict[tuple[int, bool], tuple[Path, int, int]]
 
 
 def _images(folder: Path, stream: str) -> _Images:
-    """All images of a stream: in its folder, where it was unpacked, else in its archive."""
+    """All images of a stream: in its folder if it was extracted, else in its archive."""
     found: _Images = {}
     if is_folder(folder / stream):
         for path in list_folder(folder / stream):
@@ -215,7 +215,7 @@ def _images(folder: Path, stream: str) -> _Images:
 
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
-    """(H, W, 2) of the table of unit vectors; NaN where the lens has none."""
+    """Rays (H, W, 2) from a table of unit vectors; NaN where it has none."""
     data = read_bytes(path, limit=_MOST_BYTES)
     height, width = shape
     if len(data) != 12 * height * width:

@@ -79,17 +79,17 @@ class IfmH5Source(FileSource):
             times = self._times()
         except InputError:
             raise
-        except Exception as error:  # of a damaged file, h5py raises what it likes
+        except Exception as error:  # h5py can raise anything for a damaged file
             raise self._damaged(error) from error
         super().__init__(times)
         self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
         if len(self.names) > 1 and stream is None:
             others = ", ".join(self.names[1:])
             self.warnings.append(
-                f"the stream {self.names[0]} is read; there are also {others}: choose by --topic"
+                f"the stream {self.names[0]} is read; others are {others}: choose with --topic"
             )
         if (np.diff(self.timestamps) < 0).any():
-            self.warnings.append("time goes back; frames stay in the order of the file")
+            self.warnings.append("time decreases; frames stay in the order of the file")
 
     def _find(self, file: Any, stream: str | None) -> None:
         streams = file.get("streams", {})
@@ -109,13 +109,13 @@ class IfmH5Source(FileSource):
                 raise InputError(f"has no {name}", where=f"{self.path}: {self.name}")
         if not 0 < len(self.rows) <= _MOST_FRAMES or self.rows.dtype.itemsize > _MOST_BYTES:
             raise InputError(
-                f"holds {len(self.rows)} frames of {self.rows.dtype.itemsize} bytes",
+                f"contains {len(self.rows)} frames of {self.rows.dtype.itemsize} bytes",
                 where=f"{self.path}: {self.name}",
                 remedy="check the file",
             )
 
     def _times(self) -> Float64:
-        """Seconds: of the first exposure, or else when the data were taken; else the number."""
+        """Timestamps (N,) in s of the first exposure or the acquisition; else the frame numbers."""
         for name, unit in (("timestamp_ns", 1e-9), ("_data_timestamp", 1e-6)):
             if name in self.fields:
                 ticks = np.asarray(self.rows[name], float).reshape(len(self.rows), -1)[:, 0]
@@ -145,7 +145,7 @@ class IfmH5Source(FileSource):
         if "confidence" in self.fields:
             flags = self._image(row, "confidence", where, counts.shape)
             if flags.dtype.kind not in "ui":
-                raise InputError("has flags that are no whole numbers", where=where)
+                raise InputError("has flags that are not integers", where=where)
             distance = np.where(flags & INVALID, np.float32(0), distance)
         noise = amplitude = None
         if "distanceNoise" in self.fields:

@@ -67,13 +67,13 @@ class IfmO3rSource(FileSource):
                 try:
                     info = _info(self.data, chunks[INFO], f"{path}: frame {k}")
                 except InputError:
-                    continue  # that frame's own trouble, told when it is read
+                    continue  # an error of that frame alone, raised when it is read
                 self.metadata["depth_unit_m"] = info.distance_unit_m
                 if NOISE in chunks:
                     self.metadata["sigma_unit_m"] = info.distance_unit_m
                 break
         if (np.diff(self.timestamps) < 0).any():
-            self.warnings.append("time goes back; frames stay in the order of the file")
+            self.warnings.append("time decreases; frames stay in the order of the file")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -96,7 +96,7 @@ class IfmO3rSource(FileSource):
         if CONFIDENCE in chunks:
             flags = self._same_size(chunks[CONFIDENCE], counts.shape, where)
             if flags.dtype.kind not in "ui":
-                raise InputError("has flags that are no whole numbers", where=where)
+                raise InputError("has flags that are not integers", where=where)
             distance = np.where(flags & INVALID, np.float32(0), distance)
         noise = amplitude = None
         if NOISE in chunks:
@@ -133,7 +133,7 @@ def _info(data: bytes, chunk: Chunk, where: str) -> HeadInfo:
 
 
 def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
-    """Seconds of each frame, interpolated where it is damaged."""
+    """Timestamps (N,) in s, interpolated for damaged frames."""
     times = np.full(len(frames), np.nan)
     for k, chunks in enumerate(frames):
         if not isinstance(chunks, InputError) and chunks:

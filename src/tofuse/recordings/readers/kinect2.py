@@ -1,4 +1,4 @@
-"""Reader of what kinect2_viewer of iai_kinect2 saves: Kinect v2 by libfreenect2."""
+"""Reader of images saved by kinect2_viewer of iai_kinect2: Kinect v2 with libfreenect2."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tofuse.recordings.phones import first_size
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
-# Which camera an image is seen by, and how much smaller than its calibration, by its size.
+# Camera of an image, and its scale relative to the calibration, by the image size.
 _VIEWS = {
     (512, 424): ("calib_ir.yaml", 1.0),
     (960, 540): ("calib_color.yaml", 0.5),
@@ -46,7 +46,7 @@ class Kinect2:
         return Sniff(
             UNSURE,
             f"{len(files)} *_depth.png but no calibration",
-            "put kinect2_bridge's calib_ir.yaml and calib_color.yaml beside them",
+            "put kinect2_bridge's calib_ir.yaml and calib_color.yaml into the same folder",
         )
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
@@ -64,7 +64,7 @@ class Kinect2:
             options=options,
         )
         source.metadata["sensor"] = "Kinect v2 (ToF)"
-        source.warnings.append("no time stamps: frames are numbered in seconds")
+        source.warnings.append("no timestamps: frame numbers serve as seconds")
         return source
 
 
@@ -75,7 +75,7 @@ def _color(file: Path) -> Path | None:
 
 
 def _calibration(folder: Path, name: str) -> Path | None:
-    """The calibration beside the images, or in the one folder with it: the camera's number."""
+    """The calibration in the folder of the images, or in its only subfolder with one."""
     if is_file(folder / name):
         return folder / name
     try:
@@ -89,7 +89,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     """The images are rectified: pinhole cameras with the calibration's matrix."""
     if size not in _VIEWS:
         raise InputError(
-            f"holds images of {size[0]} x {size[1]} pixels, which no Kinect v2 gives",
+            f"has images of {size[0]} x {size[1]} pixels, unlike any Kinect v2",
             where=folder,
             remedy="give their camera by --camera",
         )
@@ -104,7 +104,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     match = _MATRIX.search(read_text(path, limit=1 << 20))
     numbers = _numbers(match[1]) if match else np.zeros(0)
     if numbers.shape != (9,):
-        raise InputError("holds no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
+        raise InputError("has no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
     K = scale * numbers.reshape(3, 3)
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)

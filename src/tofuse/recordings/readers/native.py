@@ -46,7 +46,7 @@ class Native:
     def open(self, path: Path, options: ReaderOptions) -> NativeSource:
         """See `Reader.open`."""
         if not is_folder(path):
-            raise InputError("is no folder", where=path, remedy="give the recording's folder")
+            raise InputError("is not a folder", where=path, remedy="give the recording's folder")
         if not is_folder(path / "depth") and not is_folder(path / "cloud"):
             raise InputError(
                 "has neither depth/ nor cloud/",

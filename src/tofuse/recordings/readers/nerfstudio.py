@@ -25,7 +25,7 @@ from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
-_IMAGES = ("", ".png", ".jpg", ".jpeg")  # NeRFCapture leaves suffixes out
+_IMAGES = ("", ".png", ".jpg", ".jpeg")  # NeRFCapture omits suffixes
 _MODELS = {
     "PERSPECTIVE": "pinhole",
     "PINHOLE": "pinhole",
@@ -62,7 +62,7 @@ class Nerfstudio:
 
 
 class NerfstudioSource(FileSource):
-    """Depth images, each with its own lens, and the poses of the file as reference."""
+    """Depth images with a lens each, and the poses of the file as reference."""
 
     concurrent = True
 
@@ -78,7 +78,7 @@ class NerfstudioSource(FileSource):
             raise InputError(
                 "has no frames with depth_file_path",
                 where=file,
-                remedy="record depth too: colour alone is not enough",
+                remedy="record depth too: colour alone is not sufficient",
             )
         left_out = len(self.frames) - len(with_depth)
         self.frames = _in_order(with_depth)
@@ -89,9 +89,9 @@ class NerfstudioSource(FileSource):
         self.sigma_unit_m = number_in(about, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
         if left_out:
-            self.warnings.append(f"{file}: {left_out} frames have no depth: left out")
+            self.warnings.append(f"{file}: {left_out} frames have no depth: skipped")
         if not timed:
-            self.warnings.append(f"{file}: no times: frames are numbered in seconds")
+            self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
         self._read_poses()
 
     def _read_poses(self) -> None:
@@ -145,7 +145,7 @@ class NerfstudioSource(FileSource):
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """What the file says of one frame; what it does not say holds for all."""
+    """The entry of one frame, with the common values as defaults."""
 
     common: dict[str, Any]
     own: dict[str, Any]
@@ -158,7 +158,7 @@ class _Frame:
 
     @property
     def time(self) -> float:
-        """Seconds; NaN where not told."""
+        """Timestamp in s; NaN if not given."""
         value = self.own.get("timestamp")
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e18:
             return math.nan
@@ -169,7 +169,7 @@ class _Frame:
         return name_order(Path(str(self.own.get("file_path", self.number))))
 
     def path(self, *names: str) -> Path | None:
-        """The first of these files that the frame names."""
+        """Return the first of these files that the entry refers to."""
         named = next((self.own[name] for name in names if name in self.own), None)
         if not isinstance(named, str) or not named or "\0" in named:
             return None
@@ -198,7 +198,7 @@ class _Frame:
         return number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        """The camera of depth images of a size (width, height), of which colour may have more."""
+        """Return the camera of depth images of a size (width, height); the file's may be larger."""
         word = self.own.get("camera_model", self.common.get("camera_model", "OPENCV"))
         model = _MODELS.get(word) if isinstance(word, str) else None
         if model is None:
@@ -211,7 +211,7 @@ class _Frame:
         if not (2 <= width <= 16384 and 2 <= height <= 16384):
             raise InputError(f"is {width:g}, h {height:g}", where=f"{self.where}: w")
         fx = self.number_of("fl_x", self._by_angle("camera_angle_x", width))
-        # Here the corner of the first pixel, there its centre is at the origin.
+        # Pixel coordinates here start at the corner of the first pixel, in `Pinhole` at its centre.
         values = {
             "fx": fx,
             "fy": self.number_of("fl_y", self._by_angle("camera_angle_y", height) or fx),
@@ -227,14 +227,15 @@ class _Frame:
         camera = checked_lens(MODELS[model], (int(width), int(height)), values, self.where)
         if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
             raise InputError(
-                f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: another shape",
+                f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: "
+                "another aspect ratio",
                 where=self.where,
                 remedy=_REMEDY,
             )
         return scaled(camera, *size)
 
     def _by_angle(self, name: str, pixels: float) -> float | None:
-        """Focal length by the angle that an image shows; None where it isn't told."""
+        """Focal length by the field of view; None if not given."""
         angle = self.own.get(name, self.common.get(name))
         if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < 3.1:
             return None
@@ -246,14 +247,14 @@ def _file(path: Path) -> Path:
 
 
 def _in_order(frames: list[_Frame]) -> list[_Frame]:
-    """By time, or by the names of their images where some have no time."""
+    """The frames by time, or by the names of their images if some have no time."""
     if all(math.isfinite(frame.time) for frame in frames):
         return sorted(frames, key=lambda frame: frame.time)
     return sorted(frames, key=lambda frame: frame.key)
 
 
 def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
-    """Metres of one count: as the file says, or nerfstudio's millimetre."""
+    """Metres per count: as stated in the file, or nerfstudio's millimetre."""
     for name in ("depth_unit_scale_factor", "integer_depth_scale"):
         if name in about:
             unit = number_in(about, name, file, remedy=_REMEDY)
@@ -264,7 +265,7 @@ def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
         raise InputError(
             "is missing",
             where=f"{file}: integer_depth_scale",
-            remedy="write how many metres one count of depth is",
+            remedy="write the metres per count of depth",
         )
     return 0.001
 
@@ -273,8 +274,8 @@ def _array(path: Path) -> Float32:
     """Depth (H, W) of a .npy file."""
     try:
         table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # its header is Python, and damaged Python raises anything
-        raise InputError("is no array", where=path, remedy="write it by numpy.save") from error
+    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
+        raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
     if table.ndim == 3 and table.shape[2] == 1:
         table = table[..., 0]
     if table.ndim != 2 or table.dtype.kind not in "fiu" or min(table.shape) < 2:

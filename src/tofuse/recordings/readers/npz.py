@@ -1,4 +1,4 @@
-"""Reader of NumPy archives: a few named arrays, for whatever has no reader of its own."""
+"""Reader of NumPy archives with a few named arrays, for data without a reader of its own."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _KNOWN = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 @part("reader", "npz", label="validated")
 @dataclass(frozen=True)
 class Npz:
-    """A .npz file with depth (N, H, W), a camera (K or rays), and what else there is."""
+    """A .npz file with depth (N, H, W), a camera (K or rays), and optional channels."""
 
     joinable: ClassVar[bool] = False
 
@@ -62,7 +62,7 @@ class Npz:
 
 
 class NpzSource(FileSource):
-    """Frames of arrays that are held in memory."""
+    """Frames of arrays in memory."""
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
@@ -99,7 +99,7 @@ class NpzSource(FileSource):
             self.metadata["sensor"] = str(arrays["sensor"])[:200]
         unknown = [name for name in arrays if name not in _KNOWN]
         if unknown:
-            self.warnings.append(f"{path}: means nothing here: {', '.join(unknown)[:200]}")
+            self.warnings.append(f"{path}: unknown arrays ignored: {', '.join(unknown)[:200]}")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -135,14 +135,14 @@ class NpzSource(FileSource):
         unit = 1.0
         if self.depth.dtype.kind != "f" or "depth_unit_m" in arrays:
             if "depth_unit_m" not in arrays and options.camera is None:
-                raise self._error("depth_unit_m", "is missing", "save the metres of one count")
+                raise self._error("depth_unit_m", "is missing", "save the metres per count")
             unit = self._number(arrays, "depth_unit_m") if "depth_unit_m" in arrays else 1.0
         height, width = self.depth.shape[1:]
         camera: Camera
         if options.camera is not None:
             about, camera = load_camera(options.camera, (width, height))
             self.kind = about.depth_kind
-            if self.depth.dtype.kind != "f":  # which are metres already
+            if self.depth.dtype.kind != "f":  # those are metres already
                 unit = about.depth_unit_m
         elif "rays" in arrays:
             rays = self._floats(arrays, "rays")
@@ -162,7 +162,7 @@ class NpzSource(FileSource):
                 "give the camera of these images",
             )
         if not 1e-9 <= unit <= 1:
-            raise self._error("depth_unit_m", f"is {unit}", "save the metres of one count")
+            raise self._error("depth_unit_m", f"is {unit}", "save the metres per count")
         return camera, unit
 
     def _lens(self, arrays: dict[str, NDArray[Any]], width: int, height: int) -> Camera:
@@ -244,5 +244,5 @@ class NpzSource(FileSource):
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays, unless they unpack to more than memory should hold."""
+    """Read all arrays, unless they decompress to an absurd size."""
     return read_npz(path, limit=MAX_BYTES)

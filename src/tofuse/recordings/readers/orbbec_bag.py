@@ -68,7 +68,7 @@ class _Profile:
 
 
 class OrbbecSource(BagSource):
-    """See `OrbbecBag`. Its messages have more fields than ROS's own, so they are read here."""
+    """See `OrbbecBag`; its messages have more fields than those of ROS, and are decoded here."""
 
     @staticmethod
     def open_bag(path: Path) -> Any:
@@ -97,9 +97,9 @@ class OrbbecSource(BagSource):
         where = f"{self.path}: {_ORBBEC_DEPTH_PROFILE}"
         lens = self._profile(_ORBBEC_COLOR_PROFILE).lens(f"{self.path}: {_ORBBEC_COLOR_PROFILE}")
         R = self.profile.rotation
-        # As single precision, and not made orthogonal before.
+        # Single precision, and not orthonormalised.
         if not (np.abs(R @ R.T - np.eye(3)).max() < 0.05 and np.linalg.det(R) > 0):
-            raise InputError("has no place beside colour", where=where)
+            raise InputError("has no pose relative to colour", where=where)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, self.profile.translation_m
         return ColorCamera(lens, check_pose(orthonormalise(T), where=where))
@@ -140,7 +140,7 @@ class OrbbecSource(BagSource):
 
 
 def _header_end(raw: bytes, where: str) -> int:
-    """Return where a ROS 1 header (counter, time, name of the frame) ends."""
+    """The end of a ROS 1 header (counter, time, name of the frame)."""
     if len(raw) < 16:
         raise InputError("is cut off", where=where, remedy="check the bag")
     return 16 + int.from_bytes(raw[12:16], "little")

@@ -1,4 +1,4 @@
-"""Reader of PCD clouds; organised ones become images of a camera where they fit one."""
+"""Reader of PCD clouds; organised ones become images if they fit a camera."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def _keyframes(path: Path) -> Path:
 
 
 def _times(files: list[Path]) -> Float64:
-    """Seconds of files named by microseconds; their numbers where they are named otherwise."""
+    """Timestamps (N,) in s of files named by microseconds; their numbers for other names."""
     if all(file.stem.isdecimal() and len(file.stem) <= 18 for file in files):
         return np.array([int(file.stem) for file in files], float) * 1e-6
     return np.arange(len(files), dtype=float)
@@ -127,4 +127,4 @@ def _numbers(facts: dict[str, Any], names: tuple[str, ...] | list[str], path: Pa
     try:
         return np.array([facts[name] for name in names], float)
     except OverflowError as error:
-        raise InputError("holds a number that is too large", where=path) from error
+        raise InputError("contains a number that is too large", where=path) from error

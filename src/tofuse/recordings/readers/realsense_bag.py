@@ -90,7 +90,7 @@ class RealSenseSource(BagSource):
         depth, color = self._places(self.stream), self._places(stream)
         common = sorted(depth.keys() & color.keys())
         if not common:
-            raise InputError("has no place beside depth", where=f"{self.path}: {stream}")
+            raise InputError("has no pose relative to depth", where=f"{self.path}: {stream}")
         return ColorCamera(lens, color[common[0]] @ inverse(depth[common[0]]))
 
     def _places(self, stream: str) -> dict[str, Float64]:
@@ -171,7 +171,7 @@ class RealSenseSource(BagSource):
         except ValueError:
             unit = 0.0
         if not 1e-6 < unit < 0.1:
-            self.warnings.append(f"{self.path}: no depth unit is told; 1 mm is taken")
+            self.warnings.append(f"{self.path}: no depth unit is given; 1 mm is assumed")
             return 0.001
         return float(np.float32(unit))
 

@@ -67,7 +67,7 @@ class Record3D:
 
 
 class Record3DSource(FileSource):
-    """Frames of one lens with ARKit's poses; colour is registered once it is made small."""
+    """Frames of one lens with ARKit's poses; colour is registered after downscaling."""
 
     def __init__(self, store: _Folder | _Archive) -> None:
         self.store = store
@@ -76,7 +76,7 @@ class Record3DSource(FileSource):
         self.camera = about.lens(self.size)
         times = about.times()
         numbers = np.array(store.numbers)
-        # Poses and times are of all frames; an export may hold only some.
+        # Poses and timestamps are of all frames; an export may contain only some.
         if times is None or numbers.max() >= len(times):
             rate = about.frame_rate()
             times = np.arange(numbers.max() + 1) / rate
@@ -85,7 +85,9 @@ class Record3DSource(FileSource):
             known = True
         super().__init__(times[numbers])
         if not known:
-            self.warnings.append(f"{store.where}: no times of all frames: taken to come evenly")
+            self.warnings.append(
+                f"{store.where}: no timestamps for all frames: assumed to be evenly spaced"
+            )
         poses = about.poses()
         if poses is not None:
             inside = numbers < len(poses)
@@ -95,7 +97,7 @@ class Record3DSource(FileSource):
         if store.has_confidence:
             self.metadata["confidence_max"] = CONFIDENCE_MAX
         else:
-            self.warnings.append("the export holds no confidence")
+            self.warnings.append("the export contains no confidence")
 
     def whole_color(self, index: int) -> UInt8 | None:
         """See `FileSource.whole_color`."""
@@ -139,7 +141,7 @@ class _Folder:
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
         channels = parse_exr(read_bytes(path, limit=MAX_MEMBER_BYTES), path)
-        # The one channel of a grey image, whatever the writer calls it.
+        # The only channel of a grey image, whatever its name.
         depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
         if depth is None:
             depth = next(iter(channels.values()))
@@ -176,16 +178,16 @@ class _Archive:
         matches = (_MEMBER.fullmatch(name) for name in self.names)
         self.numbers = sorted({int(m.group(1)) for m in matches if m})
         if not self.numbers:
-            raise InputError("holds no rgbd/*.depth", where=path, remedy="export it again")
+            raise InputError("contains no rgbd/*.depth", where=path, remedy="export it again")
         self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
 
     def metadata(self) -> dict[str, Any]:
         try:
             data = json.loads(self._member("metadata"))
         except (ValueError, RecursionError) as error:
-            raise InputError("is broken JSON", where=self.where, remedy="export again") from error
+            raise InputError("is invalid JSON", where=self.where, remedy="export again") from error
         if not isinstance(data, dict):
-            raise InputError("holds no JSON object", where=self.where, remedy="export it again")
+            raise InputError("is not a JSON object", where=self.where, remedy="export it again")
         return data
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
@@ -235,13 +237,13 @@ class _Archive:
 
 
 class _Metadata:
-    """Checked access to what Record3D tells of a recording."""
+    """Checked access to Record3D's metadata."""
 
     def __init__(self, data: dict[str, Any], where: Path) -> None:
         self.data, self.where = data, where
 
     def depth_size(self, default: tuple[int, int] | None) -> tuple[int, int]:
-        """Return (width, height) of depth, which older versions of the app don't tell."""
+        """Return (width, height) of depth; `default` for older versions, which don't state it."""
         if default is not None and not ("dw" in self.data and "dh" in self.data):
             return default
         width, height = (self._numbers(name, 1)[0] for name in ("dw", "dh"))

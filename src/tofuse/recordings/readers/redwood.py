@@ -68,7 +68,7 @@ class Redwood:
             camera = PRIMESENSE if file is None else _read_intrinsics(file)
             if file is None:
                 warnings.append(
-                    "no camera .json: the PrimeSense default is taken (525 px); --camera to change"
+                    "no camera .json: the PrimeSense default is used (525 px); --camera to change"
                 )
         source = DepthImageSource(
             files,
@@ -87,7 +87,7 @@ class Redwood:
 
 
 def _camera_file(path: Path) -> Path | None:
-    """Return the .json with an intrinsic_matrix, if there is one; refuse several that differ."""
+    """The .json with an intrinsic_matrix, if there is one; InputError if several differ."""
     files = [f for f in files_with(path, ".json") if is_file(f)]
     found = [f for f in files if "intrinsic_matrix" in read_text(f)]
     if len({read_text(f) for f in found}) > 1:
@@ -135,8 +135,8 @@ def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Pat
     if any(found):
         return found
     warnings.append(
-        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}, and their names don't tell "
-        "which belong together: colour is left out"
+        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}, and their names don't show "
+        "which belong together: colour is ignored"
     )
     return None
 
@@ -151,10 +151,12 @@ def _poses(path: Path, count: int) -> Float64:
     """Read a trajectory.log: (count, 4, 4), NaN for frames that it leaves out."""
     found = read_poses(path)
     if found.frames is None:
-        raise InputError("has times instead of frames", where=path, remedy="give a .log")
+        raise InputError(
+            "has timestamps instead of frame numbers", where=path, remedy="give a .log"
+        )
     if (found.frames >= count).any():
         raise InputError(
-            f"has a pose of frame {found.frames.max()}, there are {count}",
+            f"has a pose of frame {found.frames.max()} of {count}",
             where=path,
             remedy="check the counts",
         )

@@ -44,11 +44,11 @@ from tofuse.recordings.sources import FARTHEST_M, FileSource, cloud_frame
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
-# Depth in whole numbers is in mm by convention (REP 118).
+# Integer depth is in mm by convention (REP 118).
 _UNIT_M = {"u": 0.001, "f": 1.0}
 _AMPLITUDE_WORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
 _COLOR_WORDS = ("color", "colour", "rgb")
-# Frames that odometry drifts in; what is above them is corrected.
+# Prefix of drifting odometry frames; frames above them are corrected.
 _ODOMETRY = "odom"
 
 
@@ -81,7 +81,7 @@ class Ros:
 
 
 class RosSource(FileSource):
-    """Messages of the topic that was chosen, or that looks most like depth."""
+    """Messages of the chosen topic, or of the one most likely to contain depth."""
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
@@ -101,7 +101,7 @@ class RosSource(FileSource):
             raise InputError(f"has no message of {self.connection.topic}", where=self.path)
         super().__init__(self.track.times)
         if (np.diff(self.timestamps) <= 0).any():
-            self.warnings.append("time goes back or repeats; frames stay in the order of the bag")
+            self.warnings.append("time decreases or repeats; frames stay in the order of the bag")
         self.kind: DepthKind = "z"
         self.unit: float | None = None
         self.camera: Camera | None = None
@@ -120,7 +120,7 @@ class RosSource(FileSource):
         else:
             if options.camera is not None:
                 raise InputError(
-                    "means nothing for clouds", where="--camera", remedy="leave it out"
+                    "does not apply to clouds", where="--camera", remedy="leave it out"
                 )
             self.camera = self._organised()
         self._read_poses(transforms)
@@ -128,8 +128,8 @@ class RosSource(FileSource):
         others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
         if others and options.topic is None:
             self.warnings.append(
-                f"the topic {self.connection.topic} is read; there are also {', '.join(others)}:"
-                " choose by --topic"
+                f"the topic {self.connection.topic} is read; others are {', '.join(others)}:"
+                " choose with --topic"
             )
 
     def load(self, index: int) -> Frame:
@@ -160,7 +160,7 @@ class RosSource(FileSource):
         return f"{self.path}: {self.connection.topic}, message {index}"
 
     def _candidates(self) -> list[Any]:
-        """Return the connections that may hold depth, the likeliest first."""
+        """The connections that may contain depth, the most likely first."""
         return sorted(
             (c for c in self.bag.connections if _rank(c) is not None),
             key=lambda c: (_rank(c), c.topic),
@@ -175,7 +175,7 @@ class RosSource(FileSource):
             raise InputError(
                 f"has no images or clouds at {topic} (there are: {topics[:300] or 'none'})",
                 where=self.path,
-                remedy="give one of these by --topic",
+                remedy="choose one of these with --topic",
             )
         for connection in self._candidates():
             if connection.msgtype != IMAGE or self._encoding(connection) in ENCODINGS:
@@ -201,14 +201,14 @@ class RosSource(FileSource):
         chosen = near or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
         if not chosen:
             raise InputError(
-                f"has no CameraInfo beside {self.connection.topic}",
+                f"has no CameraInfo for {self.connection.topic}",
                 where=self.path,
                 remedy="give the depth camera by --camera camera.json",
             )
         self.camera = self._lens_of(chosen[0])
 
     def _infos_beside(self, connection: Any) -> list[Any]:
-        """The connections of CameraInfo that belong to one of images."""
+        """The CameraInfo connections of an image connection."""
         folder = connection.topic.rsplit("/", 1)[0]
         return [
             c
@@ -219,22 +219,22 @@ class RosSource(FileSource):
     def _transforms(self) -> Transforms:
         try:
             return Transforms.read(self.bag)
-        except Exception as error:  # whatever rosbags says of damage
-            self.warnings.append(f"tf is left out: {damaged(error, self.path)}")
+        except Exception as error:  # any exception of rosbags for damaged data
+            self.warnings.append(f"tf is ignored: {damaged(error, self.path)}")
             return Transforms({})
 
     def _frame_of(self, track: Track) -> str:
-        """Name of the frame that messages are in."""
+        """Name of the tf frame of the messages."""
         return frame_name(track.message(0).header.frame_id)
 
     def _read_poses(self, transforms: Transforms) -> None:
-        """Take where the depth camera was in the frames above it, by tf."""
+        """Read the poses of the depth camera from tf."""
         if not transforms:
             return
         try:
             frame = self._frame_of(self.track)
-        except Exception as error:  # of a damaged message, which costs that frame alone
-            self.warnings.append(f"tf is left out: {damaged(error, self._where(0))}")
+        except Exception as error:  # a damaged message affects only its frame
+            self.warnings.append(f"tf is ignored: {damaged(error, self._where(0))}")
             return
         above = transforms.above(frame)
         odometry = next((each for each in above if _ODOMETRY in each.lower()), None)
@@ -248,7 +248,7 @@ class RosSource(FileSource):
                 self.reference = poses
 
     def _find_color(self, transforms: Transforms) -> None:
-        """Find images of a colour camera of which is known how they show what depth shows."""
+        """Find a colour camera with known intrinsics and pose relative to depth."""
         assert self.camera is not None
         missing: list[str] = []
         for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
@@ -260,7 +260,7 @@ class RosSource(FileSource):
             try:
                 first = self._color_image(track, 0, f"{self.path}: {connection.topic}")
                 own, other = self._frame_of(self.track), self._frame_of(track)
-                moved = _rank(self.connection) == 1  # depth, moved into the view of colour
+                moved = _rank(self.connection) == 1  # depth is registered to colour
                 same_size = first.shape[:2] == (self.camera.height, self.camera.width)
                 T = transforms.fixed(other, own)
                 infos = self._infos_beside(connection)
@@ -272,15 +272,15 @@ class RosSource(FileSource):
                 else:
                     missing.append(connection.topic)
                     continue
-            except Exception as error:  # of ours, or of rosbags about a damaged message
-                told = error if isinstance(error, InputError) else damaged(error, self.path)
-                missing.append(f"{connection.topic} ({told.problem})")
+            except Exception as error:  # an InputError, or one of rosbags for a damaged message
+                cause = error if isinstance(error, InputError) else damaged(error, self.path)
+                missing.append(f"{connection.topic} ({cause.problem})")
                 continue
             self.metadata["color_topic"] = connection.topic
             return
         if missing:
             self.warnings.append(
-                f"colour is left out: how {missing[0]} shows what depth shows is not in the bag "
+                f"colour is ignored: the relation of {missing[0]} to depth is not in the bag "
                 "(its camera_info, and tf_static between the two cameras)"
             )
 
@@ -310,7 +310,7 @@ class RosSource(FileSource):
         return replace(frame, color_image=sampled_color(frame, seen, self.color_camera, where))
 
     def _find_amplitude(self) -> Track | None:
-        """Return the active brightness of the same sensor: of the depth images' size, in step."""
+        """The amplitude images of the same sensor: of the size and times of the depth images."""
         assert self.camera is not None
         for connection in sorted(self.bag.connections, key=lambda c: c.topic):
             named = any(word in connection.topic.lower() for word in _AMPLITUDE_WORDS)
@@ -340,11 +340,11 @@ class RosSource(FileSource):
         return np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
 
     def _unit(self, kind: str) -> float:
-        """Return the metres of a count; floats are in metres, whatever a camera says."""
+        """Metres per count; floats are always in metres."""
         return self.unit if self.unit and kind == "u" else _UNIT_M[kind]
 
     def _organised(self) -> Camera | None:
-        """Return the camera whose images the clouds are, or None: in x right, y down, z forward."""
+        """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
         images = []
         step = max(1, len(self.track) // SAMPLES)
         for k in range(0, len(self.track), step)[:SAMPLES]:
@@ -367,12 +367,12 @@ class RosSource(FileSource):
 
 
 def _rank(connection: Any) -> int | None:
-    """Return how likely a topic holds depth, 0 the most; None if it can't."""
+    """The rank of a topic as a source of depth, 0 first; None if it can't be one."""
     topic, kind = connection.topic.lower(), connection.msgtype
     if kind == IMAGE and "depth" in topic:
-        # Depth as the depth camera sees it comes before what was moved into another view.
-        moved = any(word in topic for word in ("align", "regist", "_to_", "color", "rgb"))
-        return 1 if moved else 0
+        # Depth in its own view is preferred to depth registered to another one.
+        registered = any(word in topic for word in ("align", "regist", "_to_", "color", "rgb"))
+        return 1 if registered else 0
     if kind == COMPRESSED and topic.endswith("compresseddepth"):
         return 2
     if kind == IMAGE and any(word in topic for word in ("distance", "range")):

@@ -80,7 +80,7 @@ class ScannerApp:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What a frame_NNNNN.json tells."""
+    """The content of a frame_NNNNN.json."""
 
     path: Path
     data: dict[str, Any]

@@ -67,20 +67,20 @@ def _las_header(path: Path) -> Any:
     try:
         with laspy.open(path) as file:
             header = file.header
-    except Exception as error:  # laspy raises what comes along
+    except Exception as error:  # laspy can raise anything
         raise _damaged(error, path) from error
     count, size = int(header.point_count), int(header.point_format.size)
     whole = path.stat().st_size
     packed = bool(getattr(header, "are_points_compressed", False))
     if count > MAX_POINTS or (not packed and count * size > whole):
         raise InputError(
-            f"claims {count} points in {whole} bytes", where=path, remedy="copy the file again"
+            f"declares {count} points in {whole} bytes", where=path, remedy="copy the file again"
         )
     return header
 
 
 def _shift(path: Path) -> Float64:
-    """Return what to take off the coordinates of a map, so that float32 holds the rest."""
+    """The shift (3,) to subtract from map coordinates for float32."""
     header = _las_header(path)
     low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -155,17 +155,19 @@ class E57Source(FileSource):
                 poses = [self._pose(header) for header in headers]
             finally:
                 file.close()
-        except Exception as error:  # the library raises what comes along
+        except Exception as error:  # the library can raise anything
             raise _damaged(error, path) from error
         if not self.counts:
-            raise InputError("holds no scan", where=path, remedy="export scans, not only pictures")
+            raise InputError(
+                "contains no scan", where=path, remedy="export scans, not only pictures"
+            )
         super().__init__(np.arange(len(self.counts), dtype=float))
         self.reference = np.full((len(poses), 4, 4), np.nan)
         for k, pose in enumerate(poses):
             try:
                 self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
             except InputError as error:
-                self.warnings.append(f"{error}; left out")
+                self.warnings.append(f"{error}; ignored")
         unmoved = partial(self._read, shift=np.zeros(3))
         self._shift, self._kept = find_shift(unmoved, len(self.counts))
         note_shift(self, path, self._shift)
@@ -178,7 +180,7 @@ class E57Source(FileSource):
     def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"
         if self.counts[index] > MAX_POINTS:
-            raise InputError(f"claims {self.counts[index]} points", where=where)
+            raise InputError(f"declares {self.counts[index]} points", where=where)
         try:
             file = self._pye57.E57(str(self.path))
             try:

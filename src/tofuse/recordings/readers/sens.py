@@ -27,7 +27,7 @@ from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
 
 VERSION = 4
-RAW, ZLIB, OCCI = 0, 1, 2  # how depth is compressed
+RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
 _COLORS = {0: "raw", 1: "png", 2: "jpeg"}
 _FRAME = struct.Struct("<16f4Q")
 _SHAPES = struct.Struct("<2i4IfQ")
@@ -40,7 +40,7 @@ _RATE_HZ = 30.0
 @part("reader", "sens")
 @dataclass(frozen=True)
 class Sens:
-    """A .sens file: depth, colour, both lenses, and the poses of ScanNet to compare with."""
+    """A .sens file: depth, colour, both lenses, and the poses of ScanNet as reference."""
 
     joinable: ClassVar[bool] = False
 
@@ -61,7 +61,7 @@ class Sens:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A frame: where its images lie in the file, and how long they are."""
+    """A frame: offsets and sizes of its images in the file."""
 
     start: int
     color: int
@@ -69,7 +69,7 @@ class _Entry:
 
 
 class SensSource(FileSource):
-    """Frames found by walking over the file once, and read one by one."""
+    """Frames that are located by one pass over the file, and read on demand."""
 
     camera: Camera
     unit: float
@@ -88,7 +88,7 @@ class SensSource(FileSource):
         except OSError as error:
             raise input_error(error, path) from error
         if not found:
-            raise self._error("holds no whole frame", "copy the file again")
+            raise self._error("contains no complete frame", "copy the file again")
         self.entries = [entry for entry, _, _ in found]
         times = np.array([time for _, time, _ in found]) / _TIMES_PER_S
         self.timestamps = times if times.any() else np.arange(len(found)) / _RATE_HZ
@@ -154,14 +154,14 @@ class SensSource(FileSource):
         return count
 
     def _T_color_depth(self, T_device_color: Float64, T_device_depth: Float64) -> Float64:
-        """Return where the depth camera is seen from the colour camera; identity if not told."""
+        """T_color_depth (4, 4); identity if not given."""
         try:
             places = [
                 read_matrix_pose(T, f"{self.path}: extrinsics")
                 for T in (T_device_color, T_device_depth)
             ]
         except InputError as error:
-            self.warnings.append(f"{error}; colour is taken from the place of depth")
+            self.warnings.append(f"{error}; colour is assumed to have the pose of depth")
             return np.eye(4)
         if not np.isfinite(places).all():
             return np.eye(4)
@@ -173,7 +173,7 @@ class SensSource(FileSource):
         return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
 
     def _walk(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
-        """Find frames until the file ends; what is cut off is left out."""
+        """Locate frames until the end of the file; a cut-off one is skipped."""
         at = file.tell()
         for _ in range(count):
             file.seek(at)
@@ -188,7 +188,7 @@ class SensSource(FileSource):
             yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
 
     def _poses(self, tables: list[Float64]) -> Float64 | None:
-        """Return T_world_camera; the format writes minus infinity where tracking was lost."""
+        """T_world_camera (N, 4, 4); the format stores minus infinity where tracking was lost."""
         poses = np.full((len(tables), 4, 4), np.nan)
         wrong = 0
         for k, table in enumerate(tables):
@@ -197,7 +197,7 @@ class SensSource(FileSource):
             except InputError:
                 wrong += 1
         if wrong:
-            self.warnings.append(f"{self.path}: {wrong} poses are no rigid motions, and left out")
+            self.warnings.append(f"{self.path}: {wrong} poses are not rigid motions, and ignored")
         return poses if np.isfinite(poses[:, 0, 0]).any() else None
 
     def _depth(self, packed: bytes, where: str) -> UInt16:

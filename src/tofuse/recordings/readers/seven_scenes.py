@@ -58,10 +58,10 @@ class SevenScenes:
         )
         if color and not complete:
             source.warnings.append(
-                f"only {len(color)} of {len(files)} frames have colour: colour is left out"
+                f"only {len(color)} of {len(files)} frames have colour: colour is ignored"
             )
         elif color:
-            source.warnings.append("colour is not registered to depth in 7-Scenes: taken as it is")
+            source.warnings.append("colour is not registered to depth in 7-Scenes: used as it is")
         stems = [file.name[: -len(".depth.png")] for file in files]
         poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
         if np.isfinite(poses).any():
@@ -74,7 +74,7 @@ class SevenScenes:
 
 
 def read_pose(path: Path) -> Float64:
-    """T_world_camera (4, 4) of a .pose.txt; NaN where the tracker was lost."""
+    """Return T_world_camera (4, 4) of a .pose.txt; NaN if tracking was lost."""
     return read_matrix_pose(read_numbers(path), str(path))
 
 
@@ -102,6 +102,6 @@ def _camera(folder: Path) -> Pinhole:
         return DEFAULT_CAMERA
     K = read_numbers(path)
     if K.shape != (3, 3):
-        raise InputError("holds no 3x3 matrix", where=path, remedy="write three rows of three")
+        raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return checked_lens(Pinhole, (640, 480), {k: float(v) for k, v in values.items()}, path)

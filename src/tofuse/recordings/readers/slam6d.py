@@ -18,7 +18,7 @@ from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, poses_from_files
 
-# x right, y up, z forward, left-handed, cm; turning y over makes it the camera's convention.
+# x right, y up, z forward, left-handed, cm; negating y gives the camera's convention.
 FLIP = np.diag([1.0, -1.0, 1.0])
 CENTIMETRE = 0.01
 
@@ -26,7 +26,7 @@ CENTIMETRE = 0.01
 @part("reader", "slam6d", label="validated")
 @dataclass(frozen=True)
 class Slam6d:
-    """A folder of scanNNN.3d with scanNNN.pose beside them."""
+    """A folder of scanNNN.3d with scanNNN.pose."""
 
     joinable: ClassVar[bool] = False
 
@@ -45,7 +45,7 @@ class Slam6d:
             if source.reference is None:
                 source.reference = poses
                 source.warnings.append(
-                    "the .pose files are the robot's odometry: kept as reference, but no truth"
+                    "the .pose files are the robot's odometry: a reference, but not ground truth"
                 )
         return source
 
@@ -56,17 +56,17 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     first = text.split("\n", 1)[0].split()
     table = parse_numbers(text, path, skip=int(len(first) == 1))
     if table.shape[1] < 3:
-        raise InputError(f"has {table.shape[1]} numbers in a line", where=path)
+        raise InputError(f"has {table.shape[1]} numbers per line", where=path)
     with np.errstate(over="ignore"):
         points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
-    # The scanner writes the origin where nothing came back.
+    # The scanner writes the origin for missing measurements.
     points[(points == 0).all(1)] = np.nan
     amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
     return cloud_frame(index, timestamp, points, amplitude=amplitude)
 
 
 def read_pose(path: Path) -> Float64:
-    """T_world_scan (4, 4) of a .pose: position in cm and Euler angles in degrees, left-handed."""
+    """Return T_world_scan (4, 4) of a .pose: cm and Euler angles in degrees, left-handed."""
     numbers = read_numbers(path).ravel()
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise InputError(

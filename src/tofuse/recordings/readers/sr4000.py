@@ -21,8 +21,8 @@ from tofuse.recordings.sources import FileSource
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, as the maker ships it.
 AMBIGUITY_M = 5.0
-# The export counts Z from about 1 cm before the optical centre; nothing so near can be measured,
-# and no ray can be told from it.
+# The export measures Z from about 1 cm before the optical centre; such near points can't be
+# measured, and don't determine a ray.
 NEAREST_M = 0.01
 
 _BLOCKS = {
@@ -94,11 +94,11 @@ class Sr4000Source(FileSource):
         known = np.isfinite(times)
         index = np.arange(len(times))
         if not known.any():
-            self.warnings.append(f"no time stamps: frames are taken to come at {FRAME_RATE_HZ} Hz")
+            self.warnings.append(f"no timestamps: a frame rate of {FRAME_RATE_HZ} Hz is assumed")
             self.timestamps = index / FRAME_RATE_HZ
             return
         if not known.all():
-            self.warnings.append(f"{int((~known).sum())} frames have no time stamp: interpolated")
+            self.warnings.append(f"{int((~known).sum())} frames have no timestamp: interpolated")
         times[~known] = np.interp(index[~known], index[known], times[known])
         # Where the camera's counter starts again, the frames still follow each other.
         step = np.diff(times, prepend=times[0])
@@ -136,7 +136,7 @@ class Sr4000Source(FileSource):
 
 
 def _time_stamp(path: Path) -> float:
-    """Seconds, from the last lines of a file; NaN if there are none."""
+    """Timestamp in s from the last lines of a file; NaN if there is none."""
     if not is_file(path):  # a queue would be waited for, a device read for ever
         return float("nan")
     try:

@@ -101,12 +101,12 @@ class StraySource(PhoneSource):
         try:
             video = Video(path)
         except InputError as error:
-            self.warnings.append(f"{error}: colour is left out")
+            self.warnings.append(f"{error}: colour is ignored")
             return None
         if 0 < video.count <= max(self.numbers):
             self.warnings.append(
                 f"{path.name} has {video.count} frames, depth/ counts to {max(self.numbers)}: "
-                "colour is left out"
+                "colour is ignored"
             )
             return None
         return video
@@ -117,17 +117,17 @@ class StraySource(PhoneSource):
         try:
             columns = read_columns(path)
         except InputError as error:
-            self.warnings.append(f"{error}: left out")
+            self.warnings.append(f"{error}: ignored")
             return None
         if not {"timestamp", *_IMU} <= set(columns):
-            self.warnings.append(f"{path}: has no columns {', '.join(_IMU)}: left out")
+            self.warnings.append(f"{path}: has no columns {', '.join(_IMU)}: ignored")
             return None
         return {"timestamp": columns["timestamp"]} | {
             name: sign * columns[own] for own, (name, sign) in _IMU.items()
         }
 
     def _read_odometry(self, folder: Path) -> None:
-        """Take times, poses and, where newer versions of the app tell it, each frame's lens."""
+        """Read timestamps, poses and, from newer versions of the app, the lens of each frame."""
         path = folder / "odometry.csv"
         columns = read_columns(path)
         missing = [name for name in ("timestamp", "frame", *_POSE) if name not in columns]
@@ -142,7 +142,7 @@ class StraySource(PhoneSource):
         known = np.isfinite(times)
         if not known.any():
             raise InputError(
-                "has no time of any image in depth/", where=path, remedy="copy it again"
+                "has no timestamp of any image in depth/", where=path, remedy="copy it again"
             )
         if not known.all():
             self.warnings.append(f"{path}: {int((~known).sum())} frames have no row: interpolated")
@@ -166,7 +166,7 @@ class StraySource(PhoneSource):
             path = folder / "camera_matrix.csv"
             K = read_numbers(path)
             if K.shape != (3, 3):
-                raise InputError("holds no 3x3 matrix", where=path, remedy="copy it again")
+                raise InputError("is not a 3x3 matrix", where=path, remedy="copy it again")
             common = lens(K, image, size, path)
             self.cameras = [common] * len(row)
         elif not all(name in columns for name in _LENS):

@@ -1,4 +1,4 @@
-"""Reader of depth images stored as TIFF: DLR's Tiff3D, and what viewers export."""
+"""Reader of depth images stored as TIFF: DLR's Tiff3D, and exports of viewers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Tiff:
 
 
 class TiffSource(FileSource):
-    """Depth, and amplitude where there is an image for each; times and poses as in native folders.
+    """Depth, and amplitude if there is one image per frame; times and poses as in native folders.
 
     Values are times `depth_unit_m`, floats too, as the images don't tell their unit.
     """
@@ -93,8 +93,8 @@ class TiffSource(FileSource):
         if is_file(folder / "odometry.txt"):
             self.odometry = tum_poses(self, folder / "odometry.txt")
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
-        told = {"sensor": about.sensor, "frame_rate_hz": rate, "ambiguity_m": self.ambiguity_m}
-        self.metadata |= {key: value for key, value in told.items() if value is not None}
+        stated = {"sensor": about.sensor, "frame_rate_hz": rate, "ambiguity_m": self.ambiguity_m}
+        self.metadata |= {key: value for key, value in stated.items() if value is not None}
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

@@ -55,7 +55,7 @@ class Tum:
         camera = camera_of(path)
         if camera is None and options.camera is None:
             raise InputError(
-                "is a TUM folder whose name tells no camera (freiburg1, 2 or 3)",
+                "is a TUM folder without a camera in its name (freiburg1, 2 or 3)",
                 where=path,
                 remedy="give the colour camera by --camera camera.json",
             )
@@ -70,8 +70,7 @@ class Tum:
                 color = [color_files[k] if k >= 0 else None for k in pairs]
             else:
                 warnings.append(
-                    f"no depth image has a colour image within {COLOR_LIMIT_S} s: "
-                    "colour is left out"
+                    f"no depth image has a colour image within {COLOR_LIMIT_S} s: colour is ignored"
                 )
         source = DepthImageSource(files, times, camera, DEPTH_UNIT_M, color=color, options=options)
         source.warnings += warnings
@@ -82,7 +81,7 @@ class Tum:
 
 
 def camera_of(path: Path) -> BrownConrady | None:
-    """Return the colour camera that the folder's name, or its parent's, tells."""
+    """Return the colour camera by the name of the folder or its parent."""
     for name in (path.absolute().name, path.absolute().parent.name):
         found = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
         if found:

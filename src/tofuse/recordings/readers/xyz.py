@@ -43,12 +43,10 @@ class XyzClouds:
 
 
 def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read one file; `shift` (3,) is taken off the coordinates, m."""
+    """Read one file; `shift` (3,) in m is subtracted from the coordinates."""
     table = read_numbers(path)
     if table.shape[1] < 3:
-        raise InputError(
-            f"has {table.shape[1]} numbers in a line", where=path, remedy="write x y z"
-        )
+        raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
     points = _float32(table[:, :3]) if shift is None else table[:, :3]
     amplitude = normals = color = None
     if table.shape[1] == 4:

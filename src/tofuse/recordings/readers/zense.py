@@ -1,4 +1,4 @@
-"""Reader of Pico Zense folders: depth images beside a .toml with the lens."""
+"""Reader of Pico Zense folders: depth images, and a .toml with the lens."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_
 @part("reader", "zense", label="validated")
 @dataclass(frozen=True)
 class Zense:
-    """Folders of depth*.png in mm and a .toml that holds camera_fx, _fy, _cx and _cy."""
+    """Folders of depth*.png in mm and a .toml with camera_fx, _fy, _cx and _cy."""
 
     joinable: ClassVar[bool] = False
 
@@ -59,7 +59,7 @@ class Zense:
             files, np.arange(len(files)) / rate, camera, 0.001, options=options
         )
         source.metadata |= {"sensor": "Pico Zense (ToF)", "frame_rate_hz": rate}
-        source.warnings.append(f"no time stamps: frames are taken to come at {rate:g} Hz")
+        source.warnings.append(f"no timestamps: a frame rate of {rate:g} Hz is assumed")
         return source
 
 
@@ -68,7 +68,7 @@ def _depth_files(path: Path) -> list[Path]:
 
 
 def _settings(path: Path) -> Path | None:
-    """Return the .toml that tells a lens, if there is one."""
+    """The .toml with a lens, if there is one."""
     if not is_folder(path):
         return None
     files = [p for p in files_with(path, ".toml") if is_file(p)]
@@ -81,7 +81,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         data = tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"is broken TOML ({error})", where=path, remedy="correct it") from error
+        raise InputError(f"is invalid TOML ({error})", where=path, remedy="correct it") from error
     values: dict[str, Any] = {}
     for key, value in data.items():
         values |= value if isinstance(value, dict) else {key: value}
@@ -89,7 +89,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, int]:
-    """Return (width, height) as the file tells, or else of the images."""
+    """(width, height) as in the file, or else of the images."""
     if "image_width" not in values or "image_height" not in values:
         return first_size(files)
     size = tuple(number_in(values, key, path) for key in ("image_width", "image_height"))
