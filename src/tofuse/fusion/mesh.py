@@ -175,10 +175,16 @@ class Mesh:
             cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
 
     def simplified(self, cell_m: float) -> Mesh:
-        """Return the mesh with the vertices in each cube of a grid merged, per side of a sheet.
+        """Return the mesh simplified by clustering vertices in the cells of a grid.
 
-        Vertex clustering (Rossignac and Borrel 1993), placed by least squares on the planes of the
-        triangles around (Lindstrom 2000): edges and corners stay sharp.
+        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
+        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
+        that edges and corners stay sharp.
+
+        Parameters
+        ----------
+        cell_m
+            Edge of a cell, m.
         """
         if len(self) == 0:
             return self

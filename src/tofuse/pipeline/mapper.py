@@ -193,7 +193,15 @@ class Mapper:
         return self._preparation.ahead(frame, self._tracker)
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
-        """Record a frame that could not be read; InputError if its index is not the largest."""
+        """Record that a frame could not be read.
+
+        Parameters
+        ----------
+        index, timestamp
+            Frame index, larger than those before (else InputError), and s.
+        reason
+            Why it could not be read.
+        """
         self._check_open()
         self._intake.check_order(index)
         self._intake.accept(index)

@@ -409,12 +409,12 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     has_albedo = light is not None
     if light is not None:
         albedo = np.full((rows, columns, 3), np.nan, np.float32)
-        albedo = np.empty((rows, columns), np.float32)
+        raw_albedo = np.empty((rows, columns), np.float32)
         falls = lit and frame.amplitude_kind == "raw"
-        albedo_image(planes, rays, light, falls, lit, options.falloff or 0.0, albedo)
+        albedo_image(planes, rays, light, falls, lit, options.falloff or 0.0, raw_albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
-                albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
+                raw_albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
             ),
             rows,
             _chunks(rows),
