@@ -32,6 +32,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 import test_recordings_fuzz as folders  # noqa: E402
 import test_recordings_fuzz_cameras as cameras  # noqa: E402
 import test_recordings_ros as bags  # noqa: E402
+
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
 from tofuse.recordings.frames import RangeFrame  # noqa: E402

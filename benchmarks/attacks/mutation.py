@@ -45,10 +45,11 @@ def subjects() -> dict[str, Subject]:
     """Return all, by name; those whose optional packages are missing are left out."""
     if str(TESTS) not in sys.path:
         sys.path.insert(0, str(TESTS))
-    import made_exports
-    import made_ifm
     import test_recordings_fuzz as plain
     import test_recordings_fuzz_cameras as cameras
+
+    import made_exports
+    import made_ifm
 
     found = {
         name: Subject(_in(make, "freiburg1"), _recording("freiburg1", name))

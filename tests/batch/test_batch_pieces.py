@@ -1,0 +1,193 @@
+"""One long recording whose pieces of work are spread over a Dask cluster of two processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import drifted, path, surfaces
+from paths import BENCHMARKS, HELPERS
+from refined_submaps import refined
+from revisited_path import ALL, pushed, turn  # noqa: F401 - a fixture
+from tofuse.batch import client
+from tofuse.cli import main
+from tofuse.kernels.executors import LocalExecutor, executor, using_executor
+from tofuse.posegraph.refinement import Joint
+from tofuse.posegraph.revisits import Revisits
+
+pytest.importorskip("distributed", reason="Dask is not installed")
+from tofuse.batch import pieces
+from tofuse.batch.pieces import DaskExecutor
+
+
+@pytest.fixture(scope="module")
+def measured() -> Iterator:
+    """The benchmark, which starts clusters and compares results."""
+    pytest.importorskip("psutil")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        # Workers look up the functions of this module by their names.
+        known = [str(HELPERS), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(known))
+        import batch
+
+        yield batch
+
+
+@pytest.fixture(scope="module")
+def cluster(measured) -> Iterator[str]:
+    """The address of a cluster of two workers."""
+    with measured.local_cluster(2) as (address, _):
+        yield address
+
+
+def slowly_squared(k: int) -> tuple[int, int]:
+    import time
+
+    time.sleep(0.05)
+    return k * k, os.getpid()
+
+
+def failing(k: int) -> int:
+    raise ValueError(f"piece {k}")
+
+
+def test_a_run_on_a_cluster_gives_the_same_bytes(
+    measured, cluster: str, tmp_path: Path, monkeypatch
+) -> None:
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
+
+    recording = simulate(
+        "room", tmp_path / "room", frames=24, effects=Effects.none(shot_noise=True)
+    )
+    config = tmp_path / "small.toml"
+    config.write_text('[refinement]\npart = "joint"\nsubmap = 10\n')
+    there: list[int] = []
+    leave = DaskExecutor.close
+    monkeypatch.setattr(
+        DaskExecutor, "close", lambda self: (there.append(self.done_there), leave(self))
+    )
+    words = ["run", str(recording), "--config", str(config), "--threads", "2"]
+    assert main([*words, "--out", str(tmp_path / "here")]) == 0
+    assert main([*words, "--out", str(tmp_path / "there"), "--scheduler", cluster]) == 0
+    assert there == [3]  # submaps
+    assert measured.contents(tmp_path / "here") == measured.contents(tmp_path / "there")
+
+
+def test_submaps_on_a_cluster_are_refined_to_the_same_bits(cluster: str) -> None:
+    truth = path(30)
+    views, start = surfaces(truth, noise=0.005), drifted(truth)
+    here = refined(Joint(submap=10), views, start)
+    told: list[str] = []
+    there = DaskExecutor(cluster, told.append)
+    with using_executor(there):
+        assert executor() is there
+        found = refined(Joint(submap=10), views, start)
+    there.close()
+    assert isinstance(executor(), LocalExecutor)
+    assert there.done_there == 3
+    assert not told
+    np.testing.assert_array_equal(found.poses, here.poses)
+    assert found.support == here.support
+    for a, b in zip(found.edges, here.edges, strict=True):
+        np.testing.assert_array_equal(a.information, b.information)
+
+
+def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> None:  # noqa: F811
+    frames, _, start = turn
+    options = Revisits(spacing=ALL, overlap=0.15)
+    here = pushed(options, frames, start)
+    there = DaskExecutor(cluster, lambda text: None)
+    with using_executor(there):
+        found = pushed(options, frames, start)
+    there.close()
+    assert there.done_there >= len(here) > 1
+    for a, b in zip(found, here, strict=True):
+        assert a.record == b.record
+        np.testing.assert_array_equal(a.T_i_j, b.T_i_j)
+        np.testing.assert_array_equal(a.information, b.information)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+def test_a_killed_worker_loses_nothing(cluster: str) -> None:
+    there = DaskExecutor(cluster, lambda text: None)
+    killed: set[int] = set()
+
+    def arguments(k: int) -> tuple[int]:
+        if k == 12 and not killed:  # some pieces are being done
+            pids = there._client.run(os.getpid)
+            killed.add(next(iter(pids.values())))
+            os.kill(next(iter(killed)), signal.SIGKILL)
+        return (k,)
+
+    found = there.map(slowly_squared, 40, arguments)
+    there.close()
+    assert killed
+    assert [square for square, _ in found] == [k * k for k in range(40)]
+
+
+def test_an_error_of_a_piece_is_told_as_if_it_had_been_done_here(cluster) -> None:
+    told: list[str] = []
+    there = DaskExecutor(cluster, told.append)
+    with pytest.raises(ValueError, match="piece 0"):
+        there.map(failing, 3, lambda k: (k,))
+    there.close()
+    assert told == [
+        f"{cluster}: a worker failed (piece 0); the rest of the run is done on this machine"
+    ]
+
+
+def test_a_scheduler_that_goes_away_is_told_once_and_the_rest_done_here(measured) -> None:
+    told: list[str] = []
+    with measured.local_cluster(1) as (address, _):
+        there = DaskExecutor(address, told.append)
+        some = there.map(slowly_squared, 3, lambda k: (k,))
+        assert os.getpid() not in {pid for _, pid in some}
+    rest = there.map(slowly_squared, 5, lambda k: (k,))
+    assert {pid for _, pid in rest} == {os.getpid()}
+    assert [square for square, _ in rest] == [0, 1, 4, 9, 16]
+    there.map(slowly_squared, 2, lambda k: (k,))
+    there.close()
+    gone = f"{address}: the scheduler went away; the rest of the run is done on this machine"
+    assert told == [gone]
+
+
+def test_workers_that_would_give_other_results_are_refused(
+    measured, room_recording, tmp_path, monkeypatch, capsys, cluster
+) -> None:
+    monkeypatch.setattr(pieces, "_program", lambda: ("tofuse 0.0", "numpy 1"))
+    words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--scheduler", cluster]
+    monkeypatch.setattr(DaskExecutor, "_check_workers", _checked_against(pieces._program()))
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "results would differ: install the same versions there" in said
+    assert said.count("\n") == 1
+
+
+def _checked_against(mine):
+    checked = DaskExecutor._check_workers
+
+    def check(self) -> None:
+        self._client.run = lambda _: {"tcp://worker:1": ("tofuse 9.9", *mine[1:])}
+        checked(self)
+
+    return check
+
+
+def test_a_scheduler_that_is_not_there_is_told(
+    room_recording: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr(client, "ANSWERS_S", 1.0)
+    words = ["run", str(room_recording), "--out", str(tmp_path / "out")]
+    assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("tofuse: tcp://127.0.0.1:1: no Dask scheduler answers there; start one")
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,243 @@
+"""Batches as a person starts them: here and on Dask, whole, killed and told once more."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from time import monotonic, sleep
+from types import ModuleType
+
+import pytest
+
+from paths import BENCHMARKS
+from tofuse.batch import client
+from tofuse.cli import main
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+JOBS = [f"seed-{k}" for k in range(6)]
+WORDS = ("--every", "4", "--threads", "1")
+
+
+@pytest.fixture
+def measured(monkeypatch) -> ModuleType:
+    """The benchmark, which starts clusters, kills their workers and compares results."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    pytest.importorskip("psutil")
+    import batch
+
+    return batch
+
+
+@pytest.fixture(scope="module")
+def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of six jobs."""
+    path = tmp_path_factory.mktemp("listed") / "list.csv"
+    rows = [f"{room_recording},{name},{k},4" for k, name in enumerate(JOBS)]
+    path.write_text("\n".join(["recording,name,seed,every", *rows]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `tofuse run` gives of each of them."""
+    out = tmp_path_factory.mktemp("alone")
+    for k, name in enumerate(JOBS):
+        words = ("--out", out / name, "--seed", k, *WORDS)
+        assert main(["run", str(room_recording), *map(str, words)]) == 0
+    return out
+
+
+def states(out: Path) -> dict[str, str]:
+    if not (out / "batch.csv").exists():
+        return {}  # no job has ended
+    with (out / "batch.csv").open(newline="") as file:
+        return {row["name"]: row["state"] for row in csv.DictReader(file)}
+
+
+def records(out: Path) -> list[dict[str, object]]:
+    return [json.loads(path.read_text()) for path in sorted((out / "jobs").glob("*.json"))]
+
+
+def same(measured: ModuleType, alone: Path, out: Path) -> bool:
+    assert states(out) == dict.fromkeys(JOBS, "done")
+    return measured.same_results([Path(name) for name in JOBS], alone, out) == len(JOBS)
+
+
+def wait_until(happened: Callable[[], object], seconds: float = 120) -> None:
+    end = monotonic() + seconds
+    while not happened():
+        assert monotonic() < end, "it did not happen"
+        sleep(0.05)
+
+
+def running(out: Path) -> bool:
+    return (out / "jobs").is_dir() and any(r["state"] == "running" for r in records(out))
+
+
+def test_bad_recordings_cost_nobody_else(room_recording: Path, tmp_path: Path, capsys) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "camera.json").write_text("{")
+    (tmp_path / "list.txt").write_text(f"nothing\nbroken\n{room_recording}\n")
+    out = tmp_path / "out"
+    words = ["batch", str(tmp_path / "list.txt"), "--out", str(out), "--workers", "2"]
+    assert main([*words, "--only", "nothing"]) == 2
+    said = capsys.readouterr().err
+    assert "none of 1 recordings gave a result; nothing: " in said
+    assert said.count("\n") == 1
+    assert main([*words, "--print-jobs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [shlex.split(line)[-1] for line in lines] == ["nothing", "broken", room_recording.name]
+
+    assert main(words) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("1 of 3 recordings have a result: ")
+    assert f"nothing: {tmp_path / 'nothing'}: doesn't exist" in said
+    assert states(out) == {"nothing": "failed", "broken": "failed", room_recording.name: "done"}
+    page = (out / "batch.html").read_text()
+    assert f'<img src="jobs/{room_recording.name}.jpg"' in page
+    assert (out / "jobs" / f"{room_recording.name}.jpg").read_bytes()[:2] == b"\xff\xd8"
+    (made,) = (r for r in records(out) if r["state"] == "done")
+    assert made["posed"] == made["frames"] == 8
+    assert made["peak_bytes"] > 50_000_000
+
+    before = (out / room_recording.name / "run.json").stat().st_mtime_ns
+    assert main([*words, "--json"]) == 3  # only what failed is tried again
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {e["name"] for e in told if e["event"] == "job"} == {"nothing", "broken"}
+    assert told[-1] == {
+        "event": "result", "out": str(out), "jobs": 3, "done": 1, "failed": 2,
+        "verdicts": {made["verdict"]: 1},
+    }  # fmt: skip
+    assert (out / room_recording.name / "run.json").stat().st_mtime_ns == before
+
+
+def test_killed_jobs_and_a_killed_batch_lose_nothing(
+    measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = ("--workers", 2, "--retries", 10)
+    batch = measured.start_batch(listed, out, *words)
+    pids = lambda: measured.children(batch.pid)  # noqa: E731
+    assert measured.kill_often(batch, pids, 10, 0.5, seed=3) == 10
+    wait_until(pids)
+    jobs = pids()
+    batch.kill()
+    batch.communicate()
+    # Nobody asks for what they do any more.
+    wait_until(lambda: not any(Path(f"/proc/{pid}/exe").exists() for pid in jobs), 20)
+    measured.finish(measured.start_batch(listed, out, *words))
+    assert same(measured, alone, out)
+    assert sum(int(r["starts"]) for r in records(out)) >= 10
+
+
+def test_an_interrupted_batch_says_what_is_done(
+    measured: ModuleType, listed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    batch = measured.start_batch(listed, out)
+    wait_until(lambda: running(out))
+    batch.send_signal(signal.SIGINT)
+    _, said = batch.communicate(timeout=60)
+    assert batch.returncode == 130
+    assert (
+        said
+        == "tofuse: interrupted, 0 of 6 recordings are done; run the same command again to resume\n"
+    )
+
+
+Started = AbstractContextManager[tuple[str, Callable[[], list[int]]]]
+
+
+def begun(measured: ModuleType, kind: str, folder: Path) -> Started:
+    """A Dask cluster of two workers."""
+    if kind == "LocalCluster":
+        return measured.local_cluster(2)
+    return measured.own_processes(2, folder)
+
+
+@pytest.mark.parametrize(("kind", "kills"), [("LocalCluster", 2), ("own processes", 10)])
+def test_workers_of_dask_that_are_killed_lose_nothing(
+    kind: str, kills: int, measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    out = tmp_path / "out"
+    with begun(measured, kind, tmp_path / "dask") as (address, pids):
+        batch = measured.start_batch(listed, out, "--scheduler", address, "--retries", 10)
+        assert measured.kill_often(batch, pids, kills, 0.5, seed=4) == kills
+        measured.finish(batch)
+    assert same(measured, alone, out)
+
+
+def test_a_scheduler_that_goes_away_loses_nothing(
+    measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    out = tmp_path / "out"
+    with measured.own_processes(2, tmp_path / "dask") as (address, _):
+        batch = measured.start_batch(listed, out, "--scheduler", address)
+        wait_until(lambda: "done" in states(out).values() if out.is_dir() else False)
+    _, said = batch.communicate(timeout=60)
+    assert batch.returncode == 3
+    assert said == (
+        f"tofuse: {address}: the scheduler went away; start it again, and give the same command: "
+        "it goes on\n"
+    )
+    with measured.own_processes(2, tmp_path / "dask") as (address, _):
+        # More memory than any worker declares: told before anything is begun.
+        words = ("--scheduler", tmp_path / "dask" / "scheduler.json")
+        refused = measured.start_batch(listed, out, *words, "--memory", "1GB")
+        _, said = refused.communicate(timeout=60)
+        assert "of the 2 workers none declares more than 0" in said
+        assert said.count("\n") == 1
+        measured.finish(measured.start_batch(listed, out, *words))
+    assert same(measured, alone, out)
+
+
+def test_a_scheduler_that_is_not_there_is_told(
+    listed: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    monkeypatch.setattr(client, "ANSWERS_S", 1.0)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
+        words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
+        assert main(words) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"tofuse: {address}: no Dask scheduler answers there; start one")
+        assert said.count("\n") == 1
+    words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
+    assert main(words) == 2
+    assert "is no file that a Dask scheduler wrote" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_workers_without_tofuse_are_told(
+    measured: ModuleType, listed: Path, tmp_path: Path, monkeypatch
+) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['tofuse'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with measured.own_processes(1, tmp_path / "dask") as (address, _):
+        monkeypatch.undo()
+        monkeypatch.syspath_prepend(str(BENCHMARKS))
+        batch = measured.start_batch(listed, tmp_path / "out", "--scheduler", address)
+        _, said = batch.communicate(timeout=120)
+    assert batch.returncode == 2, said
+    assert "install this version of tofuse for its scheduler and its workers" in said
+    assert said.count("\n") == 1
+
+
+def test_a_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:
+    words = [str(tmp_path / "a.jpg"), str(room_recording), "--out", str(tmp_path / "out")]
+    job = subprocess.Popen([sys.executable, "-m", "tofuse.cli.job", *words], stdin=subprocess.PIPE)
+    assert job.stdin is not None
+    job.stdin.close()
+    assert job.wait(60) == -signal.SIGKILL
+    assert not (tmp_path / "out" / "run.json").exists()

@@ -1,0 +1,57 @@
+"""A little of each soak of `benchmarks/soak.py`, and whether it would notice a leak."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import pytest
+
+from paths import BENCHMARKS
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+@pytest.fixture
+def soak(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import soak
+
+    return soak
+
+
+def held(soak, memory, handles=7, threads=3):
+    return [soak.Held(100 * (k + 1), m, handles, threads) for k, m in enumerate(memory)]
+
+
+def test_a_leak_is_noticed(soak, capsys) -> None:
+    flat = [int(5e8 + 1e5 * (-1) ** k) for k in range(10)]
+    assert soak.judged("some", held(soak, flat), soak.RUN_BYTES)
+    filled = [int(1e8 * min(k + 1, 4)) for k in range(10)]  # caches fill at the beginning
+    assert soak.judged("some", held(soak, filled), soak.RUN_BYTES)
+    growing = [int(1e8 + 5e6 * k) for k in range(10)]  # 50 kB each
+    assert soak.growth(held(soak, growing)) == pytest.approx(5e4)
+    assert not soak.judged("some", held(soak, growing), soak.RUN_BYTES)
+    more = [*held(soak, flat[:9]), soak.Held(1000, flat[9], 8, 3)]
+    assert not soak.judged("some", more, soak.RUN_BYTES)
+    more = [*held(soak, flat[:9]), soak.Held(1000, flat[9], 7, 4)]
+    assert not soak.judged("some", more, soak.RUN_BYTES)
+    assert capsys.readouterr().out.count("DID NOT HOLD") == 3
+
+
+def test_what_a_live_camera_sends_is_recorded(soak, tmp_path: Path, capsys) -> None:
+    """Two minutes of its time, of which some is missing, some comes twice, and some late."""
+    assert soak.live(32, 120.0, 10.0, tmp_path, mapped=False)
+    sent = soak.Camera(32, 1200, 10.0)
+    times = [frame.timestamp for frame in sent._frames(1200)]
+    assert min(sent.sent.missing, sent.sent.doubled, sent.sent.late) > 3
+    assert len(times) == 1200 - sent.sent.missing + sent.sent.doubled
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    assert sum(step == 0 for step in steps) == sent.sent.doubled
+    assert sum(step < 0 for step in steps) >= 1
+    assert "1200" not in capsys.readouterr().err
+
+
+def test_a_mapper_takes_frames_that_are_late_missing_and_doubled(soak, tmp_path: Path) -> None:
+    assert soak.live(32, 15.0, 10.0, tmp_path, mapped=True, samples=3)

@@ -1,0 +1,220 @@
+"""The process in surroundings that lack something: a result, or one line that says why not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from paths import BENCHMARKS
+from tofuse import cli
+from tofuse.cli import main, run_command
+from tofuse.cli.streams import SafeStream, safe_streams
+from tofuse.errors import Ended
+from tofuse.kernels import cores
+from tofuse.lab.simulation.record import simulate
+
+sys.path.insert(0, str(BENCHMARKS))
+from attacks.environments import ENVIRONMENTS, attempt
+
+# One of each kind; `benchmarks/attack.py` runs all.
+CHOSEN = (
+    "512 MB of addresses",
+    "1024 MB of addresses",
+    "1536 MB of addresses",
+    "12 file handles",
+    "no threads",
+    "files of 20 kB at most",
+    "all closed",
+    "lines to a full disk",
+    "a reader that leaves",
+    "Windows-1252",
+    "a name in ASCII streams",
+    "a home that can't be written",
+    "a clock that goes backwards",
+    "the output folder is read-only",
+    "SIGTERM at tracking",
+    "SIGINT at moves",
+    "SIGTERM at the end",
+)
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits and paths of Linux")
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate("peaks", tmp_path_factory.mktemp("peaks") / "rec", frames=2)
+
+
+@pytest.mark.parametrize("name", CHOSEN)
+def test_surroundings_that_lack_something(name: str, clouds: Path, tmp_path: Path) -> None:
+    (environment,) = [e for e in ENVIRONMENTS if e.name == name]
+    outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
+    assert outcome.faults == (), outcome.said
+
+
+def shell(script: str) -> tuple[int, str]:
+    begin = f"{sys.executable} -m tofuse"
+    done = subprocess.run(
+        ["/bin/bash", "-c", script.replace("tofuse", begin, 1)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stderr
+
+
+def test_what_only_prints_and_can_not_says_so(clouds: Path) -> None:
+    status, said = shell(f"tofuse inspect {clouds} > /dev/full")
+    assert (status, said) == (
+        2,
+        "tofuse: standard output: can't be written (no space left on device)\n",
+    )
+    assert shell("tofuse --help > /dev/full")[0] == 2
+    status, said = shell(f"tofuse inspect {clouds} | true; exit ${{PIPESTATUS[0]}}")
+    assert status in (0, 141)  # it may be read before the reader ends
+    assert "Traceback" not in said
+    status, said = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
+    assert (status, said) == (141, "")
+
+
+class Broken:
+    encoding = "ascii"
+
+    def write(self, _text: str) -> int:
+        raise BrokenPipeError
+
+    def flush(self) -> None:
+        raise BrokenPipeError
+
+
+def test_an_outlet_never_fails(tmp_path: Path) -> None:
+    out = SafeStream(Broken())  # type: ignore[arg-type]
+    assert out.write("text") == 4
+    out.writelines(["a", "b"])
+    out.flush()
+    assert isinstance(out.error, BrokenPipeError)
+    assert out.encoding == "ascii"
+    assert SafeStream(None).write("text") == 4
+    with (tmp_path / "text").open("w", encoding="ascii") as file:
+        safe = SafeStream(file)
+        safe.write("s\xfcd\udcff")
+        assert safe.error is None
+    assert (tmp_path / "text").read_text() == "s\\xfcd\\udcff"
+    before = sys.stdout
+    with pytest.raises(KeyError), safe_streams():
+        raise KeyError
+    assert sys.stdout is before
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "says"),
+    [
+        (RuntimeError("can't start new thread"), 2, "--threads 1"),
+        (ImportError("libx.so: cannot map"), 2, "can't be loaded (libx.so"),
+        (MemoryError(), 2, "out of memory"),
+        (Ended(15), 143, "terminated"),
+        (BrokenPipeError(32, "Broken pipe"), 2, "Broken pipe"),
+    ],
+)
+def test_what_stops_a_command_is_said_in_a_line(error, status, says, capfd) -> None:
+    def fail() -> int:
+        raise error
+
+    assert run_command(fail) == status
+    said = capfd.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+
+
+def test_a_fault_of_ours_is_a_line_too_and_can_be_seen(capfd, monkeypatch) -> None:
+    def fail() -> int:
+        raise ZeroDivisionError("in\nsome depth")
+
+    assert cli.report_bugs(fail) == 1
+    assert capfd.readouterr().err.startswith("tofuse: bug in the program (ZeroDivisionError: ")
+    monkeypatch.setenv("TOFUSE_TRACEBACK", "1")
+    with pytest.raises(ZeroDivisionError):
+        cli.report_bugs(fail)
+
+
+@pytest.mark.parametrize("place", ["prepare_process", "report_bugs"])
+def test_an_interruption_before_the_command_is_a_line_too(place, capfd, monkeypatch) -> None:
+    def interrupted(*_args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, place, interrupted)
+    assert cli.console() == 130
+    assert capfd.readouterr().err == f"tofuse: interrupted; {cli._UNCHANGED}\n"
+
+
+def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:
+    """As under nohup."""
+    script = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "from tofuse import cli\n"
+        "cli.main = lambda: os.kill(os.getpid(), signal.SIGHUP) or 0\n"
+        "sys.exit(cli.console())\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+CGROUPS = {
+    "none": ({}, None),
+    "all": ({"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/cpu.max": "max 100000\n"}, None),
+    "half": ({"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/cpu.max": "50000 100000\n"}, 0.5),
+    "of the one above": (
+        {
+            "proc/self/cgroup": "0::/a/b\n",
+            "sys/fs/cgroup/a/cpu.max": "250000 100000\n",
+            "sys/fs/cgroup/a/b/cpu.max": "max 100000\n",
+        },
+        2.5,
+    ),
+    "of a container": (
+        {"proc/self/cgroup": "0::/../../x\n", "sys/fs/cgroup/cpu.max": "300000 100000"},
+        3.0,
+    ),
+    "version 1": (
+        {
+            "proc/self/cgroup": "7:memory:/d\n4:cpu,cpuacct:/d\n",
+            "sys/fs/cgroup/cpu/d/cpu.cfs_quota_us": "150000\n",
+            "sys/fs/cgroup/cpu/d/cpu.cfs_period_us": "100000\n",
+        },
+        1.5,
+    ),
+    "version 1, all": (
+        {
+            "proc/self/cgroup": "4:cpu:/\n",
+            "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1\n",
+            "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000\n",
+        },
+        None,
+    ),
+    "nonsense": ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "1 0 x\n"}, None),
+}
+
+
+@pytest.mark.parametrize("name", CGROUPS)
+def test_quotas_of_containers_count(name, tmp_path, monkeypatch) -> None:
+    files, wanted = CGROUPS[name]
+    for path, text in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
+    assert cores.quota(tmp_path) == wanted
+    monkeypatch.setattr(cores, "quota", lambda: wanted)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1, 2, 3}, raising=False)
+    expected = {None: 4, 0.5: 1, 2.5: 3, 3.0: 3, 1.5: 2}[wanted]
+    assert cores.usable_cores.__wrapped__() == expected
+
+
+def test_the_second_of_two_runs_is_refused_at_once(clouds: Path, tmp_path: Path, capfd) -> None:
+    from tofuse.results.folder import OutputFolder
+
+    with OutputFolder(tmp_path / "out"):
+        assert main(["run", "no such recording", "--out", str(tmp_path / "out")]) == 2
+    assert f"is being written by another process (pid {os.getpid()}" in capfd.readouterr().err

@@ -1,0 +1,418 @@
+"""Bad input at the command line: one clear line, exit status 2, nothing written."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_calls import listing, refuses
+from tofuse.cli import main
+from tofuse.files import reading
+from tofuse.files.images import read_image, write_png
+
+
+@pytest.fixture
+def recording(room_recording, tmp_path) -> Path:
+    """A copy of the recording with four frames, to be broken."""
+    copy = tmp_path / "rec"
+    keep = {f"{k:06d}" for k in range(4)}
+    shutil.copytree(
+        room_recording,
+        copy,
+        ignore=lambda _folder, names: [
+            n for n in names if n == "truth" or (n.endswith(".png") and n[:6] not in keep)
+        ],
+    )
+    for name in ("groundtruth.txt", "timestamps.txt", "frames.csv"):
+        (copy / name).unlink()
+    return copy
+
+
+def camera(recording: Path, **changes: object) -> None:
+    data = json.loads((recording / "camera.json").read_text()) | changes
+    (recording / "camera.json").write_text(json.dumps(data))
+
+
+def truncate_all(recording: Path) -> None:
+    for file in (recording / "depth").iterdir():
+        file.write_bytes(file.read_bytes()[:60])
+
+
+def blank_all(recording: Path) -> None:
+    for file in (recording / "depth").iterdir():
+        write_png(file, np.zeros_like(read_image(file)))
+
+
+def noise_of_junk(recording: Path) -> None:
+    for file in (recording / "depth").iterdir():
+        file.write_bytes(b"junk")
+
+
+def empty(recording: Path) -> None:
+    shutil.rmtree(recording)
+    recording.mkdir()
+
+
+def as_pcd(recording: Path) -> None:
+    empty(recording)
+    for k in range(3):
+        (recording / f"{k}.pcd").write_text("this is no point cloud\n")
+
+
+def folder_for_file(recording: Path) -> None:
+    (recording / "camera.json").unlink()
+    (recording / "camera.json").mkdir()
+
+
+def folders_for_images(recording: Path) -> None:
+    for file in (recording / "depth").iterdir():
+        file.unlink()
+        file.mkdir()
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
+    "missing folder": (shutil.rmtree, ("rec", "doesn't exist")),
+    "empty folder": (empty, ("rec", "empty folder")),
+    "all images truncated": (truncate_all, ("none of 4 frames", "000000.png", "cut off")),
+    "all images junk": (noise_of_junk, ("none of 4 frames", "000000.png")),
+    "other sizes": (lambda r: camera(r, width=99), ("99", "176")),
+    "broken json": (lambda r: (r / "camera.json").write_text('{"a": '), ("camera.json", "JSON")),
+    "empty json": (lambda r: (r / "camera.json").write_text(""), ("camera.json", "JSON")),
+    "json list": (lambda r: (r / "camera.json").write_text("[]"), ("camera.json",)),
+    "json bytes": (lambda r: (r / "camera.json").write_bytes(b"\xff\xfe\0"), ("camera.json",)),
+    "all frames invalid": (blank_all, ("none of the 4 frames", "0 valid points")),
+    "nan": (lambda r: camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
+    "infinite": (lambda r: camera(r, cy=float("inf")), ("camera.json", "cy", "inf")),
+    "negative focal length": (lambda r: camera(r, fy=-5), ("camera.json", "fy", "-5")),
+    "missing field": (lambda r: camera(r, fx=None), ("camera.json", "fx")),
+    "unit zero": (lambda r: camera(r, depth_unit_m=0), ("camera.json", "depth_unit_m")),
+    "unknown kind": (lambda r: camera(r, depth_kind="y"), ("camera.json", "depth_kind", "'y'")),
+    "newer schema": (lambda r: camera(r, schema=7), ("camera.json", "schema", "7")),
+    "fewer amplitudes": (lambda r: (r / "amplitude/000002.png").unlink(), ("amplitude", "3", "4")),
+    "more times": (lambda r: (r / "timestamps.txt").write_text("0\n" * 9), ("timestamps", "9")),
+    "words for times": (lambda r: (r / "timestamps.txt").write_text("a\n" * 4), ("timestamps",)),
+    "only claims to be pcd": (as_pcd, ("pcd",)),
+    "folder for camera.json": (folder_for_file, ("rec",)),
+    "folders for images": (folders_for_images, ("rec",)),
+    "broken correction": (lambda r: (r / "correction.npz").write_bytes(b"x"), ("correction.npz",)),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_bad_recordings(name, recording, tmp_path, capfd) -> None:
+    damage, says = BROKEN[name]
+    damage(recording)
+    before = listing(tmp_path)
+    said = refuses(capfd, "run", recording, "--out", tmp_path / "a" / "out", says=says)
+    assert ";" in said  # what to do about it
+    assert listing(tmp_path) == before
+
+
+def test_an_unknown_key_does_not_add_lines_to_a_failure(recording, tmp_path, capfd) -> None:
+    camera(recording, colour_of_case="grey")
+    blank_all(recording)
+    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("0 valid points",))
+
+
+def test_files_that_may_not_be_read(recording, tmp_path, capfd, monkeypatch) -> None:
+    # Permissions mean nothing to root, so the system call is made to refuse.
+    def refuse(self: Path, *_args: object, **_options: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    said = refuses(
+        capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied")
+    )
+    assert "Traceback" not in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(
+    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows may read everything"
+)
+def test_permissions(recording, tmp_path, capfd) -> None:
+    (recording / "camera.json").chmod(0)
+    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("camera.json", "ermission"))
+    (recording / "depth").chmod(0)
+    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("ermission",))
+    (recording / "depth").chmod(0o700)
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    (recording / "camera.json").chmod(0o600)
+    refuses(capfd, "run", recording, "--out", locked / "out", says=("locked", "ermission"))
+
+
+OUTPUTS: dict[str, Callable[[Path], Path]] = {
+    "not ours": lambda t: _with(t / "other", "photo.jpg"),
+    "a file": lambda t: _with(t / "other", "file") / "file",
+    "below a file": lambda t: _with(t / "other", "file") / "file" / "out",
+    "the recording": lambda t: t / "rec",
+}
+
+
+def _with(folder: Path, name: str) -> Path:
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    return folder
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_bad_output_folders(name, options, recording, tmp_path, capfd) -> None:
+    out = OUTPUTS[name](tmp_path)
+    before = listing(tmp_path)
+    refuses(capfd, "run", recording, "--out", out, *options, says=(str(out), "--out"))
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+def test_no_space_or_permission_for_the_output(code, recording, tmp_path, capfd, monkeypatch):
+    open_file = Path.open
+
+    def full(self: Path, mode: str = "r", *args: object, **named: object) -> object:
+        if "w" not in mode:
+            return open_file(self, mode, *args, **named)
+        raise OSError(code, os.strerror(code), str(self))
+
+    monkeypatch.setattr(Path, "open", full)
+    before = listing(tmp_path)
+    out = tmp_path / "out"
+    said = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))
+    assert os.strerror(code).lower() in said.lower()
+    assert ".tofuse" not in said
+    assert listing(tmp_path) == before
+
+
+def test_a_folder_that_cannot_be_made(recording, tmp_path, capfd, monkeypatch) -> None:
+    def refuse(self: Path, *_args: object, **_options: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    out = tmp_path / "out"
+    refuses(capfd, "run", recording, "--out", out, says=(str(out), "ermission denied"))
+
+
+RUN = ("run", "REC", "--out", "OUT")
+USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
+    "unknown command": (("fuse",), ("'fuse'",), "tofuse: "),
+    "misspelt command": (("rnu",), ("'rnu' (did you mean run?)",), "tofuse: "),
+    "no input": (("run", "--out", "OUT"), ("INPUT",), "tofuse run: "),
+    "no out": (("run", "REC"), ("--out",), "tofuse run: "),
+    "unknown option": ((*RUN, "--fast"), ("--fast",), "tofuse"),
+    "no threads": ((*RUN, "--threads", "0"), ("--threads", "0"), "tofuse run: "),
+    "threads a word": ((*RUN, "--threads", "x"), ("--threads", "'x'"), "tofuse run: "),
+    "negative seed": ((*RUN, "--seed", "-1"), ("--seed", "-1"), "tofuse run: "),
+    "seed a word": ((*RUN, "--seed", "1.5"), ("--seed", "1.5"), "tofuse run: "),
+    "every none": ((*RUN, "--every", "0"), ("--every", "0"), "tofuse run: "),
+    "start a word": ((*RUN, "--start", "a"), ("--start", "'a'"), "tofuse run: "),
+    "depth a word": ((*RUN, "--max-depth", "far"), ("--max-depth", "'far'"), "tofuse run: "),
+    "depth negative": ((*RUN, "--min-depth", "-1"), ("--min-depth", "-1"), "tofuse run: "),
+    "depth infinite": ((*RUN, "--max-depth", "inf"), ("--max-depth", "inf"), "tofuse run: "),
+    "unknown guess": ((*RUN, "--guess", "luck"), ("--guess", "'luck'"), "tofuse run: "),
+    "depths swapped": (
+        (*RUN, "--min-depth", "3", "--max-depth", "2"),
+        ("--max-depth", "3.0", "2.0"),
+        "tofuse: ",
+    ),
+    "misspelt option": (
+        (*RUN, "--maxdepth", "3"),
+        ("--maxdepth", "did you mean --max-depth?"),
+        "tofuse run: ",
+    ),
+    "one word too many": (("demo", "room"), ("room",), "tofuse demo: "),
+    "unknown method": ((*RUN, "--method", "magic"), ("--method", "'magic'", "thesis"), "tofuse: "),
+    "unknown format": ((*RUN, "--format", "magic"), ("--format", "'magic'", "native"), "tofuse: "),
+    "wrong format": ((*RUN, "--format", "tum"), ("REC",), "tofuse: "),
+    "nothing selected": ((*RUN, "--start", "9"), ("REC", "9", "--start"), "tofuse: "),
+    "end before start": ((*RUN, "--start", "2", "--end", "1"), ("REC", "--end"), "tofuse: "),
+    "no odometry": ((*RUN, "--guess", "odometry"), ("--guess", "odometry.txt"), "tofuse: "),
+    "no config": ((*RUN, "--config", "none.toml"), ("none.toml",), "tofuse: "),
+    "no camera": ((*RUN, "--camera", "none.json"), ("none.json",), "tofuse: "),
+    "no loops": ((*RUN, "--loops", "none.txt"), ("none.txt",), "tofuse: "),
+    "second input missing": (("run", "REC", "none", "--out", "OUT"), ("none",), "tofuse: "),
+    "simulate unknown scene": (("simulate", "moon", "--out", "OUT"), ("moon", "room"), "tofuse: "),
+    "simulate unknown camera": (
+        ("simulate", "room", "--out", "OUT", "--camera", "eye"),
+        ("eye", "sr4000"),
+        "tofuse: ",
+    ),
+    "simulate unknown effect": (
+        ("simulate", "room", "--out", "OUT", "--without", "magic"),
+        ("magic", "shot_noise"),
+        "tofuse: ",
+    ),
+    "simulate no frames": (
+        ("simulate", "room", "--out", "OUT", "--frames", "0"),
+        ("--frames", "0"),
+        "tofuse simulate: ",
+    ),
+    "simulate onto something": (("simulate", "box", "--out", "REC"), ("REC",), "tofuse: "),
+    "demo unknown scene": (("demo", "--scene", "moon"), ("moon", "room"), "tofuse demo: "),
+    "demo unknown method": (
+        ("demo", "--scene", "peaks", "--out", "OUT", "--method", "magic"),
+        ("magic", "thesis"),
+        "tofuse: ",
+    ),
+    "demo onto something": (("demo", "--out", "REC", "--overwrite"), ("REC",), "tofuse: "),
+    "merge without out": (("merge", "REC", "REC"), ("--out",), "tofuse merge: "),
+    "merge nothing": (("merge", "none", "--out", "OUT"), ("none", "doesn't exist"), "tofuse: "),
+    "merge no results": (("merge", "REC", "--out", "OUT"), ("REC", "run.json"), "tofuse: "),
+    "into nothing": ((*RUN, "--into", "none"), ("none", "doesn't exist"), "tofuse: "),
+    "into no result": ((*RUN, "--into", "REC"), ("REC", "run.json"), "tofuse: "),
+    "into itself": ((*RUN, "--into", "OUT"), ("--into", "two folders"), "tofuse: "),
+    "into in view": ((*RUN, "--into", "REC", "--view"), ("--view", "--into"), "tofuse: "),
+    "inspect nothing": (("inspect", "none"), ("none",), "tofuse: "),
+    "evaluate nothing": (("evaluate", "none", "REC"), ("none",), "tofuse: "),
+    "evaluate no reference": (("evaluate", "REC", "REC"), ("trajectory.txt",), "tofuse: "),
+    "optimize nothing": (("optimize", "none.g2o", "--out", "OUT"), ("none.g2o",), "tofuse: "),
+    "optimize onto something": (
+        ("optimize", "none.g2o", "--out", "REC"),
+        ("REC", "--overwrite"),
+        "tofuse: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", USAGE)
+def test_bad_usage(name, recording, tmp_path, capfd, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.move(recording, tmp_path / "REC")
+    before = listing(tmp_path)
+    words, says, prefix = USAGE[name]
+    refuses(capfd, *words, says=says, prefix=prefix)
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("words", [[], ["rig"]])
+def test_no_command_shows_the_help(words, capsys) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    said, complaint = capsys.readouterr()
+    assert stopped.value.code == 0
+    assert said.startswith("usage: tofuse")
+    assert "commands:" in said
+    assert not complaint
+
+
+CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "bad toml": ("filters = [", ("is not TOML",)),
+    "not text": ("\xff\xfe", ("is not text",)),
+    "unknown option": ("colour = 1", ("unknown option 'colour'", "'filters'")),
+    "unknown nested option": (
+        "[odometry.registration]\nresolutoin = 1",
+        ("odometry.registration", "'resolutoin'", "'resolution'"),
+    ),
+    "wrong type": ("[odometry.registration]\nresolution = 'fine'", ("resolution", "'fine'")),
+    "out of range": ("[odometry.registration]\nresolution = -1", ("resolution", "-1")),
+    "not a number": ("[odometry.registration]\nresolution = nan", ("resolution", "nan")),
+    "unknown part": ("[[filters]]\npart = 'magic'", ("filters[0]", "'magic'", "'median'")),
+    "part of no name": ("[[filters]]\nk = 3", ("filters[0]", "None", "'median'")),
+    "part of odd name": ("[[filters]]\npart = [1]", ("filters[0]", "[1]", "'median'")),
+    "number for a part": ("odometry = 3", ("odometry", "is 3", "'sequential'")),
+    "number for a list": ("filters = 3", ("filters", "is 3", "list")),
+    "table for a list": ("[filters]\npart = 'median'", ("filters", "list")),
+    "unknown method": ("method = 'magic'", ("'magic'", "'thesis'")),
+    "number for a method": ("method = 3", ("method", "3")),
+    "date": ("[fusion]\nvoxel_m = 2020-01-01", ("fusion.voxel_m", "float")),
+    "unknown guess": ("[odometry]\nguess = 'luck'", ("odometry.guess", "'luck'", "'previous'")),
+}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_bad_configurations(name, recording, tmp_path, capfd) -> None:
+    text, says = CONFIGS[name]
+    config = tmp_path / "my.toml"
+    config.write_text(text, encoding="latin-1")
+    words = ("run", recording, "--out", tmp_path / "out", "--config", config)
+    if "method" not in text:
+        words += ("--method", "thesis")
+    said = refuses(capfd, *words, says=says)
+    assert "my.toml" in said or "--method" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"schema": 1}', '{"schema": 1, "config": 3}', "{}"])
+def test_a_run_json_that_is_none(text, recording, tmp_path, capfd) -> None:
+    config = tmp_path / "run.json"
+    config.write_text(text)
+    words = ("run", recording, "--out", tmp_path / "out", "--config", config)
+    refuses(capfd, *words, says=("run.json",))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("0 1 2\n", ("line 1", "3 values")),
+        ("0 3\n0 x\n", ("line 2",)),
+        ("0 99\n", ("line 1", "no frame 99")),
+        ("2 2\n", ("line 1",)),
+        ("0 3 1 0 0 0 0 0 7\n", ("line 1", "quaternion")),
+        ("0 3 nan 0 0 0 0 0 1\n", ("line 1",)),
+    ],
+)
+def test_bad_loops(text, says, recording, tmp_path, capfd) -> None:
+    loops = tmp_path / "loops.txt"
+    loops.write_text(text)
+    words = ("run", recording, "--out", tmp_path / "out", "--loops", loops)
+    refuses(capfd, *words, says=("loops.txt", *says))
+    assert not (tmp_path / "out").exists()
+
+
+GRAPHS = {
+    "empty": "",
+    "words": "hello\n",
+    "short vertex": "VERTEX_SE3:QUAT 0 0 0 0\n",
+    "nan": "VERTEX_SE3:QUAT 0 nan 0 0 0 0 0 1\n",
+    "edge to nowhere": "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 5 0 0 0 0 0 0 1 "
+    + " ".join(["1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"]),
+    "binary": "\x00\xff\x01",
+}
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_broken_graphs(name, tmp_path, capfd) -> None:
+    graph = tmp_path / "in.g2o"
+    graph.write_text(GRAPHS[name], encoding="latin-1")
+    refuses(capfd, "optimize", graph, "--out", tmp_path / "out.g2o", says=("in.g2o",))
+    assert not (tmp_path / "out.g2o").exists()
+
+
+def test_trajectories_that_do_not_match_in_time(tmp_path, capfd) -> None:
+    for name, start in (("a.txt", 0), ("b.txt", 1000)):
+        lines = [f"{start + k} {k} 0 0 0 0 0 1" for k in range(5)]
+        (tmp_path / name).write_text("\n".join(lines))
+    words = ("evaluate", tmp_path / "a.txt", tmp_path / "b.txt")
+    refuses(capfd, *words, says=("0.02 s", "a.txt", "b.txt"))
+    (tmp_path / "c.txt").write_text("0 1 2\n")
+    refuses(capfd, "evaluate", tmp_path / "c.txt", tmp_path / "a.txt", says=("c.txt",))
+    (tmp_path / "d.txt").write_text("")
+    refuses(capfd, "evaluate", tmp_path / "a.txt", tmp_path / "d.txt", says=("d.txt",))
+
+
+def test_inspect_of_nothing_readable(recording, capfd) -> None:
+    truncate_all(recording)
+    refuses(capfd, "inspect", recording, says=("none of 4 frames",))
+
+
+def test_what_no_room_foresaw_is_still_one_line(capfd, monkeypatch) -> None:
+    def fail(*_args: object, **_options: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), "some/file")
+
+    monkeypatch.setattr(reading, "read_text", fail)
+    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", fail)
+    refuses(capfd, "evaluate", "a", "b", says=("some/file", os.strerror(errno.EIO)))
+
+    def too_much(*_args: object, **_options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", too_much)
+    refuses(capfd, "evaluate", "a", "b", says=("out of memory", "--every"))

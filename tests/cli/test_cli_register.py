@@ -1,0 +1,634 @@
+"""``tofuse register``: every kind of view and guess, what is printed and written, every refusal."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from browser import changed, chromium, watched
+from cli_calls import call, listing, refuses
+from registration_scenes import bumpy_ball, stone, turn
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.las import write_las
+from tofuse.files.ply import read_ply, write_ply
+from tofuse.files.pose import read_pose
+from tofuse.files.trajectory import read_tum, tum_text, write_tum
+from tofuse.geometry import se3
+from tofuse.pipeline import pair as pair_module
+from tofuse.recordings.open import open_recording
+from tofuse.registration.base import Registration
+
+FILES = {"registration.json", "transform.txt", "aligned.ply", "report.html"}
+MAP = np.array([512_345.25, 4_012_345.5, 310.0])
+MIDDLE = np.add(MAP, (0, 0, 2.0))  # of the clouds there
+T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
+
+
+@pytest.fixture
+def light_page(monkeypatch) -> None:
+    """Leave out the page where the test doesn't look at it."""
+    monkeypatch.setattr("tofuse.report.pair.render_pair", lambda result: "<html>")
+
+
+@pytest.fixture
+def clouds(tmp_path) -> tuple[Path, Path]:
+    """Two samples of one surface: the source is the target's frame turned by `T_SMALL`."""
+    target = stone(3000, 1, noise=0.001)
+    source = se3.transform(se3.inverse(T_SMALL), stone(3000, 2, noise=0.001))
+    for name, points in (("source.ply", source), ("target.ply", target)):
+        write_ply(tmp_path / name, GeometryRecord(points))
+    return tmp_path / "source.ply", tmp_path / "target.ply"
+
+
+def told(capfd, *words: object) -> tuple[int, dict]:
+    """Run with --json; nothing but one object is printed."""
+    capfd.readouterr()
+    status = call("register", *words, "--json")
+    out = capfd.readouterr().out
+    assert out.count("\n") == 1
+    return status, json.loads(out)
+
+
+def gap(T: np.ndarray, truth: np.ndarray, at: np.ndarray) -> tuple[float, float]:
+    """How far apart two motions take a point (m), and their angle (degrees)."""
+    step = se3.transform(T, at[None]) - se3.transform(truth, at[None])
+    return float(np.linalg.norm(step)), float(np.degrees(se3.angle(se3.inverse(T) @ truth)))
+
+
+def near(T: object, truth: np.ndarray, at=(0, 0, 2.0), metres=0.01, degrees=0.5) -> None:
+    moved, turned = gap(np.asarray(T), truth, np.asarray(at, float))
+    assert moved < metres
+    assert turned < degrees
+
+
+def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
+    _, poses = read_tum(recording / "groundtruth.txt")
+    return se3.inverse(poses[target]) @ poses[source]
+
+
+def test_two_frames_of_a_recording(room_recording, tmp_path, capfd) -> None:
+    out = tmp_path / "out"
+    status, said = told(
+        capfd, f"{room_recording}#3", f"{room_recording}#0", "--out", out, "--threads", 2
+    )
+    assert status == 0
+    assert said["believed"] is True
+    assert said["probability"] > 0.9
+    assert said["reason"] == ""
+    assert (said["source"]["frame"], said["target"]["frame"]) == (3, 0)
+    assert said["source"]["format"] == "native"
+    near(said["T_target_source"], true_motion(room_recording, 3, 0), metres=0.03, degrees=1)
+    assert {p.name for p in out.iterdir()} == FILES
+    written = json.loads((out / "registration.json").read_text())
+    assert {**written, "out": str(out)} == said
+    assert written["schema"] == 1
+    assert len(written["covariance"]) == 36
+    covariance = np.reshape(written["covariance"], (6, 6))
+    np.testing.assert_allclose(
+        covariance @ np.reshape(written["information"], (6, 6)), np.eye(6), atol=1e-6
+    )
+    assert written["sigma_m"] == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), said["T_target_source"])
+    frame = open_recording(room_recording)[3]
+    ply = read_ply(out / "aligned.ply")
+    moved = se3.transform(np.array(said["T_target_source"]), frame.points.astype(float))
+    np.testing.assert_allclose(ply.points, moved, atol=1e-5)
+    np.testing.assert_array_equal(ply.amplitude, frame.amplitude)
+    page = (out / "report.html").read_text()
+    assert "room#3 registered to room#0" in page
+    assert "Believed" in page
+    assert (out / "report.html").stat().st_size < 4e6
+
+
+def test_the_index_is_that_of_the_recording(room_recording, capfd) -> None:
+    """Source and target are not mixed up: the other way round gives the inverse."""
+    _, there = told(capfd, f"{room_recording}#5", f"{room_recording}#4")
+    _, back = told(capfd, f"{room_recording}#4", f"{room_recording}#5")
+    near(there["T_target_source"], true_motion(room_recording, 5, 4), metres=0.03, degrees=1)
+    near(se3.inverse(back["T_target_source"]), np.array(there["T_target_source"]), metres=0.03)
+
+
+def test_what_is_printed(room_recording, capfd) -> None:
+    assert call("register", f"{room_recording}#1", f"{room_recording}#0") == 0
+    said = capfd.readouterr().out.splitlines()
+    assert said[0].startswith("believed: probability")
+    start = next(k for k, line in enumerate(said) if line.startswith("T_target_source"))
+    rows = [line.removeprefix("T_target_source").split() for line in said[start : start + 4]]
+    T = np.array(rows, float)
+    near(T, true_motion(room_recording, 1, 0), metres=0.03, degrees=1)
+    names = [line.split("  ")[0] for line in said if not line.startswith(" ")]
+    assert names[1:] == ["translation", "rotation", "T_target_source", "overlap", "rms distance",
+                         "sigma"]  # fmt: skip
+    angle = np.degrees(se3.angle(T))
+    assert f"{angle:.3f}" in next(line for line in said if line.startswith("rotation"))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las", ".laz"])
+def test_clouds_of_each_format(suffix, clouds, capfd) -> None:
+    paths = []
+    for path in clouds:
+        points = read_ply(path).points.astype(float)
+        other = path.with_suffix(suffix)
+        paths.append(other)
+        write_cloud(other, points)
+    status, said = told(capfd, *paths)
+    assert status == 0
+    assert said["believed"] is True
+    assert said["probability"] > 0.9
+    assert said["source"]["format"] == ("las" if suffix == ".laz" else suffix[1:])
+    near(said["T_target_source"], T_SMALL)
+
+
+def write_cloud(path: Path, points: np.ndarray) -> None:
+    """Write (N, 3) points in double precision, in the format of the suffix."""
+    rows = "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in points)
+    if path.suffix == ".ply":
+        write_ply(path, GeometryRecord(points), double=True)
+    elif path.suffix == ".xyz":
+        path.write_text(rows)
+    elif path.suffix == ".pcd":
+        path.write_text(
+            "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\n"
+            f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA ascii\n{rows}"
+        )
+    elif path.suffix == ".las":
+        pytest.importorskip("laspy")
+        write_las(path, GeometryRecord(points))
+    else:
+        laspy = pytest.importorskip("laspy")
+        header = laspy.LasHeader(version="1.2", point_format=0)
+        header.scales, header.offsets = np.full(3, 1e-4), np.floor(points.mean(0))
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = points.T
+        data.write(path)
+
+
+def test_scans_of_one_e57(clouds, tmp_path, capfd) -> None:
+    pye57 = pytest.importorskip("pye57")
+    path = tmp_path / "scans.e57"
+    file = pye57.E57(str(path), mode="w")
+    for cloud in clouds:
+        points = read_ply(cloud).points.astype(float)
+        file.write_scan_raw({f"cartesian{a}": points[:, k] for k, a in enumerate("XYZ")})
+    file.close()
+    status, said = told(capfd, f"{path}#0", f"{path}#1")
+    assert status == 0
+    near(said["T_target_source"], T_SMALL)
+    refuses(capfd, "register", path, f"{path}#1", says=("scans.e57", "holds 2 frames", "#0"))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las"])
+def test_map_coordinates_come_back_to_the_millimetre(
+    suffix, clouds, tmp_path, capfd, light_page
+) -> None:
+    """Half a million and four millions of metres from the origin, where float32 steps by 0.25 m."""
+    source, target = (read_ply(path).points.astype(float) + MAP for path in clouds)
+    paths = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    write_cloud(paths[0], source)
+    write_cloud(paths[1], target)
+    out = tmp_path / "out"
+    _, said = told(capfd, *paths, "--out", out)
+    T = np.array(said["T_target_source"])
+    shift = np.eye(4)
+    shift[:3, 3] = MAP
+    truth = shift @ T_SMALL @ se3.inverse(shift)
+    near(T, truth, MIDDLE)
+    assert gap(T, truth, MIDDLE)[0] > 1e-9  # of the clouds, not given away by the test
+    np.testing.assert_allclose(said["reference_point_m"], MIDDLE, atol=1.5)
+    assert said["warnings"] == []  # what readers take off is added again
+    aligned = read_ply(out / "aligned.ply")
+    assert aligned.points.dtype == np.float64
+    np.testing.assert_allclose(aligned.points, se3.transform(T, source), atol=1e-3)
+    np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), T)
+    # As a guess the result leads to itself: nothing is lost on the way out and in.
+    _, again = told(capfd, *paths, "--guess", out / "registration.json")
+    near(again["T_target_source"], T, MIDDLE, metres=0.002, degrees=0.1)
+
+
+def test_a_cloud_of_a_map_and_one_about_the_origin(tmp_path, capfd) -> None:
+    """Without a guess they are laid over each other; the result is between the files."""
+    target = bumpy_ball(6000, 1) + MAP
+    source = se3.transform(se3.inverse(T_SMALL), bumpy_ball(6000, 2))
+    write_cloud(tmp_path / "map.ply", target)
+    write_cloud(tmp_path / "local.ply", source)
+    _, said = told(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
+    shift = np.eye(4)
+    shift[:3, 3] = MAP
+    near(said["T_target_source"], shift @ T_SMALL, metres=0.02, degrees=1)
+
+
+def test_an_image_and_a_cloud(room_recording, tmp_path, capfd) -> None:
+    frame = open_recording(room_recording)[0]
+    write_ply(
+        tmp_path / "cloud.ply",
+        GeometryRecord(frame.points, color=np.zeros_like(frame.points, np.uint8)),
+    )
+    status, said = told(
+        capfd, f"{room_recording}#1", tmp_path / "cloud.ply",
+        "--camera", room_recording / "camera.json",
+    )  # fmt: skip
+    assert status == 0
+    near(said["T_target_source"], true_motion(room_recording, 1, 0), metres=0.05, degrees=1.5)
+
+
+def test_single_depth_images(room_recording, tmp_path, capfd) -> None:
+    for k in (0, 2):
+        shutil.copy(room_recording / "depth" / f"{k:06d}.png", tmp_path / f"{k}.png")
+    lone = tmp_path / "2.png", tmp_path / "0.png"
+    refuses(capfd, "register", *lone, says=("2.png", "without a camera", "--camera"))
+    _, said = told(capfd, *lone, "--camera", room_recording / "camera.json")
+    assert said["source"]["format"] == "depth-png"
+    near(said["T_target_source"], true_motion(room_recording, 2, 0), metres=0.05, degrees=1.5)
+    shutil.copy(room_recording / "camera.json", tmp_path / "camera.json")
+    _, beside = told(capfd, *lone)
+    assert beside["T_target_source"] == said["T_target_source"]
+    inside = room_recording / "depth" / "000002.png"
+    refuses(capfd, "register", inside, lone[1], says=(f"use {room_recording}#2",))
+
+
+def test_a_path_with_a_number_sign_is_a_path(clouds, tmp_path, capfd) -> None:
+    odd = tmp_path / "scan#7.ply"
+    shutil.copy(clouds[0], odd)
+    _, said = told(capfd, odd, f"{clouds[1]}#0")
+    assert (said["source"]["path"], said["source"]["frame"]) == (str(odd), 0)
+    assert (said["target"]["path"], said["target"]["frame"]) == (str(clouds[1]), 0)
+
+
+GUESSES = {
+    "four rows": lambda T: "".join(" ".join(map(repr, row)) + "\n" for row in T.tolist()),
+    "one row": lambda T: "# mine\n" + ", ".join(map(repr, T.ravel().tolist())),
+    "json": lambda T: json.dumps({"schema": 1, "T_target_source": T.tolist()}),
+    "json list": lambda T: json.dumps(T.tolist()),
+    "tum": lambda T: "12.5 " + tum_words(T),
+    "tum without time": lambda T: tum_words(T),
+}
+
+
+def tum_words(T: np.ndarray) -> str:
+    return tum_text([0.0], T[None]).split(" ", 1)[1]
+
+
+@pytest.mark.parametrize("form", GUESSES)
+def test_a_guess_is_read_in_each_form(form, tmp_path) -> None:
+    T = se3.exp([4e5, -2, 0.3, 0.4, -0.2, 1.0])
+    path = tmp_path / "guess"
+    path.write_text(GUESSES[form](T))
+    np.testing.assert_allclose(read_pose(path), T, rtol=0, atol=1e-9)
+
+
+def test_a_guess_decides_where_it_starts(clouds, tmp_path, capfd, monkeypatch) -> None:
+    """The engine is given the guess, or none."""
+    seen = []
+
+    def spy(source, target, *, guess=None):
+        seen.append(guess)
+        return made(np.eye(4) if guess is None else guess)
+
+    monkeypatch.setattr(pair_module, "register", spy)
+    T = se3.exp([0.1, 0.2, 0.3, 0.4, -0.2, 1.0])
+    (tmp_path / "guess.txt").write_text(GUESSES["tum"](T))
+    _, said = told(capfd, *clouds, "--guess", tmp_path / "guess.txt")
+    np.testing.assert_allclose(seen[0], T, atol=1e-9)
+    np.testing.assert_allclose(said["T_target_source"], T, atol=1e-9)
+    assert said["guess"] == str(tmp_path / "guess.txt")
+    told(capfd, *clouds)
+    assert seen[1] is None
+
+
+BAD_GUESSES = {
+    "missing": (None, ("doesn't exist",)),
+    "empty": ("", ("contains 0 numbers", "16 numbers")),
+    "words": ("1 0 0 x", ("line 1", "'x'")),
+    "nan": ("nan " * 16, ("nan",)),
+    "nine numbers": ("1 2 3\n" * 3, ("contains 9 numbers",)),
+    "scaled": ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", ("no rotation", "rigid")),
+    "mirrored": ("-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", ("no rotation",)),
+    "projective": ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", ("last row",)),
+    "no quaternion": ("0 0 0 2 0 0 0", ("quaternion", "length 2")),
+    "broken json": ('{"T_target_source": ', ("not JSON",)),
+    "json without": ('{"pose": 1}', ("T_target_source", "missing")),
+    "json of another shape": ('{"T_target_source": [[1, 2]]}', ("T_target_source", "(1, 2)")),
+    "json of words": ('{"T_target_source": [["a"]]}', ("T_target_source", "not a 4x4")),
+    "json ragged": ('{"T_target_source": [[1], [1, 2]]}', ("T_target_source", "not a 4x4")),
+    "binary": ("\0\1", ("'\\x00\\x01'",)),
+}
+
+
+@pytest.mark.parametrize("name", BAD_GUESSES)
+def test_a_bad_guess_is_refused(name, clouds, tmp_path, capfd) -> None:
+    text, says = BAD_GUESSES[name]
+    guess = tmp_path / "guess.txt"
+    if text is not None:
+        guess.write_text(text)
+    before = listing(tmp_path)
+    said = refuses(
+        capfd, "register", *clouds, "--guess", guess, "--out", tmp_path / "out",
+        says=(str(guess), *says),
+    )  # fmt: skip
+    assert ";" in said  # what to do about it
+    assert listing(tmp_path) == before
+
+
+def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ...]]:
+    """A view that can't be used, and what is said of it."""
+    path = folder / "bad.ply"
+    match name:
+        case "missing":
+            return folder / "none.ply", ("none.ply", "doesn't exist")
+        case "missing recording":
+            return f"{folder / 'none'}#3", ("none", "doesn't exist")
+        case "empty cloud":
+            write_ply(path, GeometryRecord(np.zeros((0, 3))))
+            return path, ("bad.ply", "0 valid points")
+        case "nan cloud":
+            write_ply(path, GeometryRecord(np.full((50, 3), np.nan)))
+            return path, ("bad.ply", "0 valid points")
+        case "few points":
+            write_ply(path, GeometryRecord(np.eye(3)))
+            return path, ("bad.ply", "3 valid points", "10")
+        case "no cloud":
+            path.write_bytes(b"junk")
+            return path, ("bad.ply", "PLY")
+        case "several frames":
+            return room, (str(room), "holds 8 frames", f"{room}#0 to {room}#7")
+        case "out of range":
+            return f"{room}#8", (str(room), "has no frame 8", "0 to 7")
+        case "out of range of one":
+            write_ply(path, GeometryRecord(np.random.default_rng(0).normal(size=(50, 3))))
+            return f"{path}#1", ("has no frame 1", "its only frame is 0")
+        case "negative":
+            return f"{room}#-1", ("'-1'", "whole number")
+        case "no number":
+            return f"{room}#", ("''", "whole number")
+        case _:
+            raise AssertionError(name)
+
+
+@pytest.mark.parametrize("role", ["source", "target"])
+@pytest.mark.parametrize(
+    "name",
+    ["missing", "missing recording", "empty cloud", "nan cloud", "few points", "no cloud",
+     "several frames", "out of range", "out of range of one", "negative", "no number"],
+)  # fmt: skip
+def test_a_bad_view_is_refused(name, role, clouds, room_recording, tmp_path, capfd) -> None:
+    bad, says = bad_view(name, tmp_path, room_recording)
+    before = listing(tmp_path)
+    words = (bad, clouds[1]) if role == "source" else (clouds[0], bad)
+    said = refuses(capfd, "register", *words, "--out", tmp_path / "out", says=says)
+    assert ";" in said
+    assert listing(tmp_path) == before
+
+
+def test_a_camera_for_two_clouds_is_refused(clouds, room_recording, capfd) -> None:
+    refuses(
+        capfd, "register", *clouds, "--camera", room_recording / "camera.json",
+        says=("--camera", "'ply'", "leave it out"),
+    )  # fmt: skip
+
+
+def test_clouds_that_share_nothing_are_refused_in_a_line(tmp_path, capfd) -> None:
+    """No motion is fixed by points on a line."""
+    for k in range(2):
+        write_ply(tmp_path / f"{k}.ply", GeometryRecord(np.linspace([0, 0, 1], [1, 0, 1 + k], 40)))
+    refuses(capfd, "register", tmp_path / "0.ply", tmp_path / "1.ply", says=("tofuse: ",))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("a.ply",), ("TARGET",)),
+        (("a.ply", "b.ply", "c.ply"), ("c.ply",)),
+        (("a.ply", "b.ply", "--threads", "0"), ("--threads", "0")),
+        (("a.ply", "b.ply", "--gess", "x"), ("--gess", "--guess")),
+    ],
+)
+def test_bad_usage(words, says, capfd) -> None:
+    refuses(capfd, "register", *words, says=says, prefix="tofuse register: ")
+
+
+def test_overwrite_alone_is_refused(clouds, capfd) -> None:
+    refuses(capfd, "register", *clouds, "--overwrite", says=("--overwrite", "--out"))
+
+
+def test_an_output_folder_of_others_is_refused(clouds, tmp_path, capfd, monkeypatch) -> None:
+    monkeypatch.setattr(pair_module, "register", lambda *a, **k: pytest.fail("work was begun"))
+    for name, content in (("photo.jpg", "mine"), ("run.json", "{}"), ("registration.json", "{}")):
+        out = tmp_path / f"for {name}"
+        out.mkdir()
+        (out / name).write_text(content)
+        for more in ((), ("--overwrite",)):
+            refuses(capfd, "register", *clouds, "--out", out, *more, says=(str(out), "--out"))
+        assert [p.name for p in out.iterdir()] == [name]
+        assert (out / name).read_text() == content
+
+
+def test_overwrite_replaces_an_earlier_result_and_nothing_else(
+    clouds, tmp_path, capfd, light_page
+) -> None:
+    out = tmp_path / "out"
+    assert call("register", *clouds, "--out", out) == 0
+    first = (out / "registration.json").read_text()
+    (out / "notes.txt").write_text("mine")
+    (out / "aligned.ply").unlink()
+    refuses(
+        capfd, "register", *clouds, "--out", out, says=("contains an earlier result", "--overwrite")
+    )
+    assert call("register", clouds[1], clouds[1], "--out", out, "--overwrite") == 0
+    assert {p.name for p in out.iterdir()} == {*FILES, "notes.txt"}
+    assert (out / "registration.json").read_text() != first
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_a_failure_while_writing_leaves_an_earlier_result(
+    clouds, tmp_path, capfd, monkeypatch, light_page
+) -> None:
+    out = tmp_path / "out"
+    assert call("register", *clouds, "--out", out) == 0
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tofuse.report.pair.render_pair", full)
+    refuses(
+        capfd, "register", clouds[1], clouds[1], "--out", out, "--overwrite",
+        says=(str(out), "No space left"),
+    )  # fmt: skip
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    refuses(capfd, "register", *clouds, "--out", tmp_path / "new", says=("No space left",))
+    assert not (tmp_path / "new").exists()
+
+
+def made(T: np.ndarray, **more: object) -> Registration:
+    """A result of an engine that knows only what it must."""
+    plain = Registration(T, True, 3, 80, 100, 0.1, 0.004, 1e6 * np.eye(6))
+    return replace(plain, **more)
+
+
+@pytest.mark.parametrize(
+    ("more", "status", "says"),
+    [
+        ({"believed": True, "probability": 0.97}, 0, "believed: probability 97 %"),
+        ({"believed": True, "probability": 0.9999}, 0, "believed: probability above 99 %"),
+        (
+            {"believed": False, "probability": 0.2, "reason": "too little overlap"},
+            3,
+            "not believed: probability 20 %; too little overlap",
+        ),
+        ({"believed": False}, 3, "not believed"),
+        ({}, 3, "not verified: the method can't verify its result"),
+    ],
+)
+def test_belief_decides_the_exit_status(
+    more, status, says, clouds, tmp_path, capfd, monkeypatch, light_page
+) -> None:
+    """Whatever else the engine leaves out."""
+    monkeypatch.setattr(pair_module, "register", lambda *a, **k: made(T_SMALL, **more))
+    assert call("register", *clouds, "--out", tmp_path / "out") == status
+    assert capfd.readouterr().out.splitlines()[0] == says
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+    again, said = told(capfd, *clouds)
+    assert again == status
+    assert said["believed"] is more.get("believed")
+    assert said["runner_up"] is said["margin"] is said["overlap"] is None
+
+
+def test_a_page_of_a_pair_of_which_hardly_anything_is_known(tmp_path, monkeypatch, capfd) -> None:
+    """Too few points for surfaces, no distance, and a start far away."""
+    for name in ("a&b.ply", "target.ply"):
+        write_ply(tmp_path / name, GeometryRecord(np.random.default_rng(1).normal(size=(12, 3))))
+    far = se3.exp([1e4, 0, 0, 0, 0, 1])
+    found = made(far, rms_m=float("nan"), information=np.zeros((6, 6)))
+    monkeypatch.setattr(pair_module, "register", lambda *a, **k: found)
+    out = tmp_path / "out"
+    assert call("register", tmp_path / "a&b.ply", tmp_path / "target.ply", "--out", out) == 3
+    printed = capfd.readouterr().out
+    assert "nan" not in printed
+    page = (out / "report.html").read_text()
+    assert "a&amp;b.ply registered to target.ply" in page
+    assert "a&b.ply" not in page
+    assert "No point is within" in page
+    scene = json.loads(page.split('id="scene">')[1].split("</script>")[0])
+    assert {layer["count"] for layer in scene["layers"]} == {12}
+
+
+def printed(capfd, monkeypatch, clouds, found: Registration) -> dict[str, str]:
+    """The printed values by name."""
+    monkeypatch.setattr(pair_module, "register", lambda *a, **k: found)
+    capfd.readouterr()
+    call("register", *clouds)
+    lines = capfd.readouterr().out.splitlines()[1:]
+    named = [line for line in lines if not line.startswith(" ")]
+    return {line[:15].strip(): line[15:].strip() for line in named}
+
+
+def test_degenerate_directions_in_words(clouds, capfd, monkeypatch) -> None:
+    wall = np.eye(6)[[0, 1, 5]]
+    mixed = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] @ wall
+    both = "1.00 mm, 0.057°"
+    for free, says, sigma in (
+        (np.eye(6)[[0]], "sliding along x (axes of the source)", both),
+        (-np.eye(6)[[4]], "turning about y (axes of the source)", both),
+        (mixed, "sliding in any direction perpendicular to z and turning about z", both),
+        (np.eye(6)[3:], "turning about any axis", "1.00 mm (1"),
+        (np.eye(6)[:3], "sliding in any direction", "0.057° (1"),
+        (np.array([[1, 1, 0, 0, 0, 0]]) / np.sqrt(2), "sliding along (0.71, 0.71, 0.00)", both),
+    ):
+        said = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=free))
+        assert says in said["unobservable"], says
+        # What is not observable is not part of the stated accuracy.
+        assert said["sigma"].startswith(sigma), says
+        _, data = told(capfd, *clouds)
+        assert data["covariance"] is None
+    said = printed(capfd, monkeypatch, clouds, made(np.eye(4)))
+    assert "unobservable" not in said
+    said = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=np.eye(6)))
+    assert said["sigma"].startswith("unknown")
+
+
+def test_information_that_is_no_good_gives_no_accuracy(clouds, capfd, monkeypatch) -> None:
+    for information in (np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6)):
+        found = made(np.eye(4), information=information, rms_m=float("nan"))
+        monkeypatch.setattr(pair_module, "register", lambda *a, found=found, **k: found)
+        _, said = told(capfd, *clouds)
+        assert said["covariance"] is said["sigma_m"] is said["sigma_rad"] is said["rms_m"] is None
+
+
+def test_the_runner_up_is_told_by_margin_and_place(clouds, capfd, monkeypatch) -> None:
+    other = se3.exp([0.3, 0, 0, 0, 0, 0])
+    found = made(np.eye(4), runner_up=other, margin=0.125, believed=True, probability=0.95,
+                 overlap=0.8, support=0.7, contradiction=0.01)  # fmt: skip
+    said = printed(capfd, monkeypatch, clouds, found)
+    assert said["runner-up"] == "0.300 m and 0.0° away, fits 12 % fewer of the points"
+    overlap = "80 % of the points overlap, 70 % support the pose, 1.0 % contradict it"
+    assert said["overlap"] == overlap
+    _, data = told(capfd, *clouds)
+    np.testing.assert_allclose(data["runner_up"], other)
+
+
+def test_what_is_known_of_points_goes_along(clouds, tmp_path, capfd, light_page) -> None:
+    points = read_ply(clouds[0]).points
+    count = len(points)
+    color = np.random.default_rng(1).integers(0, 255, (count, 3)).astype(np.uint8)
+    normals = np.tile(np.array([0, 0, -1], np.float32), (count, 1))
+    light = np.arange(count, dtype=np.float32)
+    write_ply(
+        clouds[0],
+        GeometryRecord(points, color=color, normals=normals, scalars={"intensity": light}),
+    )
+    _, said = told(capfd, *clouds, "--out", tmp_path / "out")
+    aligned = read_ply(tmp_path / "out" / "aligned.ply")
+    np.testing.assert_array_equal(aligned.color, color)
+    np.testing.assert_array_equal(aligned.amplitude, light)
+    R = np.array(said["T_target_source"])[:3, :3]
+    np.testing.assert_allclose(aligned.normals, normals @ R.T, atol=1e-6)
+
+
+def test_a_bad_pose_of_a_trajectory_line_is_not_taken_for_a_matrix(tmp_path) -> None:
+    """Two lines of a trajectory hold sixteen numbers too, and are no rigid motion."""
+    write_tum(tmp_path / "t.txt", [0.0, 1.0], np.stack([np.eye(4), T_SMALL]))
+    with pytest.raises(Exception, match=r"last row|rotation"):
+        read_pose(tmp_path / "t.txt")
+
+
+def test_the_page_in_a_browser(room_recording, tmp_path) -> None:
+    """The three states differ, views can be switched off, and nothing is asked of others."""
+    out = tmp_path / "out"
+    assert call("register", f"{room_recording}#4", f"{room_recording}#0", "--out", out) == 0
+    page_file = out / "report.html"
+    with (
+        chromium() as browser,
+        watched(
+            browser, page_file.as_uri(), ours=page_file.as_uri(),
+            viewport={"width": 390, "height": 800},
+        ) as seen,
+    ):  # fmt: skip
+        page = seen.page
+        page.locator("#viewer.live").wait_for(timeout=20_000)
+
+        def shown() -> np.ndarray:
+            page.wait_for_timeout(900)
+            return seen.pixels("#viewer .stage canvas")
+
+        after = shown()
+        blue, red = after[..., 0], after[..., 2]  # the channels are BGR
+        assert (red - blue > 60).mean() > 0.02  # the source is orange
+        assert (blue - red > 60).mean() > 0.02  # the target is blue
+        assert not page.locator(".only-distance").is_visible()
+        page.locator("input[value=before]").click()
+        assert changed(after, shown()) > 0.02
+        page.locator("input[value=distance]").click()
+        assert changed(after, shown()) > 0.05
+        assert page.locator(".only-distance").is_visible()
+        page.locator("input[value=after]").click()
+        assert changed(after, shown()) < 0.002
+        page.locator("input[name=source]").click()
+        without = shown()
+        assert (without[..., 2] - without[..., 0] > 60).mean() < 0.002
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        seen.check()

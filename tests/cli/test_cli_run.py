@@ -1,0 +1,833 @@
+"""Whole runs at the command line: exit status, output folder, what is printed, interruptions."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse import cli
+from tofuse.cli import main
+from tofuse.cli.parser import DEMO_SCENES, make_parser
+from tofuse.errors import TofuseError
+from tofuse.files.images import read_image, write_png
+from tofuse.files.ply import read_ply
+from tofuse.files.trajectory import read_tum
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
+from tofuse.parts import name_of
+from tofuse.pipeline import run as run_module
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.g2o import read_g2o
+from tofuse.recordings.convert import convert
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.results.folder import LOCK, STAGING
+from tofuse.results.types import Component, Reason, Reconstruction
+from tofuse.results.verdict import ADVICE, REASONS
+from tofuse.viewer.content import read_content
+from wrapped_depth import wrapping
+
+SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
+FILES = {*SAME, "report.html", "view.npz", "run.json"}
+
+
+@pytest.fixture(autouse=True)
+def light_report(request, monkeypatch):
+    """Leave out the report, half of the time of a run, where the test doesn't look at it."""
+    if "full_report" not in request.fixturenames:
+        monkeypatch.setattr(run_module, "write_report_files", _stubs)
+
+
+def _stubs(*of_a_run: object) -> None:
+    for name in ("report.html", "view.npz"):
+        (of_a_run[-1] / name).write_text(name)
+
+
+@pytest.fixture
+def full_report() -> None:
+    """Ask for the real report."""
+
+
+@pytest.fixture
+def recording(room_recording, tmp_path) -> Path:
+    return shutil.copytree(room_recording, tmp_path / "rec")
+
+
+def run(*words: object, status: int = 0) -> None:
+    assert main(["run", *(str(w) for w in words)]) == status
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def same(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in SAME}
+
+
+def run_json(folder: Path) -> dict:
+    return json.loads(
+        (folder / "run.json").read_text(), parse_constant=lambda c: pytest.fail(f"{c} in run.json")
+    )
+
+
+@pytest.fixture(scope="module")
+def plain_run(room_recording, tmp_path_factory) -> Path:
+    """The result of a run without options, with its report."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    assert main(["run", str(room_recording), "--out", str(out), "--threads", "2"]) == 0
+    return out
+
+
+def test_the_files_of_the_contract(plain_run, room_recording) -> None:
+    assert {p.name for p in plain_run.iterdir()} == FILES
+    times, poses = read_tum(plain_run / "trajectory.txt")
+    recorded, _ = read_tum(room_recording / "groundtruth.txt")
+    np.testing.assert_allclose(times, recorded, atol=1e-6)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+    graph = read_g2o(plain_run / "pose_graph.g2o")
+    np.testing.assert_allclose(graph.poses, poses, atol=1e-6)
+    assert len(graph.edges) >= 7
+    assert (np.linalg.eigvalsh(graph.information) > 0).all()
+    cloud = read_ply(plain_run / "cloud.ply")
+    assert len(cloud) > 1000
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-4)
+    assert np.ptp(cloud.color) > 100
+    report = (plain_run / "report.html").read_text()
+    assert report.lower().startswith("<!doctype html")
+    assert not re.search(r"(src|href)=[\"']https?:", report)
+
+
+def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
+    data = run_json(plain_run)
+    assert set(data) == {
+        "schema",
+        "version",
+        "input",
+        "seed",
+        "threads",
+        "config",
+        "seconds",
+        "verdict",
+        "self_calibration",
+        "accuracy",
+        "reasons",
+        "frames",
+        "loops",
+        "optimiser",
+        "outside",
+        "refinement",
+        "filters",
+        "findings",
+        "warnings",
+        "components",
+        "sessions",
+        "session_pairs",
+        "changes",
+        "T_up_world",
+        "tiles",
+        "rig",
+    }
+    assert data["schema"] == 1
+    opening = data["input"].pop("opening")
+    assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}
+    assert opening["paths"] == [str(room_recording)]
+    assert (data["seed"], data["threads"]) == (0, 2)
+    assert data["verdict"] in ("good", "degraded", "failed")
+    assert all(isinstance(s, float) and s >= 0 for s in data["seconds"].values())
+    for reason in data["reasons"]:
+        assert set(reason) == {"code", "frames", "ranges", "text"}
+        assert reason["code"] in REASONS
+        assert len(reason["frames"]) == 2
+    assert [f["index"] for f in data["frames"]] == list(range(8))
+    for frame in data["frames"]:
+        assert set(frame) == {
+            "index",
+            "timestamp",
+            "status",
+            "reason",
+            "valid_share",
+            "inlier_share",
+            "rms_m",
+            "covariance",
+            "unobservable",
+            "component",
+            "session",
+        }
+        assert frame["status"] == "tracked"
+        assert 0 < frame["valid_share"] <= 1
+        if frame["index"]:
+            assert 0 < frame["inlier_share"] <= 1
+            assert 0 < frame["rms_m"] < 0.1
+            covariance = np.array(frame["covariance"]).reshape(6, 6)
+            assert (np.linalg.eigvalsh(covariance) > 0).all()
+    for values in data["filters"].values():
+        assert set(values) == {"removed"}
+        assert 0 <= values["removed"] <= 1
+
+
+def test_one_seed_one_result_whatever_the_threads(plain_run, room_recording, tmp_path) -> None:
+    for name, options in (("one", ["--threads", 1]), ("two", ["--threads", 2])):
+        run(room_recording, "--out", tmp_path / name, *options)
+        assert same(tmp_path / name) == same(plain_run)
+
+
+def test_the_seed_decides_what_is_random(room_recording, tmp_path) -> None:
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        options = ["--method", "thesis", "--seed", seed, "--threads", 1 + (name == "b")]
+        run(room_recording, "--out", tmp_path / name, "--every", 2, *options)
+    assert same(tmp_path / "a") == same(tmp_path / "b")
+    found = {(tmp_path / n / "trajectory.txt").read_bytes() for n in ("b", "c")}
+    assert len(found) == 2
+
+
+def test_an_earlier_run_json_gives_the_same_bytes(recording, tmp_path) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
+    for file in (recording / "confidence").iterdir():
+        write_png(file, (read_image(file) // 3).astype(np.uint8))
+    options = ["--seed", 3, "--max-depth", 4, "--guess", "identity", "--method", "thesis"]
+    run(recording, "--out", tmp_path / "a", *options)
+    config = run_json(tmp_path / "a")["config"]
+    assert config["filters"][0] == {
+        "part": "distance",
+        "minimum": 0.0,
+        "maximum": 4.0,
+        "measure": "z",
+    }
+    assert config["filters"][1] == {"part": "confidence", "minimum": 2, "highest": 2}
+    run(recording, "--out", tmp_path / "b", "--config", tmp_path / "a/run.json")
+    assert same(tmp_path / "b") == same(tmp_path / "a")
+    again = run_json(tmp_path / "b")
+    assert again["config"] == config
+    assert again["seed"] == 3
+    # What is said at the command line goes before what the file says.
+    run(recording, "--out", tmp_path / "c", "--config", tmp_path / "a/run.json", "--seed", 4)
+    assert run_json(tmp_path / "c")["seed"] == 4
+
+
+def test_options_of_a_toml_file(room_recording, tmp_path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text('method = "thesis"\nfilters = []\n[fusion]\nvoxel_m = 0.1\n')
+    run(room_recording, "--out", tmp_path / "out", "--config", file, "--guess", "identity")
+    config = run_json(tmp_path / "out")["config"]
+    assert (config["method"], config["filters"]) == ("thesis", [])
+    assert (config["fusion"]["voxel_m"], config["odometry"]["guess"]) == (0.1, "identity")
+    assert len(read_ply(tmp_path / "out/cloud.ply")) < 5000
+
+
+def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
+    thesis = ["--method", "thesis"]
+    run(room_recording, "--out", tmp_path / "a", "--min-depth", 1, "--every", 4, *thesis)
+    names = [f["part"] for f in run_json(tmp_path / "a")["config"]["filters"]]
+    assert names[0] == "distance"
+    assert names[1:] == [name_of(f) for f in from_method("thesis").filters]
+    run(
+        room_recording,
+        "--out",
+        tmp_path / "c",
+        "--object",
+        "--max-depth",
+        2.5,
+        "--every",
+        4,
+        *thesis,
+    )
+    filters = run_json(tmp_path / "c")["config"]["filters"]
+    assert filters[0]["maximum"] == 2.5
+    assert run_json(tmp_path / "c")["filters"]["distance"]["removed"] > 0.1
+    # Nothing beyond the limit is in the model: the camera hardly moves from where it began.
+    first = read_ply(tmp_path / "c/cloud.ply").points
+    assert np.linalg.norm(first, axis=1).max() < 4
+
+
+def test_an_object_is_told_from_its_background(tmp_path) -> None:
+    effects = Effects.none(shot_noise=True, scatter=0.02)
+    simulate("box", tmp_path / "rec", every=20, frames=9, effects=effects)
+    run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
+    made = run_json(tmp_path / "out")
+    assert made["config"]["filters"][0] == {"part": "background", "sigmas": 4.0, "share": 0.02}
+    *_, scattering, multipath = made["config"]["corrections"]
+    assert (scattering["part"], multipath["part"]) == ("scattering", "multipath")
+    assert 0.01 < sum(scattering["shares"]) < 0.04
+    assert 0.5 < made["filters"]["background"]["removed"] < 0.95
+    # The wall is 4 m away.
+    assert np.linalg.norm(read_ply(tmp_path / "out/cloud.ply").points, axis=1).max() < 2
+    # The run can be repeated from what it wrote.
+    again = ["--config", tmp_path / "out/run.json", "--threads", 1]
+    run(tmp_path / "rec", "--out", tmp_path / "again", "--object", *again)
+    assert same(tmp_path / "again") == same(tmp_path / "out")
+
+
+def test_what_lies_beyond_the_period_is_brought_back(room_recording, tmp_path) -> None:
+    frames, period = list(open_recording(room_recording))[::2], 2.8
+    source = ArraySource(wrapping(frames, period), metadata={"ambiguity_m": period})
+    convert(Recording.of(source, "wrapped", "test"), tmp_path / "rec")
+    farthest = {}
+    for name, options in (("near", []), ("far", ["--unwrap"])):
+        # As it is the recording is refused or spoilt; which of them is not asked here.
+        words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
+        assert main(words) == 0 or name == "near"
+        made = run_json(tmp_path / name)
+        told = {finding["code"] for finding in made["findings"]}
+        assert ("phase_wrap" in told) == (name == "near")
+        points = read_ply(tmp_path / name / "cloud.ply").points
+        farthest[name] = np.quantile(np.linalg.norm(points, axis=1), 0.9)
+    true = np.quantile(frames[0].radial_range[frames[0].valid], 0.9)
+    assert farthest["near"] < 2.9
+    assert farthest["far"] == pytest.approx(true, rel=0.1)
+
+
+def test_what_says_no_period_is_not_unwrapped(recording, tmp_path, capsys) -> None:
+    shutil.rmtree(recording / "amplitude")
+    run(recording, "--out", tmp_path / "out", "--unwrap", status=2)
+    assert "--unwrap: the recording can't be unwrapped" in capsys.readouterr().err
+
+
+def test_a_moving_camera_has_no_background(room_recording, tmp_path, capsys) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--object", status=2)
+    said = capsys.readouterr().err
+    assert "leave it out if the camera moves" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bad_frame_in_the_middle_is_skipped_and_counted(recording, tmp_path, capsys) -> None:
+    file = recording / "depth/000004.png"
+    file.write_bytes(file.read_bytes()[:200])
+    run(recording, "--out", tmp_path / "out")
+    assert "7 of 8 frames tracked, 1 unreadable" in capsys.readouterr().out
+    data = run_json(tmp_path / "out")
+    assert [f["status"] for f in data["frames"]] == ["tracked"] * 4 + ["skipped"] + ["tracked"] * 3
+    assert "000004.png" in data["frames"][4]["reason"]
+    assert "unreadable_frames" in [r["code"] for r in data["reasons"]]
+    times, _ = read_tum(tmp_path / "out/trajectory.txt")
+    assert len(times) == 7
+
+
+@pytest.mark.usefixtures("full_report")
+def test_the_report_tells_of_a_bad_frame(recording, tmp_path) -> None:
+    (recording / "depth/000002.png").write_bytes(b"")
+    run(recording, "--out", tmp_path / "out", "--end", 4)
+    report = (tmp_path / "out/report.html").read_text()
+    assert "Frame 2 could not be read." in report
+
+
+def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> None:
+    file = recording / "depth/000003.png"
+    write_png(file, np.zeros_like(read_image(file)))
+    run(recording, "--out", tmp_path / "out", status=3)
+    assert "7 of 8 frames tracked, 1 lost" in capsys.readouterr().out
+    data = run_json(tmp_path / "out")
+    assert data["frames"][3]["status"] == "lost"
+    assert data["frames"][3]["covariance"] is None
+    assert data["verdict"] == "degraded"
+    times, _ = read_tum(tmp_path / "out/trajectory.txt")
+    recorded, _ = read_tum(recording / "groundtruth.txt")
+    np.testing.assert_allclose(times, np.delete(recorded, 3), atol=1e-6)
+    assert read_g2o(tmp_path / "out/pose_graph.g2o").ids.tolist() == [0, 1, 2, 4, 5, 6, 7]
+
+
+@pytest.mark.usefixtures("full_report")
+def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--end", 1)
+    data = run_json(tmp_path / "out")
+    assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
+    # Nothing was registered, so nothing is known of the accuracy.
+    assert data["verdict"] == "degraded"
+    assert data["accuracy"] == {
+        "position_m": None,
+        "rotation_rad": None,
+        "relative": None,
+        "assessed": False,
+        "worst": None,
+        "unbounded": [],
+    }
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+    assert len(read_ply(tmp_path / "out/cloud.ply")) > 500
+    mesh = read_ply(tmp_path / "out/mesh.ply")
+    assert mesh.faces is not None
+    assert len(mesh.faces) > 1000
+
+
+def test_selection(room_recording, tmp_path) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--start", 1, "--end", 7, "--every", 2)
+    data = run_json(tmp_path / "out")
+    assert [f["index"] for f in data["frames"]] == [1, 3, 5]
+    assert data["input"]["frames"] == 3
+    times, poses = read_tum(tmp_path / "out/trajectory.txt")
+    np.testing.assert_allclose(times, [f["timestamp"] for f in data["frames"]], atol=1e-6)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+
+
+def test_several_inputs_and_a_folder_of_folders_are_joined(recording, tmp_path) -> None:
+    both = tmp_path / "both"
+    both.mkdir()
+    for name in ("b", "a"):
+        shutil.copytree(recording, both / name)
+    run(both / "a", both / "b", "--out", tmp_path / "listed", "--every", 3)
+    run(both, "--out", tmp_path / "folder", "--every", 3)
+    assert same(tmp_path / "listed") == same(tmp_path / "folder")
+    data = run_json(tmp_path / "listed")
+    assert [f["index"] for f in data["frames"]] == [0, 3, 6, 9, 12, 15]
+    times = [f["timestamp"] for f in data["frames"]]
+    assert sorted(times) == times
+    assert data["input"]["path"] == f"{both / 'a'} {both / 'b'}"
+
+
+def test_another_camera(recording, tmp_path) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    wide = tmp_path / "wide.json"
+    wide.write_text(json.dumps(camera | {"fx": camera["fx"] / 2, "fy": camera["fy"] / 2}))
+    run(recording, "--out", tmp_path / "own", "--end", 1)
+    run(recording, "--out", tmp_path / "wide", "--end", 1, "--camera", wide)
+    own, other = (read_ply(tmp_path / n / "cloud.ply").points for n in ("own", "wide"))
+    assert np.ptp(other[:, 0]) > 1.5 * np.ptp(own[:, 0])
+
+
+def test_loops_from_a_file(room_recording, tmp_path) -> None:
+    loops = tmp_path / "loops.txt"
+    T = read_tum(room_recording / "groundtruth.txt")[1][6]
+    loops.write_text(f"# by hand\n0 6 {T[0, 3]} {T[1, 3]} {T[2, 3]} 0 0 0 1\n")
+    run(room_recording, "--out", tmp_path / "out", "--loops", loops, "--method", "thesis")
+    (loop,) = run_json(tmp_path / "out")["loops"]
+    assert (loop["i"], loop["j"], loop["accepted"]) == (0, 6, True)
+    assert set(loop) == {
+        "i",
+        "j",
+        "accepted",
+        "reason",
+        "overlap",
+        "rms_m",
+        "free_space_violation",
+        "margin",
+    }
+    assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
+
+
+def test_odometry_beside_the_images(recording, tmp_path) -> None:
+    shutil.copy(recording / "groundtruth.txt", recording / "odometry.txt")
+    run(recording, "--out", tmp_path / "a", "--method", "thesis", "--guess", "odometry")
+    run(recording, "--out", tmp_path / "b", "--method", "thesis")
+    assert run_json(tmp_path / "a")["config"]["odometry"]["guess"] == "odometry"
+    assert same(tmp_path / "a") != same(tmp_path / "b")
+
+
+def test_the_reference_is_never_used(recording, tmp_path, plain_run) -> None:
+    (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
+    run(recording, "--out", tmp_path / "out")
+    assert same(tmp_path / "out") == same(plain_run)
+
+
+def test_json_lines_end_with_the_result(room_recording, tmp_path, capfd) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--json", "--every", 2)
+    done = capfd.readouterr()
+    assert done.err == ""
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    assert {line["event"] for line in lines} == {"stage", "frame", "note", "result"}
+    assert [line["index"] for line in lines if line["event"] == "frame"] == [0, 2, 4, 6]
+    last = lines[-1]
+    assert last["event"] == "result"
+    assert last["frames"] == {"tracked": 4, "predicted": 0, "lost": 0, "skipped": 0}
+    assert last["out"] == str(tmp_path / "out")
+    assert main(["inspect", "--json", str(room_recording)]) == 0
+    assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
+
+
+def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
+    run(recording, "--out", tmp_path / "out", "--every", 4)
+    done = capfd.readouterr()
+    notes = done.err.splitlines()
+    assert all(note.startswith("note: ") for note in notes)
+    assert sum("colour_of_case" in note for note in notes) == 1
+    assert sum("multipath not applied" in note for note in notes) == 1
+    assert len(notes) == 2
+    # Each reason, and what can be done about it.
+    assert len(done.out.splitlines()) <= 4 + 2 * len(run_json(tmp_path / "out")["reasons"])
+    assert "\x1b" not in done.out
+
+
+def torn_apart(recording, config, **_options) -> Reconstruction:
+    """Reconstruct the two halves of a recording, and let nothing connect them."""
+    n = len(recording)
+    main_part = reconstruct(recording.select(0, n // 2), config)
+    other = reconstruct(recording.select(n // 2), config)
+    indices = recording.indices.tolist()
+    components = (
+        Component(((indices[0], indices[n // 2 - 1]),), np.eye(4), None),
+        Component(((indices[n // 2], indices[-1]),), None, None, other),
+    )
+    d = main_part.diagnostics
+    reason = Reason("disconnected", components[1].frames, "The recording falls into 2 parts.")
+    frames = (
+        *(replace(f, component=0) for f in d.frames),
+        *(replace(f, component=1) for f in other.diagnostics.frames),
+    )
+    missing = np.full((n - n // 2, 4, 4), np.nan)
+    return replace(
+        main_part,
+        trajectory=np.concatenate([main_part.trajectory, missing]),
+        timestamps=recording.timestamps,
+        diagnostics=replace(
+            d,
+            frames=frames,
+            sequential=np.concatenate([d.sequential, missing]),
+            reasons=(*d.reasons, reason),
+            verdict="degraded",
+        ),
+        components=components,
+    )
+
+
+@pytest.mark.usefixtures("full_report")
+def test_a_part_that_nothing_connects_has_its_own_result(
+    room_recording, tmp_path, monkeypatch, capfd
+) -> None:
+    monkeypatch.setattr(run_module, "reconstruct", torn_apart)
+    out = tmp_path / "out"
+    run(room_recording, "--out", out, status=3)
+    said = capfd.readouterr().out.splitlines()
+    assert "  degraded: The recording falls into 2 parts." in said
+    at = said.index("  degraded: The recording falls into 2 parts.")
+    assert said[at + 1].strip() == ADVICE["disconnected"]
+    assert said[-1] == f"and {out / 'component-1/report.html'}, for frames 4-7"
+    assert {p.name for p in out.iterdir()} == FILES | {"component-1"}
+    assert {p.name for p in (out / "component-1").iterdir()} == FILES
+    for folder, frames in ((out, range(4)), (out / "component-1", range(4, 8))):
+        shown = read_content(folder)
+        assert list(shown.after) == list(frames)
+        np.testing.assert_allclose(shown.after[frames[0]], np.eye(4), atol=1e-12)
+    assert [f["component"] for f in run_json(out)["frames"]] == [0] * 4 + [1] * 4
+    assert [f["index"] for f in run_json(out / "component-1")["frames"]] == list(range(4, 8))
+    report = (out / "component-1/report.html").read_text()
+    assert ", component 1 –" in report
+    assert "component-1/report.html" in (out / "report.html").read_text()
+    run(room_recording, "--out", out, "--overwrite", "--json", status=3)
+    last = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert last["reasons"] == run_json(out)["reasons"]
+
+
+def test_an_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:
+    words = (room_recording, "--out", tmp_path / "out", "--every", 4)
+    run(*words)
+    before = contents(tmp_path)
+    run(*words, "--seed", 1, status=2)
+    assert "--overwrite" in capfd.readouterr().err
+    assert contents(tmp_path) == before
+    run(*words, "--seed", 1, "--overwrite")
+    assert contents(tmp_path) != before
+
+
+@pytest.mark.parametrize(
+    ("stage", "error"),
+    [
+        ("tracking", KeyboardInterrupt),
+        ("fusing", RuntimeError),
+        ("checking", TofuseError),
+        ("writing", KeyboardInterrupt),
+    ],
+)
+def test_an_interrupted_run_changes_nothing(
+    stage, error, plain_run, room_recording, tmp_path, monkeypatch
+) -> None:
+    words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--every", "4"]
+    shutil.copytree(plain_run, tmp_path / "out")
+    before = contents(tmp_path)
+
+    def interrupt(_self, name, total=None) -> None:
+        if name == stage:
+            raise error("now")
+
+    monkeypatch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+    words += ["--overwrite", "--seed", "1"]
+    if error is RuntimeError:
+        with pytest.raises(RuntimeError):
+            main(words)
+    else:
+        assert main(words) == (130 if error is KeyboardInterrupt else 2)
+    assert contents(tmp_path) == before
+    # With nothing there before, nothing is there after, and the command works as it is.
+    words = ["run", str(room_recording), "--out", str(tmp_path / "new/out"), "--every", "4"]
+    with contextlib.suppress(RuntimeError):
+        main(words)
+    assert not (tmp_path / "new").exists()
+    monkeypatch.undo()
+    assert main(words) == 0
+
+
+# Says when it is in the middle of tracking, and waits there.
+_SLOW = """
+import signal, sys, time
+from tofuse.cli import main
+from tofuse.cli.progress import QuietProgress
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
+def advance(self, record=None):
+    if record is not None and record.index == 2:
+        print("middle", flush=True)
+        time.sleep(60)
+QuietProgress.advance = advance
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
+    out, new = tmp_path / "out", tmp_path / "new"
+    run(room_recording, "--out", out, "--every", 4)
+    before = contents(out)
+    for target, options in ((out, ["--overwrite"]), (new, [])):
+        words = ["run", str(room_recording), "--out", str(target), "--seed", "1", *options]
+        job = subprocess.Popen(
+            [sys.executable, "-c", _SLOW, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert job.stdout is not None
+        assert job.stdout.readline() == "middle\n"
+        job.send_signal(how)
+        _, said = job.communicate(timeout=120)
+        if how == signal.SIGINT:
+            assert job.returncode == 130
+            assert said == f"tofuse: interrupted; {cli._UNCHANGED}\n"
+    found = contents(out)
+    # A process that was killed can't take its own things away; the next run does.
+    left = set() if how == signal.SIGINT else {STAGING, LOCK}
+    assert {k: v for k, v in found.items() if k.split("/")[0] not in left} == before
+    assert {p.name for p in new.iterdir()} == left if new.exists() else not left
+    run(room_recording, "--out", new, "--every", 4)
+    assert {p.name for p in new.iterdir()} == FILES
+    assert same(new) == {name: before[name] for name in SAME}
+    run(room_recording, "--out", out, "--every", 4, status=2)
+    run(room_recording, "--out", out, "--every", 4, "--overwrite")
+    assert {p.name for p in out.iterdir()} == FILES
+
+
+OPTIONS = {
+    "run": "--out --method --camera --config --format --seed --threads --start --end --every "
+    "--min-depth --max-depth --guess --loops --object --overwrite --json",
+    "demo": "--scene --out",
+    "simulate": "--out --camera --seed",
+    "inspect": "",
+    "evaluate": "--recording --json",
+    "optimize": "--out",
+    "experiments": "--out",
+}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_help_of_each_command(command, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    done = capsys.readouterr()
+    assert done.err == ""
+    for option in OPTIONS[command].split():
+        assert re.search(rf"{option}\b", done.out), option
+    if command in ("run", "demo"):
+        assert "exit status" in done.out
+    assert "None" not in done.out
+
+
+def test_help_and_version(capsys) -> None:
+    for words in (["--help"], ["--version"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 0
+    out = capsys.readouterr().out
+    for command in OPTIONS:
+        assert re.search(rf"^ +{command}\b", out, re.MULTILINE)
+    assert re.search(r"^tofuse \d+\.\d+", out, re.MULTILINE)
+
+
+def test_the_module_runs_too() -> None:
+    words = [sys.executable, "-m", "tofuse", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("tofuse ")
+    done = subprocess.run(words[:-1], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("usage: tofuse")
+
+
+def test_defaults_of_the_contract() -> None:
+    arguments = make_parser().parse_args(["demo"])
+    assert arguments.scene == "room"
+    assert set(DEMO_SCENES) == {"room", "empty-room", "rail", "torso", "box", "peaks"}
+    arguments = make_parser().parse_args(["run", "a", "b", "--out", "c"])
+    assert arguments.inputs == ["a", "b"]
+    assert (arguments.start, arguments.end, arguments.every) == (0, None, 1)
+
+
+def test_a_reader_of_the_output_that_goes_away_needs_no_words(room_recording) -> None:
+    words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(words, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_simulate_writes_what_run_reads(tmp_path, capsys) -> None:
+    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
+    assert main([*words, "--without", "all", "--seed", "3", "--uniform"]) == 0
+    assert "2 frames" in capsys.readouterr().out
+    run(tmp_path / "rec", "--out", tmp_path / "out", "--object", "--max-depth", 1.2)
+    assert len(run_json(tmp_path / "out")["frames"]) == 2
+
+
+def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
+    def interrupt(_self, _record=None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tofuse.cli.progress.QuietProgress.advance", interrupt)
+    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
+    assert main([*words, "--without", "all"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_demo_that_fails_says_where(tmp_path, capsys) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "--failure", "--out", str(out)]) == 0
+    assert "degraded" in capsys.readouterr().out
+    run = json.loads((out / "run.json").read_text())
+    reasons = {reason["code"]: reason for reason in run["reasons"]}
+    assert "unobserved_motion" in reasons
+    assert run["accuracy"]["position_m"] is None
+    assert reasons["unobserved_motion"]["ranges"] == [[2, 19]]
+    with pytest.raises(SystemExit) as stopped:
+        main(["demo", "--failure", "--scene", "torso", "--out", str(out)])
+    assert stopped.value.code == 2
+
+
+def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)
+    made = (FILES | {"recording"}) - {"mesh.ply", "mesh.glb"}
+    assert {p.name for p in out.iterdir()} == made
+    assert run_json(out)["config"]["filters"] == []
+    thesis = tmp_path / "thesis"
+    words = ["demo", "--scene", "peaks", "--method", "thesis", "--out", str(thesis)]
+    assert main(words) in (0, 3)
+    assert run_json(thesis)["config"]["odometry"]["registration"]["resolution"] == 1.0
+    before = contents(tmp_path)
+    assert main(["demo", "--scene", "peaks", "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+    def interrupt(_self, name, total=None) -> None:
+        if name == "fusing":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+        words = ["demo", "--scene", "peaks", "--seed", "1"]
+        assert main([*words, "--out", str(out), "--overwrite"]) == 130
+        assert contents(tmp_path) == before  # the recording too
+        assert main([*words, "--out", str(tmp_path / "new")]) == 130
+    assert not (tmp_path / "new").exists()
+    assert main([*words, "--out", str(out), "--overwrite"]) in (0, 3)
+    assert run_json(out)["seed"] == 1
+    assert {p.name for p in out.iterdir()} == made
+
+
+def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
+    words = ["evaluate", str(plain_run), str(room_recording), "--recording", str(room_recording)]
+    assert main([*words, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["ate_rms_m"] < 0.1
+    assert data["coverage"] == 1
+    assert data["map_consistency"]["inlier_share"] > 0.5
+    assert main(words) == 0
+    table = capsys.readouterr().out
+    for part in ("ATE rms", "RPE over 1 frame", "RPE over 30 frames", "map consistency"):
+        assert part in table
+
+
+def test_evaluate_against_what_a_recording_comes_with(plain_run, room_recording, tmp_path, capsys):
+    """In any format, not only the native one."""
+    out = tmp_path / "tum"
+    assert main(["convert", str(room_recording), "--out", str(out), "--to", "tum"]) == 0
+    words = ["evaluate", str(plain_run), "--json"]
+    assert main(["evaluate", str(plain_run), str(room_recording), "--json"]) == 0
+    expected = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert main(["evaluate", str(plain_run), str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["ate_rms_m"] == pytest.approx(expected["ate_rms_m"], abs=1e-5)
+    bare = tmp_path / "bare"
+    shutil.copytree(room_recording, bare)
+    (bare / "groundtruth.txt").unlink()
+    assert main([*words, str(bare)]) == 2
+    assert "has no reference poses" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "none.txt")]) == 2
+    assert "none.txt: doesn't exist" in capsys.readouterr().err
+
+
+def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
+    out = tmp_path / "out.g2o"
+    assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert re.match(r"8 poses, \d+ edges: squared error", told)
+    # The edges are what the refinement measured, so nothing is left to gain.
+    before, after = read_g2o(plain_run / "pose_graph.g2o"), read_g2o(out)
+    assert after.ids.tolist() == list(range(8))
+    assert np.abs(after.poses - before.poses).max() < 2e-3
+    assert main(["optimize", str(out), "--out", str(out)]) == 2
+    words = ["optimize", str(out), "--out", str(out), "--overwrite", "--optimiser"]
+    assert main([*words, "castellani"]) == 0
+    capsys.readouterr()
+    assert main([*words, "guesswork"]) == 2
+    assert "castellani" in capsys.readouterr().err
+
+
+def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
+    unit = " ".join(str(v) for v in 1e4 * np.eye(6)[np.triu_indices(6)])
+    lines = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in (0, 1, 2, 3, 4, 9)]
+    edges = [(0, 1, 1.01), (1, 2, 0.99), (2, 3, 1.0), (3, 4, 1.0)]
+    edges += [(0, 2, 2.01), (0, 3, 3.0), (1, 4, 3.01), (0, 4, -7.0)]
+    lines += [f"EDGE_SE3:QUAT {i} {j} {x} 0 0 0 0 0 1 {unit}" for i, j, x in edges]
+    (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
+    words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "1 edge does not fit the others" in told
+    assert re.search(r"part from vertex 0: 5 poses, 8 edges", told)
+    assert re.search(r"part from vertex 9: 1 poses, 0 edges", told)
+    assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
+
+
+def test_how_fine_the_model_is(plain_run, room_recording, tmp_path) -> None:
+    whole = read_ply(plain_run / "mesh.ply")
+    sizes = {}
+    for name, options in (("faces", ["--faces", "500"]), ("voxel", ["--voxel", "5cm"])):
+        out = tmp_path / name
+        assert main(["run", str(room_recording), "--out", str(out), *options]) == 0
+        sizes[name] = len(read_ply(out / "mesh.ply").faces), len(read_ply(out / "cloud.ply"))
+    assert sizes["faces"][0] <= 500
+    assert sizes["faces"][1] == len(read_ply(plain_run / "cloud.ply"))
+    assert sizes["voxel"][0] < 0.5 * len(whole.faces)
+    fusion = run_json(tmp_path / "voxel")["config"]["fusion"]
+    assert fusion["voxel_m"] == 0.05
+
+
+@pytest.mark.parametrize(
+    "options", [["--faces", "0"], ["--faces", "x"], ["--voxel", "0"], ["--voxel", "-1mm"]]
+)
+def test_a_model_of_no_size_is_refused(options, room_recording, tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options])
+    assert stopped.value.code == 2
+    assert options[0] in capsys.readouterr().err

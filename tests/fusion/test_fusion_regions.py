@@ -1,0 +1,217 @@
+"""Fusion in regions that fit into memory: what they hold, who sees them, and that no seam shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range
+from made_rooms import at, seen
+from tofuse.files.spill import Spill
+from tofuse.fusion.frusta import Frusta
+from tofuse.fusion.layout import Layout
+from tofuse.fusion.model import ModelBuilder
+from tofuse.fusion.options import Fusion
+from tofuse.fusion.range_view import RangeView
+from tofuse.fusion.stitching import Piece, stitch
+from tofuse.fusion.tsdf import Volume, _free_space_limits, fuse_surface
+from tofuse.kernels import tsdf
+from tofuse.kernels.blocks import EDGE, block_key, block_of
+from tofuse.kernels.threads import threads
+from tofuse.pipeline.states import decode, encode
+
+COLUMNS = ("vertices", "faces", "normals", "color", "sigma", "views")
+
+
+def a_room(count=24):
+    """Views (views, poses) of a furnished room, turning on the spot in two places."""
+    poses = np.array(
+        [at(-0.5 + (k % 2), 0.2 * (k % 3) - 0.2, 2 * np.pi * k / count) for k in range(count)]
+    )
+    return [RangeView.of(seen(T, k)) for k, T in enumerate(poses)], poses
+
+
+@pytest.fixture(scope="module")
+def room():
+    return a_room()
+
+
+def same(a, b):
+    for name in COLUMNS:
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+@pytest.mark.parametrize(("memory_mb", "least"), [(8, 2), (3, 5), (1, 30)])
+def test_regions_make_the_same_surface_to_the_byte(room, memory_mb, least) -> None:
+    views, poses = room
+    options = Fusion(voxel_m=0.03, island=60)
+    whole = fuse_surface(views, poses, options)
+    small = replace(options, memory_mb=memory_mb)
+    layout = Layout.of(views, poses, 0.03, small)
+    assert len(layout.regions(memory_mb * 1_000_000 // layout.block_bytes)) >= least
+    same(fuse_surface(views, poses, small), whole)
+    with threads(1):
+        same(fuse_surface(views, poses, small), whole)
+
+
+def test_turns_colours_and_views_of_two_cameras_make_no_seam() -> None:
+    """Views have turns by the numbers of blocks and views, whichever are looked at together."""
+    frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
+    rng = np.random.default_rng(4)
+    color = rng.integers(0, 255, (72, 88, 3)).astype(np.uint8)
+    other = replace(CAMERA, fx=93.0)
+    frames = [
+        replace(f, camera=other if k % 40 > 25 else CAMERA, color_image=None if k % 9 else color)
+        for k, f in enumerate(frames)
+    ]
+    views = [RangeView.of(frame) for frame in frames]
+    for options in (Fusion(voxel_m=0.009), Fusion(voxel_m=0.009, min_views=30, island=0)):
+        same(
+            fuse_surface(views, poses, replace(options, memory_mb=2)),
+            fuse_surface(views, poses, options),
+        )
+
+
+def test_voxels_don_t_grow_where_memory_is_short(room) -> None:
+    views, poses = room
+    small = Layout.of(views, poses, 0.03, Fusion(memory_mb=1))
+    assert small.voxel_m == 0.03
+    most = 1_000_000 // small.block_bytes
+    for region in small.regions(most):
+        volume = Volume.of(small, region)
+        arrays = (volume.distance, volume.weight, volume.seen, volume.color, volume.free)
+        assert sum(a.nbytes for a in arrays) <= 1e6
+
+
+def test_each_block_is_of_one_region_and_has_its_neighbours_around(room) -> None:
+    views, poses = room
+    layout = Layout.of(views, poses, 0.03, Fusion())
+    place = {block_of(int(key)): k for k, key in enumerate(layout.keys)}
+    regions = layout.regions(300)
+    owned = np.concatenate([region.rows[: region.own] for region in regions])
+    np.testing.assert_array_equal(np.sort(owned), np.arange(len(layout.keys)))
+    for region in regions:
+        assert len(region.rows) <= 300
+        assert (np.diff(region.rows[: region.own]) > 0).all()
+        assert len(np.unique(region.rows)) == len(region.rows)
+        held = set(region.rows.tolist())
+        for row in region.rows[: region.own]:
+            i, j, k = block_of(int(layout.keys[row]))
+            around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
+            near = [place.get((i + a, j + b, k + c)) for a, b, c in around.tolist()]
+            assert held.issuperset(n for n in near if n is not None)
+            assert (region.low < [i, j, k]).all()
+            assert (region.high > [i + 1, j + 1, k + 1]).all()
+    # Halves of halves: no region is much smaller than the others.
+    sizes = [region.own for region in regions]
+    assert min(sizes) > max(sizes) / 5
+    assert len(layout.regions(1)) == len(layout.keys)  # no further than to single blocks
+    assert len(layout.regions(len(layout.keys))) == 1
+
+
+@pytest.mark.parametrize("which", ["room", "ball", "grazing"])
+def test_views_that_are_passed_over_would_have_told_nothing(room, which) -> None:
+    if which == "room":
+        views, poses = room
+    elif which == "ball":
+        frames, poses = around_a_ball(20, noise=np.random.default_rng(7))
+        views = [RangeView.of(f) for f in frames]
+    else:  # noisy pixels, and planes along the line of sight, speak of what is far behind them
+        poses = np.array([look([0.4 * k, 0, 0], [0.4 * k + 1.5, 0.3, 2]) for k in range(6)])
+        floor = [plane_range(T, np.array([0, 1.0, 0]), 0.4) for T in poses]
+        near = [np.where(f < 6, f, np.inf) for f in floor]
+        views = [RangeView.of(frame_of(f, k, sigma=0.03)) for k, f in enumerate(near)]
+    layout = Layout.of(views, poses, 0.01 if which == "ball" else 0.03, Fusion())
+    frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
+    passed = 0
+    for region in layout.regions(40):
+        edge = EDGE * layout.voxel_m
+        touching = frusta.touching(edge * (region.low - 1.0), edge * (region.high + 1.0))
+        passed += (~touching).sum()
+        volume = Volume.of(layout, region)
+        volume.add(views, poses, touching=~touching)
+        assert not volume.weight.any()
+        assert not volume.free.any()
+        assert not volume.seen.any()
+    assert passed > len(views)
+
+
+def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
+    """Blocks also where no surface is: what is told of free space reaches to the camera."""
+    rng = np.random.default_rng(11)
+    T = look([0.2, -0.1, 0.3], [0.6, 0.2, 2.3])
+    view = RangeView.of(frame_of(rng.uniform(0.8, 2.0, (72, 88)), sigma=0.01))
+    frusta = Frusta.of([view], T[None], _free_space_limits(0.05))
+    told = 0
+    for _ in range(200):
+        i, j, k = (int(n) for n in rng.integers(-14, 15, 3))
+        keys = np.array([block_key(i, j, k + 4)], np.int64)
+        layout = Layout(0.02, 0.05, keys, 1, 1)
+        volume = Volume.of(layout, layout.whole())
+        volume.add([view], T[None])
+        low = 0.16 * np.array([i, j, k + 4])
+        something = bool(volume.weight.any() or volume.free.any())
+        told += something
+        assert frusta.touching(low, low + 0.16)[0] or not something
+    assert 3 < told < 100
+
+
+def test_a_view_that_shows_nothing_touches_nothing() -> None:
+    empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
+    frusta = Frusta.of([empty], EYE[None], _free_space_limits(0.05))
+    assert not frusta.touching(np.full(3, -9.0), np.full(3, 9.0)).any()
+    assert fuse_surface([empty], EYE[None], Fusion(memory_mb=1)).faces.shape == (0, 3)
+
+
+def test_an_island_is_told_by_all_its_parts() -> None:
+    """A strip over several regions is larger than an island; in each of them it is smaller."""
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[:34] = np.inf
+    ranges[40:] = np.inf
+    view = RangeView.of(frame_of(ranges))
+    layout = Layout.of([view], EYE[None], 0.01, Fusion())
+    pieces: Spill[Piece] = Spill(0)
+    largest = 0
+    for region in layout.regions(30):
+        volume = Volume.of(layout, region)
+        volume.add([view], EYE[None])
+        piece = volume.piece()
+        largest = max(largest, len(piece))
+        pieces.put(piece)
+    assert len(pieces) > 5
+    mesh = stitch(pieces, len(layout.keys), 2 * largest)
+    assert len(mesh) > 3 * largest
+    assert len(stitch(pieces, len(layout.keys), 2 * len(mesh))) == 0
+
+
+def test_progress_is_told_for_each_view_once(room) -> None:
+    views, poses = room
+    calls = []
+    fuse_surface(views, poses, Fusion(voxel_m=0.03, memory_mb=1), lambda: calls.append(1))
+    assert len(calls) == len(views)
+
+
+def test_counts_stop_at_what_they_hold() -> None:
+    view = RangeView.of(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)))
+    volume = Volume.around([view], EYE[None], 0.05, Fusion())
+    volume.add([view], EYE[None])
+    near = volume.seen > 0
+    volume.seen[near] = tsdf.MAX_SEEN
+    volume.add([view], EYE[None])
+    assert (volume.seen[near] == tsdf.MAX_SEEN).all()
+
+
+@pytest.mark.parametrize("memory_mb", [1, 600])
+def test_what_is_on_disk_comes_back_with_a_state_of_the_run(room, memory_mb) -> None:
+    _, poses = room
+    builder = ModelBuilder(Fusion(voxel_m=0.05, memory_mb=memory_mb))
+    for k, T in enumerate(poses):
+        builder.add(seen(T, k), None, 1000)
+    nodes, arrays = encode(builder)
+    again = decode(nodes, {name: np.asarray(array) for name, array in arrays.items()})
+    made = [each.fuse(dict(enumerate(poses))).mesh for each in (builder, again)]
+    same(*made)
+    again.add(seen(poses[0], len(poses)), None, 1000)
+    assert again.views == len(poses) + 1

@@ -1,0 +1,658 @@
+"""The surface of range images: where it is, that it closes, what it leaves out, and its bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
+from tofuse.files.spill import Spill
+from tofuse.fusion import layout
+from tofuse.fusion.model import ModelBuilder
+from tofuse.fusion.options import Fusion
+from tofuse.fusion.range_view import DECODED, RangeView, with_camera_correction
+from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
+from tofuse.fusion.upright import upright
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole, ray_lengths
+from tofuse.kernels import tsdf
+from tofuse.kernels.blocks import (
+    block_key,
+    block_of,
+    index_of,
+    mark_eighths,
+    parent_of,
+    voxel_of,
+)
+from tofuse.kernels.threads import threads
+from tofuse.posegraph.refinement import without_errors
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+
+
+@pytest.fixture(scope="module")
+def ball():
+    frames, poses = around_a_ball(noise=np.random.default_rng(1))
+    views = [RangeView.of(f) for f in frames]
+    return views, poses, fuse_surface(views, poses, Fusion(voxel_m=0.012))
+
+
+def edges_of(faces):
+    """Directed edges (3 M, 2) of triangles."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def test_the_zero_of_exact_distances_is_closed_across_blocks() -> None:
+    frames, poses = around_a_ball()
+    volume = Volume.around([RangeView.of(f) for f in frames], poses, 0.012, Fusion())
+    r = np.linalg.norm(voxels_of(volume), axis=-1)
+    volume.distance[:] = r - 0.3
+    volume.weight[:] = 1e6
+    volume.seen[:] = 1
+    mesh = volume.surface()
+    edges = edges_of(mesh.faces)
+    there, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 1).all()  # a directed edge is of one face: all turn the same way
+    np.testing.assert_array_equal(there, np.unique(edges[:, ::-1], axis=0))  # no border
+    # Euler: V - E + F = 2 for a ball.
+    assert len(mesh) - len(edges) // 2 + len(mesh.faces) == 2
+    assert len(mesh) > 5000
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.3, atol=2e-4)
+    np.testing.assert_allclose(mesh.normals, mesh.vertices / 0.3, atol=0.02)
+    np.testing.assert_allclose(mesh.sigma, 1e-3)
+
+
+def test_noise_never_opens_the_surface(ball) -> None:
+    edges = edges_of(ball[2].faces)
+    there, count = np.unique(edges, axis=0, return_counts=True)
+    back, count_back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+    np.testing.assert_array_equal(there, back)
+    np.testing.assert_array_equal(count, count_back)
+    assert (count > 1).mean() < 0.001  # where it touches itself
+
+
+def test_a_noisy_ball_has_its_radius_and_normals_outwards(ball) -> None:
+    _, _, mesh = ball
+    p = mesh.vertices.astype(float)
+    r = np.linalg.norm(p, axis=1)
+    assert np.abs(r - 0.3).mean() < 0.002  # noise of 5 mm in each image
+    assert np.percentile(np.abs(r - 0.3), 99) < 0.006
+    outwards = p / r[:, None]
+    assert ((mesh.normals * outwards).sum(1) > np.cos(np.radians(25))).mean() > 0.98
+    a, b, c = (p[mesh.faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    assert ((face_normals * a).sum(1) > 0).mean() > 0.999
+    area = np.linalg.norm(face_normals, axis=1).sum() / 2
+    assert area == pytest.approx(4 * np.pi * 0.09, rel=0.03)
+    assert mesh.views.max() > 2
+    assert 0.0005 < np.median(mesh.sigma) < 0.005
+
+
+def test_threads_change_no_byte(ball) -> None:
+    views, poses, mesh = ball
+    for count in (1, 3):
+        with threads(count):
+            again = fuse_surface(views, poses, Fusion(voxel_m=0.012))
+        for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
+            assert getattr(again, name).tobytes() == getattr(mesh, name).tobytes(), name
+
+
+def pixels_of(view):
+    """(H, W, 5) plane n . p = h of each pixel as n, h, and its weight, 0 where unknown."""
+    n = view.normals / 127.0
+    along = (n[..., :2] * view.projection.rays).sum(-1) + n[..., 2]
+    weight = DECODED[view.strength] * ((view.z > 0) & (along > 0))
+    return np.concatenate([n, (view.z * view.unit * along)[..., None], weight[..., None]], -1)
+
+
+def voxels_of(volume):
+    """(B, 512, 3) where the voxels are, in m."""
+    ijk = np.array([block_of(int(key)) for key in volume.keys])
+    inside = np.array([voxel_of(v) for v in range(512)])
+    return (8 * ijk[:, None] + inside[None]) * volume.voxel_m
+
+
+def slow_distances(volume, views, poses):
+    """Sums over all views for every voxel, by the camera's own projection."""
+    world = voxels_of(volume)
+    top, weight, seen = (np.zeros(world.shape[:2]) for _ in range(3))
+    margin = np.full(world.shape[:2], np.inf)
+    for view, T in zip(views, poses, strict=True):
+        p = se3.transform(se3.inverse(T), world.reshape(-1, 3)).reshape(world.shape)
+        uv = CAMERA.project(p)
+        good = (p[..., 2] > 1e-3) & np.isfinite(uv).all(-1)
+        u = np.where(good, uv[..., 0], 0)
+        w = np.where(good, uv[..., 1], 0)
+        # Voxels that land between two pixels may go to either.
+        for x in (u, w):
+            margin = np.minimum(margin, np.where(good, 0.5 - np.abs(x - np.round(x)), np.inf))
+        c, r = np.round(u).astype(int), np.round(w).astype(int)
+        good &= (c >= 0) & (r >= 0) & (c < 88) & (r < 72)
+        pixel = pixels_of(view)[np.where(good, r, 0), np.where(good, c, 0)]
+        d = pixel[..., 3] - (pixel[..., :3] * p).sum(-1)
+        good &= (pixel[..., 4] > 0) & (d >= -volume.reach_m)
+        wt = np.where(good, pixel[..., 4], 0)
+        top += wt * np.minimum(d, volume.reach_m)
+        weight += wt
+        seen += good & (d < volume.reach_m)
+    return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
+
+
+def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
+    # A ball before a wall, gone after two views: it is seen through, hides, and makes jumps.
+    rng = np.random.default_rng(2)
+    poses = np.array([look([x, 0.1 * x, 0], [0.2 * x, 0, 2]) for x in np.linspace(-1.2, 1.2, 5)])
+    views = []
+    for k, T in enumerate(poses):
+        wall = plane_range(T, np.array([0, 0, 1.0]), 2.0)
+        ball = sphere_range(T, np.array([0, 0, 1.2]), 0.3 if k < 2 else 0.0)
+        views.append(RangeView.of(frame_of(np.minimum(wall, ball), noise=rng)))
+    volume = Volume.around(views, poses, 0.01, Fusion())
+    volume.add(views, poses)
+    assert (volume.free > 0).sum() > 10
+    volume.surface()  # settles what was seen through
+    distance, weight, seen, margin = slow_distances(volume, views, poses)
+    near = (seen > 0) & (margin > 0.05)
+    assert near.sum() > 10_000
+    assert (volume.seen[near] != seen[near]).mean() < 1e-3  # at the cut, by rounding
+    # Blocks that were seen through count the least weight of what lies behind them.
+    assert (volume.weight[near] > weight[near] * (1 + 1e-5)).mean() < 1e-3  # at the cut again
+    exact = near & np.isclose(volume.weight, weight, rtol=1e-4) & (volume.seen == seen)
+    assert exact.sum() > 0.6 * near.sum()
+    np.testing.assert_allclose(volume.distance[exact], distance[exact], atol=2e-5)
+    # That changes few distances.
+    assert np.abs(volume.distance - distance)[near].mean() < 0.01 * volume.reach_m
+
+
+def test_blocks_lie_near_surfaces_only_and_don_t_grow_with_views(ball) -> None:
+    views, poses, _ = ball
+    once = Volume.around(views, poses, 0.012, Fusion())
+    twice = Volume.around([*views, *views], np.concatenate([poses, poses]), 0.012, Fusion())
+    np.testing.assert_array_equal(once.keys, twice.keys)
+    assert (np.diff(once.keys) > 0).all()
+    corners = np.array([[(k >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)] for k in once.keys])
+    centre = (corners + 0.5) * 8 * 0.012
+    off = np.abs(np.linalg.norm(centre, axis=1) - 0.3)
+    assert off.max() < once.reach_m + 0.02 + np.sqrt(3) * 4 * 0.012
+
+
+def test_free_space_carves_away_what_one_view_made_up() -> None:
+    wall = [plane_range(look([x, 0, 0], [x, 0, 2]), np.array([0, 0, 1.0]), 2.0) for x in (0, 0.1)]
+    poses = np.array([look([x, 0, 0], [x, 0, 2]) for x in (0, 0.1)] * 4)
+    frames = [frame_of(wall[k % 2], k) for k in range(8)]
+    ghost = wall[0].copy()
+    ghost[26:48, 30:56] = 1.4  # large enough to be no island
+    views = [RangeView.of(f) for f in frames]
+    options = Fusion(voxel_m=0.02, island=10)
+    alone = fuse_surface([RangeView.of(frame_of(ghost, 0))], poses[:1], options)
+    assert (np.abs(alone.vertices[:, 2] - 1.4) < 0.05).sum() > 50
+    views[0] = RangeView.of(frame_of(ghost, 0))
+    mesh = fuse_surface(views, poses, options)
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.02
+    assert len(mesh) > 1000
+
+
+def test_noisy_views_make_one_surface_not_several() -> None:
+    """Behind its surface a view knows nothing only from where on it is surely behind."""
+    code = 137
+    assert 1 / np.sqrt(DECODED[code]) == pytest.approx(0.05, rel=0.1)
+    views = []
+    for k in range(7):
+        z = 3.13 if k == 3 else 3.0  # 2.6 sigmas
+        view = RangeView.of(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), z), k))
+        noisy = np.where(view.strength > 0, code, 0).astype(np.uint8)
+        views.append(replace(view, strength=noisy))
+    poses = np.array([EYE] * 7)
+    volume = Volume.around(views, poses, 0.03, Fusion())
+    assert volume.reach_m < 0.1
+    volume.add(views, poses)
+    z = volume.surface().vertices[:, 2]
+    assert len(z) > 1000
+    assert np.abs(z - 3).max() < 0.05
+    # What is surely behind stays: a precise view says nothing of it.
+    sure = [replace(v, strength=np.where(v.strength > 0, 200, 0).astype(np.uint8)) for v in views]
+    volume = Volume.around(sure, poses, 0.03, Fusion())
+    volume.add(sure, poses)
+    assert (np.abs(volume.surface().vertices[:, 2] - 3.13) < 0.01).sum() > 500
+
+
+def test_at_a_jump_surfaces_end_with_the_pixels_that_measured_them() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[:, 40:] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, 40:]
+    ranges[:, 40] = 1.5  # mixes both
+    view = RangeView.of(frame_of(ranges, noise=np.random.default_rng(4)))
+    weight = DECODED[view.strength[10:60]]
+    assert (weight[:, 40] == 0).all()
+    middle = np.median(weight[:, 10:36])
+    for beside, wall in ((39, 2.0), (41, 1.0)):
+        assert (weight[:, beside] > 0).mean() > 0.9
+        assert (weight[:, beside] < 0.5 * middle).all()
+        # Drawn to the plane, as the others are: the noise was 5 mm.
+        assert np.std(view.z[10:60, beside] * view.unit - wall) < 0.0035
+    assert (weight[:, 10:36] > 0.5 * middle).mean() > 0.98
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0))
+    z = mesh.vertices[:, 2]
+    assert (np.minimum(np.abs(z - 1), np.abs(z - 2)) < 0.01).all()
+
+
+def test_weights_follow_noise_and_incidence() -> None:
+    straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    slanted = plane_range(EYE, np.array([np.sin(1.0), 0, np.cos(1.0)]), 2 * np.cos(1.0))
+    centre = (36, 43)
+    quiet = RangeView.of(frame_of(straight, sigma=0.005))
+    loud = RangeView.of(frame_of(straight, sigma=0.02))
+    assert 2 < pixels_of(quiet)[centre][4] / pixels_of(loud)[centre][4] < 16
+    tilted = RangeView.of(frame_of(slanted, sigma=0.005))
+    cut = pixels_of(tilted)[centre][4] / pixels_of(quiet)[centre][4]
+    assert cut == pytest.approx(np.cos(1.0) ** -2, rel=0.15)
+    np.testing.assert_allclose(
+        pixels_of(tilted)[centre][:3], [np.sin(1.0), 0, np.cos(1.0)], atol=0.02
+    )
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.01, 0.03])
+def test_weights_say_what_noise_is_left(sigma) -> None:
+    straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    rng = np.random.default_rng(6)
+    view = RangeView.of(frame_of(straight, sigma=sigma, noise=rng))
+    off = view.z[5:-5, 5:-5] * view.unit - 2.0
+    pixels = pixels_of(view)[5:-5, 5:-5].astype(float)
+    lengths = np.linalg.norm(np.insert(CAMERA.rays(), 2, 1, -1), axis=-1)[5:-5, 5:-5]
+    cosine = np.clip(pixels[..., 2] / lengths, 0.5, 1)
+    said = 1 / (cosine * np.sqrt(np.maximum(pixels[..., 4], 1e-9)))
+    fitted = pixels[..., 4] > 0
+    assert fitted.mean() > 0.9
+    ratio = off[fitted].std() / np.median(said[fitted])
+    assert 0.2 < ratio < 1.6  # what relief could be there is not noise, but not known
+    assert off[fitted].std() < sigma
+
+
+def test_islands_go_and_large_pieces_stay() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[28:40, 28:40] = 1.0 * ray_lengths(CAMERA)[28:40, 28:40]
+    view = RangeView.of(frame_of(ranges))
+    both = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=0))
+    assert (both.vertices[:, 2] < 1.2).any()
+    large = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=200))
+    assert (large.vertices[:, 2] > 1.9).all()
+    assert len(large) > 1000
+    assert large.faces.max() == len(large) - 1
+
+
+def test_colour_is_the_mean_of_what_the_views_saw() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    red = np.zeros((72, 88, 3), np.uint8)
+    red[..., 0] = 200
+    blue = red[..., ::-1].copy()
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate((red, blue))]
+    mesh = fuse_surface(views, np.stack([EYE, EYE]), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[100, 0, 100]])
+    assert (mesh.views == 2).all()
+
+
+def test_views_without_colour_do_not_darken() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    red = np.zeros((72, 88, 3), np.uint8)
+    red[..., 0] = 200
+    colors = (None, np.zeros_like(red), red, None)
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate(colors)]
+    mesh = fuse_surface(views, np.stack([EYE] * 4), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[200, 0, 0]])
+    assert (mesh.views == 4).all()
+
+
+def test_albedo_is_grey_and_does_not_fall_with_range() -> None:
+    # Two walls of one albedo, at 1 m and 2 m, and a dark patch.
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[:, :40] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, :40]
+    albedo = np.full((72, 88), 4000.0)
+    albedo[50:, 60:] = 500
+    view = RangeView.of(frame_of(ranges, amplitude_image=(albedo / ranges**2).astype(np.float32)))
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03))
+    near, far = mesh.vertices[:, 2] < 1.5, mesh.vertices[:, 2] > 1.5
+    assert np.median(mesh.color[near]) == np.median(mesh.color[far])
+    assert mesh.color.min() < 60
+
+
+def test_min_views_leaves_out_what_few_saw() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    side = se3.exp(np.array([0.8, 0, 0, 0, 0, 0]))
+    views = [RangeView.of(frame_of(ranges, k)) for k in range(2)]
+    poses = np.stack([EYE, side])
+    either = fuse_surface(views, poses, Fusion(voxel_m=0.03))
+    both = fuse_surface(views, poses, Fusion(voxel_m=0.03, min_views=2))
+    assert np.ptp(either.vertices[:, 0]) > np.ptp(both.vertices[:, 0]) + 1.0
+    assert (both.views == 2).all()
+
+
+def test_a_voxel_fits_the_sensor() -> None:
+    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
+
+    def views(z):
+        depth = np.full((80, 100), z, np.float32)
+        return [RangeView.of(RangeFrame(0, 0.0, camera, depth))]
+
+    assert fitting_voxel(views(2.0)) == pytest.approx(0.01, rel=0.02)  # 2 m / 200
+    assert fitting_voxel(views(0.02)) == 0.002
+    assert fitting_voxel(views(200.0)) == 0.1
+    assert fitting_voxel([]) > 0
+
+
+def test_large_images_are_kept_at_half_their_size() -> None:
+    camera = Pinhole(640, 480, 580.0, 580.0, 320.0, 240.0)
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[200:, 300:] = 0
+    color = np.zeros((480, 640, 3), np.uint8)
+    color[:, :320] = 90
+    view = RangeView.of(RangeFrame(0, 0.0, camera, depth, color_image=color))
+    assert view.z.shape == (240, 320)
+    assert view.nbytes <= 10 * 240 * 320
+    assert view.light[100, 100].tolist() == [90, 90, 90]
+    assert (view.z[100:, 150:] == 0).all()
+    mesh = fuse_surface([view], EYE[None])
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
+
+
+def test_views_that_show_nothing_make_an_empty_mesh() -> None:
+    empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
+    mesh = fuse_surface([empty], EYE[None])
+    assert (len(mesh), len(mesh.faces)) == (0, 0)
+    assert mesh.cloud().points.shape == (0, 3)
+
+
+def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
+    frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
+    posed = dict(enumerate(poses))
+    models = []
+    for options in (Fusion(voxel_m=0.02), Fusion(voxel_m=0.02, memory_mb=1)):
+        spill = Spill(options.memory_mb * 500_000)
+        builder = ModelBuilder(options, spill)
+        for frame in frames:
+            builder.add(frame, None, 1000)
+        assert builder.views == 60
+        assert builder.nbytes == 60 * RangeView.of(frames[0]).nbytes
+        advanced: list[None] = []
+        errors = {"scale": 0.01}
+        models.append(
+            [
+                builder.fuse(posed, partial(advanced.append, None)),
+                builder.fuse(posed, errors=errors),
+                builder.fuse(posed),
+            ]
+        )
+        assert len(advanced) == 60
+        assert (spill.spilled_bytes > 0) == (options.memory_mb == 1)
+        assert spill.resident_bytes <= options.memory_mb * 500_000
+        assert len(spill) == 60  # what was corrected is forgotten
+        assert len(builder.sketch(posed)) > 500
+    for large, small in zip(*models, strict=True):
+        for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
+            a, b = getattr(large.mesh, name), getattr(small.mesh, name)
+            np.testing.assert_array_equal(a, b)
+    assert models[0][0].mesh.views.max() > 20
+
+
+def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
+    rng = np.random.default_rng(5)
+    frame = frame_of(rng.uniform(1, 3, (72, 88)))
+    errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
+    view = RangeView.of(frame)
+    found = list(with_camera_correction([view, view], errors))
+    expected = without_errors(view.as_cloud().points, errors)
+    np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
+    assert found[0].projection is found[1].projection
+    # Points still land on the pixels that measured them.
+    p = found[0].projection
+    x, y = p.rays[20, 30]
+    node = (x - p.frame[0]) * p.frame[2], (y - p.frame[1]) * p.frame[3]
+    i, j = (int(n) for n in node)
+    a, b = node[0] - i, node[1] - j
+    corners = p.lookup[j : j + 2, i : i + 2].astype(float)
+    landed = np.einsum("j,i,jik->k", [1 - b, b], [1 - a, a], corners)
+    np.testing.assert_allclose(landed, [30, 20], atol=0.1)
+    builder = ModelBuilder(Fusion())
+    builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)), None, 1000)
+    z = builder.fuse({0: EYE}, errors={"scale": 0.05}).mesh.vertices[:, 2]
+    np.testing.assert_allclose(z, 2.1, atol=0.003)
+
+
+def test_a_builder_keeps_all_clouds_in_so_much_memory() -> None:
+    rng = np.random.default_rng(4)
+    clouds = [replace(CloudFrame.of(rng.normal(size=(4000, 3))), index=k) for k in range(30)]
+    poses = {k: se3.exp(0.1 * rng.normal(size=6)) for k in range(0, 30, 2)}
+    made = []
+    for memory_mb in (600, 1):
+        spill = Spill(memory_mb * 500_000)
+        builder = ModelBuilder(Fusion(voxel_m=0.1, memory_mb=memory_mb), spill)
+        for cloud in clouds:
+            builder.add(cloud, None, 3000)
+        assert builder.views == 30
+        assert (spill.spilled_bytes > 0) == (memory_mb == 1)
+        made += [builder.fuse(poses).cloud, builder.sketch(poses)]
+    for large, small in zip(made[:2], made[2:], strict=True):
+        assert large.points.tobytes() == small.points.tobytes()
+        np.testing.assert_array_equal(large.views, small.views)
+    assert made[0].views.max() > 1
+
+
+def test_clouds_have_no_surface_and_hopeless_images_still_a_cloud() -> None:
+    rng = np.random.default_rng(4)
+    builder = ModelBuilder(Fusion())
+    builder.add(CloudFrame.of(rng.normal(size=(500, 3))), None, 1000)
+    model = builder.fuse({0: EYE})
+    assert model.mesh is None
+    assert len(model.cloud) > 400
+    # A single valid pixel makes no surface.
+    ranges = np.full((72, 88), np.inf)
+    ranges[36, 43] = 1.0
+    builder = ModelBuilder(Fusion())
+    builder.add(frame_of(ranges), None, 1000)
+    model = builder.fuse({0: EYE})
+    assert len(model.mesh) == 0
+    assert len(model.cloud) == 1
+
+
+def test_simplifying_keeps_the_shape_with_fewer_faces(ball) -> None:
+    _, _, mesh = ball
+    small = mesh.simplified(0.036)
+    assert len(small.faces) < len(mesh.faces) / 5
+    r = np.linalg.norm(small.vertices, axis=1)
+    assert np.abs(r - 0.3).mean() < 0.004
+    a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
+    assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), a) > 0).mean() > 0.99
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_up_is_the_floor_s_normal_or_what_walls_are_plumb_to(tilt) -> None:
+    # The camera looks down by `tilt`, at a floor 1 m below and a wall 3 m ahead.
+    T = se3.exp(np.array([0, 0, 0, -tilt, 0, 0]))
+    floor = plane_range(T, np.array([0, 1.0, 0]), 1.0)
+    wall = plane_range(T, np.array([0, 0, 1.0]), 3.0)
+    view = RangeView.of(frame_of(np.minimum(floor, wall)))
+    # In the world, which is the first camera.
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03))
+    R = upright(mesh, EYE[None])
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    down = T[:3, :3].T @ [0, 1.0, 0]
+    if (np.minimum(floor, wall) == floor).mean() > 0.15:
+        np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
+    wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
+    # A wall is plumb, however the camera is tilted before it.
+    np.testing.assert_allclose(upright(wall_only, EYE[None]) @ down, [0, -1, 0], atol=0.03)
+    # Without a floor, what an accelerometer measured counts before the cameras' own up.
+    against_gravity = np.array([0.6, -0.8, 0.0])
+    R = upright(wall_only, EYE[None], against_gravity)
+    np.testing.assert_allclose(R @ against_gravity, [0, 1, 0], atol=1e-12)
+
+
+def test_depths_drawn_to_planes_and_jumps_against_slow_twins() -> None:
+    rng = np.random.default_rng(12)
+    shape = (19, 23)
+    z = np.where(rng.random(shape) < 0.1, 0, rng.choice([1.0, 1.04, 1.5], shape))
+    sigma = rng.uniform(0.001, 0.02, shape)
+    planes = np.zeros((*shape, 4))
+    planes[..., 3] = np.where(rng.random(shape) < 0.7, 1 / (z + sigma * rng.normal(size=shape)), 0)
+    planes[z == 0] = 0
+    known = rng.uniform(1e-6, 1e-4, shape)
+    z, sigma, planes, known = (x.astype(np.float32) for x in (z, sigma, planes, known))
+    smooth, variance = np.empty((2, *shape), np.float32)
+    measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
+    tsdf.shrink_to_planes(z, sigma, planes, known, 0.004, 2.0, smooth, variance, measured)
+    tsdf.mark_jumps(z, sigma, 0.03, 4.0, jump)
+    twin = np.zeros(shape, np.uint8)
+    for i, j in np.ndindex(shape):
+        if planes[i, j, 3] > 0:
+            plane, noise, relief = 1 / planes[i, j, 3], sigma[i, j] ** 2, (0.004 * z[i, j]) ** 2
+            gain = relief / (relief + noise)
+            rest = known[i, j] * plane**4 + min(relief, noise)
+            assert smooth[i, j] == pytest.approx(plane + gain * (z[i, j] - plane), rel=1e-6)
+            wanted = gain**2 * noise + (1 - gain) ** 2 * rest
+            assert variance[i, j] == pytest.approx(wanted, rel=1e-4)
+            off = abs(z[i, j] - plane) / plane * z[i, j] / sigma[i, j]
+            assert abs(off - 2) < 1e-3 or measured[i, j] == (off < 2)
+        else:
+            assert smooth[i, j] == z[i, j]
+            assert not measured[i, j]
+            assert variance[i, j] == pytest.approx(sigma[i, j] ** 2, rel=1e-6)
+        for p, q in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+            if 0 <= p < shape[0] and 0 <= q < shape[1] and z[i, j] > 0 and z[p, q] > 0:
+                step, both = abs(z[i, j] - z[p, q]), np.hypot(sigma[i, j], sigma[p, q])
+                twin[i, j] |= step > 0.03 * min(z[i, j], z[p, q]) and step > 4 * both
+    np.testing.assert_array_equal(jump, twin)
+    assert 0.1 < twin.mean() < 0.9
+    assert 0.1 < measured.mean() < 0.9
+
+
+def test_packed_views_against_a_slow_twin() -> None:
+    rng = np.random.default_rng(5)
+    shape = (6, 7)
+    rays = rng.uniform(-0.8, 0.8, (*shape, 2)).astype(np.float32)
+    rays[0, 0] = np.nan
+    planes = np.concatenate(
+        [rng.normal(0, 1, (*shape, 2)), rng.uniform(0.2, 1, (*shape, 2))], -1
+    ).astype(np.float32)
+    planes[rng.random(shape) < 0.3] = 0
+    planes[0, 0] = 0
+    variance = rng.uniform(1e-6, 1e-4, shape).astype(np.float32)
+    good = rng.random(shape) < 0.8
+    normals, weights = np.full((*shape, 3), 99, np.int8), np.full(shape, -1, np.float32)
+    lengths2 = (1 + (rays * rays).sum(-1)).astype(np.float32)
+    tsdf.pack_view(planes, rays, lengths2, variance, good, 0.1, normals, weights)
+    assert weights[0, 0] == 0
+    assert not normals[0, 0].any()
+    kept = 0
+    for r, c in np.ndindex(shape):
+        if (r, c) == (0, 0):
+            continue
+        ray = np.array([*rays[r, c], 1.0])
+        fitted = planes[r, c, 3] > 0
+        n = planes[r, c, :3].astype(float) if fitted else ray
+        n = n / np.linalg.norm(n)
+        cosine = n @ ray / np.linalg.norm(ray)
+        expected = 1 / (cosine**2 * variance[r, c])
+        expected *= good[r, c] and cosine > 0.1
+        kept += expected > 0
+        assert weights[r, c] == pytest.approx(expected, rel=1e-4)
+        assert np.abs(normals[r, c] - 127 * n).max() < 0.51
+    assert 10 < kept < good.sum()
+
+
+def half_dark(rng):
+    """A wall 2 m away, known to 4 mm on the left and to 60 mm on the right."""
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    sigma = np.full(ranges.shape, 0.004, np.float32)
+    sigma[:, 50:] = 0.06
+    depth = (ranges + sigma * rng.standard_normal(ranges.shape)).astype(np.float32)
+    return RangeFrame(0, 0.0, CAMERA, depth, "range", sigma_image=sigma)
+
+
+def test_a_dark_wall_gets_planes_and_weights_of_its_own_noise() -> None:
+    frame = half_dark(np.random.default_rng(7))
+    view = RangeView.of(frame)
+    dark, bright = np.s_[6:-6, 56:-6], np.s_[6:-6, 6:44]
+    off = view.z * view.unit - 2.0
+    assert np.abs(off[dark]).mean() < 0.02  # a pixel alone is off by 0.048
+    assert (view.strength[dark] > 0).mean() > 0.95
+    weight = DECODED[view.strength]
+    ratio = np.median(weight[bright]) / np.median(weight[dark])
+    assert 10 < ratio < 1000
+
+
+def test_filters_that_thin_out_are_overruled_on_planes_but_not_those_that_cut_off() -> None:
+    rng = np.random.default_rng(8)
+    frame = half_dark(rng)
+    mask = rng.random(frame.valid.shape) < 0.4
+    mask[:, :20] = False
+    view = RangeView.of(frame.keep(mask), prepare_view(frame, SurfaceOptions()))
+    assert (view.strength[4:-4, 24:-4] > 0).mean() > 0.93
+    assert not view.strength[:, :18].any()
+
+
+def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
+    frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
+    # Each also sees one pixel in front of the ball, which the others see through.
+    for k, frame in enumerate(frames):
+        frame.depth[30 + k % 12, 40 + k % 7] = 0.6
+    views = [RangeView.of(f) for f in frames]
+    options = Fusion(voxel_m=0.012, island=0)
+    turned = Volume.around(views, poses, 0.012, options)
+    assert turned.turns == 2
+    found = fuse_surface(views, poses, options)
+    monkeypatch.setattr(layout, "_TURNS", 1)
+    full = Volume.around(views, poses, 0.012, options)
+    assert full.turns == 1
+    assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over
+    assert np.isin(turned.keys, full.keys).all()
+    expected = fuse_surface(views, poses, options)
+    for mesh in (found, expected):
+        r = np.linalg.norm(mesh.vertices.astype(float), axis=1)
+        assert np.abs(r - 0.3).mean() < 0.0015
+        assert np.abs(r - 0.3).max() < 0.03
+    assert abs(len(found) - len(expected)) < 0.01 * len(expected)
+    # The same weights in the mean, both where the surface is and where there is none.
+    for volume in (turned, full):
+        volume.add(views, poses)
+        volume.surface()
+    common = np.isin(full.keys, turned.keys)
+    near = np.abs(full.distance[common]) < 0.006
+    np.testing.assert_allclose(
+        turned.weight[near & (turned.weight > 0)].mean(),
+        full.weight[common][near & (full.weight[common] > 0)].mean(),
+        rtol=0.03,
+    )
+    assert turned.weight.sum() == pytest.approx(full.weight[common].sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
+    rng = np.random.default_rng(9)
+    view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
+    T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
+    first = (1 % stride, 0)
+    keys = tsdf.near_cubes(
+        view.z, view.unit, view.normals, view.strength, view.projection.rays,
+        T, 0.05, 0.04, 0.5, first, stride,
+    )  # fmt: skip
+    expected = set()
+    steps = int(np.ceil(0.08 / 0.025))
+    for r in range(first[0], 72, stride):
+        for c in range(first[1], 88, stride):
+            if view.z[r, c] == 0 or view.strength[r, c] == 0:
+                continue
+            p = view.z[r, c] * view.unit * np.array([*view.projection.rays[r, c], 1.0])
+            for t in np.linspace(-0.04, 0.04, steps + 1):
+                q = se3.transform(T, (p + t * view.normals[r, c] / 127)[None])[0]
+                expected.add(block_key(*(int(n) for n in np.floor(q / 0.05))))
+    assert len(expected) > 200
+    both = expected & set(keys.tolist())
+    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # but for rounding
+    marks = np.zeros(2, np.uint8)
+    parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
+    mark_eighths(keys, *index_of(parents), marks)
+    for parent, mark in zip(parents, marks, strict=True):
+        eighths = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
+        assert mark == sum(1 << e for e in eighths)

@@ -1,0 +1,33 @@
+"""Call the command line in this process and check refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tofuse.cli import main
+
+
+def call(*words: object) -> int:
+    try:
+        return main([str(w) for w in words])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def listing(folder: Path) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
+
+
+def refuses(capfd, *words: object, says: tuple[str, ...], prefix: str = "tofuse: ") -> str:
+    """Call the command and check that it says one line, with all of `says` in it."""
+    capfd.readouterr()
+    assert call(*words) == 2
+    done = capfd.readouterr()
+    assert done.out == ""
+    assert done.err.endswith("\n")
+    assert done.err.count("\n") == 1, done.err
+    assert done.err.startswith(prefix)
+    for part in says:
+        assert part in done.err
+    assert len(done.err) < 700
+    return done.err

@@ -1,0 +1,53 @@
+"""Two views of a corner."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels import refinement as kernels
+from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import Smoothed, SurfaceOptions
+
+CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
+
+
+# No plane bends round the edges of the corner, so that what fits, fits exactly.
+SHARP = SurfaceOptions(radii=(2,), flatness=1e-5, smoothed=Smoothed(noise=0))
+
+
+def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0) -> RangeFrame:
+    """A corner of three walls with a pattern, seen by a camera whose range lacks `offset`."""
+    rays = np.concatenate([CAMERA.rays(), np.ones((48, 60, 1))], -1)
+    directions = rays @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+    depth = np.full((48, 60), np.inf)
+    light = np.zeros((48, 60))
+    for normal, d in (((0, 0, 1), 3.0), ((0.8, 0, 0.6), 2.6), ((0, 0.8, 0.6), 2.4)):
+        n = np.array(normal)
+        z = (d - n @ origin) / (directions @ n)
+        z = np.where(z > 0, z, np.inf)
+        hit = origin + np.where(z < 20, z, 0)[..., None] * directions
+        phase = waves * hit
+        pattern = 1.5 + 0.5 * np.sin(7 * phase[..., 0]) * np.cos(phase[..., 1:] @ (6, 5))
+        light = np.where(z < depth, pattern, light)
+        depth = np.minimum(depth, z)
+    length = np.linalg.norm(rays, axis=-1)
+    depth = depth - offset / length
+    return RangeFrame(
+        index=0,
+        timestamp=0.0,
+        camera=CAMERA,
+        depth=depth.astype(np.float32),
+        depth_kind="z",
+        amplitude_image=(1000 * light).astype(np.float32),
+        amplitude_kind="range_compensated",
+    )
+
+
+def unpack(out):
+    H = np.zeros((kernels.UNKNOWNS, kernels.UNKNOWNS))
+    upper = np.triu_indices(kernels.UNKNOWNS)
+    H[upper] = out[kernels.H : kernels.G]
+    H.T[upper] = out[kernels.H : kernels.G]
+    return H, out[kernels.G : kernels.G + kernels.UNKNOWNS]

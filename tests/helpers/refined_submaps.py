@@ -1,0 +1,14 @@
+"""A refinement of simulated views in submaps."""
+
+from __future__ import annotations
+
+from tofuse.files.spill import Scratch
+from tofuse.posegraph.view_store import Spacing, ViewStore
+
+
+def refined(part, views, poses, scratch=Scratch()):  # noqa: B008 - immutable
+    store = ViewStore(Spacing(angle=0, distance=0), scratch=scratch)
+    out = part.start(store)
+    for view, T in zip(views, poses, strict=True):
+        store.push(view, T)
+    return out.finish(list(range(len(poses))), poses)

@@ -1,0 +1,52 @@
+"""A path that leaves a place and comes back to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from corner_views import corner
+from tofuse.geometry import se3
+from tofuse.posegraph.view_store import Spacing, ViewStore
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+
+ALL = Spacing(angle=0, distance=0)
+
+
+DRIFT = se3.exp(np.array([0.004, -0.003, 0.004, 0.002, -0.003, 0.002]))
+
+
+def away_and_back(count=13, most=1.1):
+    """Yaw out to `most` and back, with a little sway, so that views in between differ."""
+    a = np.linspace(0, np.pi, count)
+    yaw = most * np.sin(a)
+    sway = 0.1 * np.sin(2 * a)
+    zero = np.zeros(count)
+    return se3.exp(np.stack([sway, zero, sway, zero, yaw, zero], axis=-1))
+
+
+@pytest.fixture(scope="module")
+def turn():
+    truth = away_and_back()
+    rng = np.random.default_rng(1)
+    frames = []
+    for k, T in enumerate(truth):
+        frame = replace(corner(T), index=k)
+        noise = 0.003 * rng.standard_normal(frame.depth.shape).astype(np.float32)
+        frames.append(replace(frame, depth=frame.depth + noise))
+    start = [truth[0]]
+    for k in range(1, len(truth)):
+        start.append(start[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ DRIFT)
+    return frames, truth, np.stack(start)
+
+
+def pushed(options, frames, poses, given=()):
+    store = ViewStore(ALL)
+    loops = options.start(0, given, store)
+    for frame, T in zip(frames, poses, strict=True):
+        store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
+        loops.push(frame, T)
+    known = {f.index: T for f, T in zip(frames, poses, strict=True)}
+    return loops.finish(known, dict.fromkeys(known, np.zeros((6, 6))))

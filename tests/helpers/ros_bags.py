@@ -1,0 +1,306 @@
+"""ROS bags as camera drivers write them."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import struct
+import warnings
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tofuse.geometry import quaternion
+from tofuse.geometry.cameras import Pinhole
+from tofuse.geometry.se3 import exp
+from tofuse.recordings.readers import ros
+
+RNG = np.random.default_rng(100)
+
+
+COUNTS = RNG.integers(300, 5000, (3, 12, 16)).astype(np.uint16)
+
+
+TOPIC = "/camera/depth/image_rect_raw"
+
+
+DEPTH_LENS = Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
+
+
+class Bag:
+    """Writes messages to a bag of a kind."""
+
+    def __init__(self, folder: Path, kind: str) -> None:
+        pytest.importorskip("rosbags", reason="the package rosbags is not installed")
+        self.kind = kind
+        self.store = importlib.import_module("rosbags.typesys").get_typestore(
+            importlib.import_module("rosbags.typesys").Stores[
+                "ROS1_NOETIC" if kind == "ros1" else "ROS2_HUMBLE"
+            ]
+        )
+        if kind == "ros1":
+            self.path = folder / "a.bag"
+            self.writer = importlib.import_module("rosbags.rosbag1").Writer(self.path)
+        else:
+            rosbag2 = importlib.import_module("rosbags.rosbag2")
+            self.path = folder / "a"
+            plugin = rosbag2.StoragePlugin["MCAP" if kind == "mcap" else "SQLITE3"]
+            self.writer = rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
+        self.writer.open()
+        self.connections: dict[str, Any] = {}
+        if "tf2_msgs/msg/TFMessage" not in self.store.types:
+            parse = importlib.import_module("rosbags.typesys").get_types_from_msg
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(parse(text, "tf2_msgs/msg/TFMessage"))
+
+    def make(self, name: str, *values: Any) -> Any:
+        return self.store.types[name](*values)
+
+    def header(self, time: float, frame: str = "depth") -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", int(time), round(time % 1 * 1e9))
+        first = (7,) if self.kind == "ros1" else ()
+        return self.make("std_msgs/msg/Header", *first, stamp, frame)
+
+    def tf(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+        q = quaternion.from_matrix(T[:3, :3])
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        motion = self.make("geometry_msgs/msg/Transform", vector, turn)
+        kind = "geometry_msgs/msg/TransformStamped"
+        stamped = self.make(kind, self.header(time, parent), child, motion)
+        name = "tf2_msgs/msg/TFMessage"
+        self.write(topic, name, time, self.make(name, [stamped]))
+
+    def write(self, topic: str, kind: str, time: float, message: Any) -> None:
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        turn = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        # The message arrives 5 ms after it was taken.
+        stamp = round((time + 0.005) * 1e9)
+        self.writer.write(self.connections[topic], stamp, turn(message, kind))
+
+    def image(
+        self,
+        topic: str,
+        time: float,
+        image: np.ndarray,
+        encoding: str,
+        pad: int = 0,
+        width: int | None = None,
+        frame: str = "depth",
+    ) -> None:
+        height, width = len(image), width or image.shape[1]
+        rows = np.ascontiguousarray(image).view(np.uint8).reshape(height, -1)
+        rows = np.pad(rows, ((0, 0), (0, pad)))
+        self.write(
+            topic,
+            ros.IMAGE,
+            time,
+            self.make(
+                ros.IMAGE, self.header(time, frame), height, width, encoding, 0, rows.shape[1],
+                rows.ravel(),
+            ),
+        )  # fmt: skip
+
+    def compressed(
+        self, topic: str, time: float, data: bytes, format_: str, frame: str = "depth"
+    ) -> None:
+        content = np.frombuffer(data, np.uint8)
+        message = self.make(ros.COMPRESSED, self.header(time, frame), format_, content)
+        self.write(topic, ros.COMPRESSED, time, message)
+
+    def transform(self, topic: str, T: np.ndarray) -> None:
+        q = quaternion.from_matrix(T[:3, :3])
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        kind = "geometry_msgs/msg/Transform"
+        self.write(topic, kind, 1.0, self.make(kind, vector, turn))
+
+    def info(
+        self,
+        topic: str,
+        model: str = "plumb_bob",
+        D: tuple[float, ...] = (0.1, 0.02),
+        lens: Pinhole = DEPTH_LENS,
+    ) -> None:
+        K = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        D = (*D, *(0.0,) * (5 - len(D)))
+        size = (lens.height, lens.width)
+        values = (*size, model, np.array(D), K, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
+        self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
+
+    def cloud(
+        self, topic: str, time: float, points: np.ndarray, light: np.ndarray, height: int = 1
+    ) -> None:
+        field = "sensor_msgs/msg/PointField"
+        names = ("x", "y", "z", "intensity")
+        fields = [self.make(field, n, 4 * k, 7, 1) for k, n in enumerate(names)]
+        data = np.concatenate([points, light[:, None]], 1).astype("<f4")
+        content = np.frombuffer(data.tobytes(), np.uint8)
+        message = self.make(
+            ros.CLOUD, self.header(time), height, len(data) // height, fields, False, 16,
+            16 * len(data) // height,
+            content, True,
+        )  # fmt: skip
+        self.write(topic, ros.CLOUD, time, message)
+
+    def close(self) -> Path:
+        self.writer.close()
+        # Its writer of MCAP leaves a file to the garbage collector.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)
+            del self.writer
+            gc.collect()
+        return self.path
+
+
+# Colour beside depth: places of both from a reference, and an image that tells its pixels apart.
+T_DEPTH = exp([0.01, 0.02, -0.005, 0.02, -0.03, 0.01])
+
+
+T_COLOR = exp([-0.06, 0.01, 0.004, 0.01, 0.12, -0.05])
+
+
+COLOR_LENS = Pinhole(48, 40, 40.0, 41.0, 23.0, 20.0)
+
+
+COLOR_V, COLOR_U = np.mgrid[:40, :48]
+
+
+COLORS = np.stack([5 * COLOR_U, 6 * COLOR_V, 0 * COLOR_U + 200], -1).astype(np.uint8)
+
+
+STEP = np.full((12, 16), 8000, np.uint16)  # a wall at 2 m, and a box at 1 m before it
+
+
+STEP[4:8, 6:10] = 4000
+
+
+def real_sense(
+    folder: Path,
+    kind: str,
+    model: str,
+    *,
+    name: str,
+    color: str = "",
+    distortion: tuple[float, ...] = (0.0,) * 5,
+) -> Path:
+    """A bag as RealSense's SDK writes it: .bag with CameraInfo, newer .db3 with text."""
+    bag = Bag(folder, kind)
+    stream = "/device_0/sensor_0/Depth_0"
+    D = (0.1, 0.02, 0.001, -0.002, 0.01)
+    text, number = "std_msgs/msg/String", "std_msgs/msg/Float32"
+    if kind == "ros1":
+        bag.info(f"{stream}/info/camera_info", model, D if model != "None" else (0.0,))
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", number, 1.0,
+                  bag.make(number, 0.00025))  # fmt: skip
+        if color:
+            bag.info(COLOR_STREAM + "/info/camera_info", "Brown Conrady", distortion, COLOR_LENS)
+            for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
+                bag.transform(f"{part}/tf/0", T)
+    else:
+        coeffs = ",".join(map(str, D if model != "None" else (0,) * 5))
+        lens = f"width=16;height=12;fx=20;ppx=7.5;fy=21;ppy=5.5;model={model};coeffs={coeffs}"
+        bag.write(f"{stream}/camera_info", text, 1.0, bag.make(text, lens))
+        if color:
+            coeffs = ",".join(map(str, distortion))
+            lens = "width=48;height=40;fx=40;ppx=23;fy=41;ppy=20;model=Inverse Brown Conrady;"
+            bag.write(
+                COLOR_STREAM + "/camera_info", text, 1.0, bag.make(text, f"{lens}coeffs={coeffs}")
+            )
+            for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
+                told = "rotation=" + ",".join(map(str, T[:3, :3].T.ravel()))  # by columns
+                told += ";translation=" + ",".join(map(str, T[:3, 3]))
+                bag.write(f"{part}/tf/0", text, 1.0, bag.make(text, told))
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0,
+                  bag.make(text, "0.000250"))  # fmt: skip
+    pair = "diagnostic_msgs/msg/KeyValue"
+    for key, value in (("Serial Number", "f0001"), ("Name", name)):
+        bag.write("/device_0/info", pair, 1.0, bag.make(pair, key, value))
+    for k in range(3):
+        bag.image(f"{stream}/image/data", 10 + k / 30, STEP if color else COUNTS[k], "mono16")
+        if color and k != 1:
+            image = packed(COLORS, color)
+            bag.image(COLOR_STREAM + "/image/data", 10.004 + k / 30, image, color, width=48)
+        infrared = (COUNTS[k] % 250).astype(np.uint8)
+        bag.image("/device_0/sensor_0/Infrared_0/image/data", 10 + k / 30, infrared, "mono8")
+    return bag.close()
+
+
+COLOR_STREAM = "/device_0/sensor_1/Color_0"
+
+
+def packed(image: np.ndarray, encoding: str) -> np.ndarray:
+    """Rows of bytes of an RGB image."""
+    if encoding == "rgb8":
+        return image.reshape(len(image), -1)
+    if encoding == "bgra8":
+        alpha = np.full((*image.shape[:2], 1), 255, np.uint8)
+        return np.concatenate([image[..., ::-1], alpha], -1).reshape(len(image), -1)
+    assert encoding == "yuyv"
+    y, cr, cb = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb).astype(float), -1, 0)
+    y, cb, cr = 16 + y * 219 / 255, 128 + (cb - 128) * 224 / 255, 128 + (cr - 128) * 224 / 255
+    rows = np.empty((len(image), 2 * image.shape[1]), np.uint8)
+    rows[:, 0::2], rows[:, 1::4], rows[:, 3::4] = y, cb[:, ::2], cr[:, ::2]
+    return rows
+
+
+def jpeg_bytes(image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 99])[1])
+
+
+def orbbec(
+    folder: Path,
+    distortion: tuple[float, ...],
+    *,
+    color: str = "",
+    R: np.ndarray | None = None,
+) -> Path:
+    """A bag as Orbbec's SDK writes it: ROS's images with more fields behind, an own profile."""
+    bag = Bag(folder, "ros1")
+    header = struct.pack("<4I", 0, 10, 0, 3) + b"cam"
+    R = np.eye(3) if R is None else R
+    profile = header + struct.pack(
+        "<2B9f3f3H4f8fB", 3, 10, *R.ravel(), *(1000 * T_COLOR[:3, 3]), 16, 12, 15, 20, 21, 7.5,
+        5.5, *distortion, 1,
+    )  # fmt: skip
+    color_profile = header + struct.pack(
+        "<2B9f3f3H4f8fB", 2, 5, *np.zeros(12), 48, 40, 15, 40, 41, 23, 20, *np.zeros(8), 1
+    )
+    kinds = {
+        "/cam/streamProfileType_3": "custom_msg/msg/OBStreamProfileInfo",
+        "/cam/sensor_3/frameType_3": "sensor_msgs/msg/Image",
+        "/cam/sensor_1/frameType_1": "sensor_msgs/msg/Image",
+    }
+    if color:
+        kinds["/cam/streamProfileType_2"] = "custom_msg/msg/OBStreamProfileInfo"
+        kinds["/cam/sensor_2/frameType_2"] = "sensor_msgs/msg/Image"
+    definition = "Header header\nuint8 streamType\n"
+    connections = {
+        topic: bag.writer.add_connection(topic, kind, msgdef=definition, md5sum="0" * 32)
+        for topic, kind in kinds.items()
+    }
+    bag.writer.write(connections["/cam/streamProfileType_3"], 10**10, profile)
+    if color:
+        bag.writer.write(connections["/cam/streamProfileType_2"], 10**10, color_profile)
+    depth = np.stack([STEP // 4] * 3) if color else COUNTS
+    data = COLORS.tobytes() if color == "rgb8" else jpeg_bytes(COLORS)
+    for k in range(3):
+        images = {
+            "/cam/sensor_3/frameType_3": ((12, 16), b"mono16", 32, depth[k].tobytes()),
+            "/cam/sensor_1/frameType_1": ((12, 16), b"mono16", 32, (COUNTS[k] // 2).tobytes()),
+        }
+        if color:
+            images["/cam/sensor_2/frameType_2"] = ((40, 48), color.encode(), 3 * 48, data)
+        for topic, (size, encoding, step, content) in images.items():
+            time = 10 + k / 15
+            head = struct.pack("<4I", k, int(time), round(time % 1 * 1e9), 3) + b"cam"
+            body = struct.pack("<3I", *size, len(encoding)) + encoding
+            body += struct.pack("<BII", 0, step, len(content)) + content
+            raw = head + body + struct.pack("<QQ", 5, 6)
+            bag.writer.write(connections[topic], round(time * 1e9), raw)
+    return bag.close()

@@ -1,0 +1,63 @@
+"""Two views of a furnished room far apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.frames import RangeFrame
+
+CAMERA = Pinhole(160, 120, 130.0, 130.0, 79.5, 59.5)
+
+
+# Boxes (centre, half size, turned about y by rad) on a floor 1 m below the origin, y down.
+FURNITURE = [
+    ((0.0, 0.7, 2.0), (0.35, 0.3, 0.25), 0.3),
+    ((0.55, 0.55, 2.7), (0.2, 0.45, 0.2), 0.9),
+    ((-0.7, 0.8, 2.6), (0.3, 0.2, 0.3), 1.2),
+]
+
+
+def seen(T_world_camera, boxes=FURNITURE, sigma=0.004, seed=0, walls=True):
+    """Depth of boxes, floor and two walls, with noise; a frame."""
+    rays = np.dstack([CAMERA.rays(), np.ones((120, 160))]).reshape(-1, 3)
+    origin, rays = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
+    best = np.full(len(rays), np.inf)
+    planes = [((0, 1, 0), 1.0)]
+    planes += [((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)] if walls else []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for normal, distance in planes:
+            along = (distance - origin @ normal) / (rays @ normal)
+            best = np.where((along > 0) & (along < best), along, best)
+        for centre, half, turn in boxes:
+            R = se3.so3_exp([0, turn, 0])
+            o, d = (origin - centre) @ R, rays @ R
+            a, b = (-np.array(half) - o) / d, (np.array(half) - o) / d
+            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+            hit = (near < far) & (near > 0)
+            best = np.where(hit & (near < best), near, best)
+    rng = np.random.default_rng([7, seed])
+    depth = best + sigma * rng.standard_normal(len(best))
+    depth[~(best < 8)] = 0
+    return RangeFrame(seed, float(seed), CAMERA, depth.reshape(120, 160).astype(np.float32), "z")
+
+
+def camera(x, z, yaw, pitch=-0.35):
+    """A pose at the height of the origin; a negative pitch looks down."""
+    T = np.eye(4)
+    T[:3, :3] = se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([pitch, 0, 0])
+    T[:3, 3] = x, 0.0, z
+    return T
+
+
+def error(found, true):
+    off = se3.inverse(true) @ found
+    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+
+
+# Half a metre aside and 30 degrees about what is seen.
+A, B = camera(-0.2, 0.0, 0.0), camera(0.55, 0.2, -0.5)
+
+
+TRUE = se3.inverse(A) @ B

@@ -1,0 +1,437 @@
+"""What `inspect` says of a recording, and what it warns of."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import made_rooms
+import tofuse
+from tofuse.cli import main
+from tofuse.errors import InputError, OutputError
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.images import read_image
+from tofuse.files.ply import write_ply
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import BrownConrady, Pinhole
+from tofuse.inspection import channels
+from tofuse.inspection.finding import CODES, Finding
+from tofuse.inspection.inspect import inspect_recording
+from tofuse.inspection.sample import Sample
+from tofuse.pipeline.run import with_findings
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+from wrapped_depth import wrapping
+
+CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
+
+
+def of(frames, **options) -> Recording:
+    return Recording.of(ArraySource(frames, **options), "somewhere", "frames")
+
+
+def image(z: float, index: int = 0, valid: int | None = None, **channels) -> RangeFrame:
+    depth = np.full((30, 40), z, np.float32)
+    if valid is not None:
+        depth.ravel()[valid:] = 0
+    return RangeFrame(index, index / 10, CAMERA, depth, **channels)
+
+
+@pytest.fixture
+def copy(room_recording, tmp_path) -> Path:
+    return shutil.copytree(room_recording, tmp_path / "rec")
+
+
+def test_facts_of_a_simulated_recording(room_recording) -> None:
+    found = inspect_recording(tofuse.open(room_recording))
+    facts = found.facts
+    assert facts["recording"] == str(room_recording)
+    assert (facts["format"], facts["frames"]) == ("native", "8")
+    assert facts["images"].startswith("176 x 144, ")
+    assert "amplitude, confidence" in facts["with"]
+    assert facts["reference poses"] == "for 8 frames"
+    assert facts["odometry"] == "none"
+    assert facts["valid points"].endswith("%")
+    assert float(facts["confidence_max"]) == 7
+    assert found.warnings == ()
+    low, high = (float(w) for w in facts["depth"].split(" m,")[0].split(" to "))
+    assert 0.3 < low < high < 8
+
+
+def test_numbers_of_a_made_recording() -> None:
+    frames = [image(2.0, k, valid=600) for k in range(11)]
+    facts = inspect_recording(of(frames)).facts
+    assert facts["time"] == "1.00 s, 10.0 frames per second"
+    assert facts["depth"] == "2.00 to 2.00 m, median 2.00 m"
+    assert facts["valid points"] == "50%"
+    assert facts["images"].startswith("40 x 30, 52 x 40 degrees")
+    assert facts["depth is"] == "z"
+    assert facts["with"] == "depth only"
+    one = inspect_recording(of([image(2.0, depth_kind="range")])).facts
+    assert (one["time"], one["depth is"]) == ("a single moment", "radial range")
+
+
+def test_poses_that_are_known() -> None:
+    poses = np.stack([np.eye(4)] * 3)
+    poses[1] = np.nan
+    facts = inspect_recording(
+        of([image(2.0, k) for k in range(3)], odometry=poses, reference=poses[:, :, :] + 0)
+    ).facts
+    assert facts["odometry"] == facts["reference poses"] == "for 2 frames"
+
+
+def test_facts_of_clouds(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        write_ply(
+            tmp_path / f"{k}.ply", GeometryRecord(rng.uniform(1, 2, (500, 3)).astype(np.float32))
+        )
+    facts = inspect_recording(tofuse.open(tmp_path)).facts
+    assert facts["views"] == "clouds of about 500 points"
+    assert facts["format"] == "ply"
+    assert facts["valid points"] == "100%"
+    assert "images" not in facts
+
+
+@pytest.mark.parametrize("z", [2000.0, 0.002])
+def test_a_wrong_unit_is_noticed(z) -> None:
+    for frame in (image(z), CloudFrame.of(image(z).points)):
+        (warning,) = (
+            str(f) for f in inspect_recording(of([frame])).findings if f.code == "depth_unit"
+        )
+        assert "depth_unit_m" in warning
+        assert f"{z:.2g}"[:1] in warning
+
+
+def test_millimetres_read_as_metres(copy, capsys) -> None:
+    camera = json.loads((copy / "camera.json").read_text())
+    (copy / "camera.json").write_text(json.dumps(camera | {"depth_unit_m": 1.0}))
+    assert main(["inspect", str(copy)]) == 0
+    said = capsys.readouterr().out
+    assert "severe: depth_unit: The median depth is" in said
+    assert "Check depth_unit_m: it may be wrong by a factor of" in said
+
+
+def test_few_and_no_valid_points_are_noticed() -> None:
+    (few,) = inspect_recording(of([image(2.0, valid=60)])).warnings
+    assert few.startswith("Only 5.0% of the pixels are valid.")
+    found = inspect_recording(of([image(0.0)]))
+    assert [f.code for f in found.findings] == ["few_valid"]
+    assert "is the depth unit right?" in found.warnings[0]
+    assert "no valid point" in found.facts["depth"]
+    (empty,) = inspect_recording(of([CloudFrame.of(np.zeros((0, 3)))])).warnings
+    assert "no valid point" in empty
+
+
+def test_unreadable_frames_are_warned_of(copy) -> None:
+    (copy / "depth/000002.png").write_bytes(b"")
+    found = inspect_recording(tofuse.open(copy))
+    assert len(found.warnings) == 1
+    assert "000002.png" in found.warnings[0]
+    assert found.facts["frames"] == "8"
+
+
+def test_what_the_reader_warns_of_is_passed_on(copy, capsys) -> None:
+    camera = json.loads((copy / "camera.json").read_text())
+    (copy / "camera.json").write_text(json.dumps(camera | {"colour[x]": "grey"}))
+    assert main(["inspect", str(copy), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert set(data) == {"facts", "findings", "warnings"}
+    assert any("colour[x]" in w for w in data["warnings"])
+    assert main(["inspect", str(copy)]) == 0
+    said = capsys.readouterr().out
+    assert "colour[x]" in said  # brackets are no markup
+    assert "\\" not in said
+
+
+def test_a_long_recording_is_only_sampled() -> None:
+    class Counting(ArraySource):
+        def read(self, index):
+            asked.append(index)
+            return super().read(index)
+
+    asked: list[int] = []
+    frames = [image(2.0, k) for k in range(1000)]
+    inspect_recording(Recording.of(Counting(frames), "x", "frames"))
+    assert len(asked) <= 16
+    assert (asked[0], asked[-1]) == (0, 999)
+
+
+def test_nothing_readable() -> None:
+    class Broken(ArraySource):
+        def read(self, index):
+            raise tofuse.errors.UnreadableFrameError("is broken", where=f"file {index}")
+
+    recording = Recording.of(Broken([image(2.0)]), "somewhere", "frames")
+    with pytest.raises(InputError, match="somewhere: no frame can be read; file 0: is broken"):
+        inspect_recording(recording)
+
+
+def test_channels_are_listed() -> None:
+    colour = np.zeros((30, 40, 3), np.uint8)
+    frame = replace(image(2.0), color_image=colour, amplitude_image=np.ones((30, 40), np.float32))
+    assert inspect_recording(of([frame])).facts["with"] == "amplitude, colour"
+
+
+# What follows: each check has a recording that triggers it, and one that must not.
+
+ROOM = BrownConrady(96, 72, 70.0, 70.0, 47.0, 36.0, k1=-0.2, k2=0.05)
+
+
+def room_depth(camera, T: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """z and light of a room of 5 x 2.6 x 4 m with two boxes, from a camera at T_room_camera."""
+    rays = camera.rays().astype(float)
+    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ T[:3, :3].T
+    o = T[:3, 3]
+    low, high = np.array([-2.5, -1.3, -2.0]), np.array([2.5, 1.3, 2.0])
+    with np.errstate(all="ignore"):
+        wall = np.where(d > 0, (high - o) / d, (low - o) / d)
+    axis, z = wall.argmin(-1), wall.min(-1)
+    for a, b in (([-0.6, 0.2, 1.0], [0.1, 1.3, 1.5]), ([1.2, -0.2, -0.6], [1.7, 1.3, 0.1])):
+        with np.errstate(all="ignore"):
+            t = np.stack([(np.array(a) - o) / d, (np.array(b) - o) / d])
+        near, far = t.min(0).max(-1), t.max(0).min(-1)
+        hit = (near < far) & (near > 0) & (near < z)
+        axis, z = np.where(hit, 3 + t.min(0).argmax(-1), axis), np.where(hit, near, z)
+    p = o + d * z[..., None]
+    waves = np.sin(7 * p[..., 0]) + np.sin(6 * p[..., 1]) + np.sin(5 * p[..., 2] + 1)
+    light = (1 + 0.15 * waves) * (0.6 + 0.1 * axis) * 4000 / z**2
+    return z * (1 + rng.normal(0, 0.002, z.shape)), light * (1 + rng.normal(0, 0.01, z.shape))
+
+
+def turning(count: int = 16, degrees: float = 8.0, camera=ROOM, seed: int = 0):
+    """Frames of a camera that turns and slides a little, with time stamps at 10 Hz."""
+    rng = np.random.default_rng([seed, 7])
+    frames = []
+    for k in range(count):
+        T = se3.exp(np.array([0, 0, 0, 0, np.radians(degrees * k + 20), 0]))
+        T[:3, 3] = 0.01 * k * (degrees > 0), -0.1, 0.0
+        z, light = room_depth(camera, T @ se3.exp(np.array([0, 0, 0, 0.12, 0, 0.05])), rng)
+        frames.append(
+            RangeFrame(k, k / 10, camera, z.astype(np.float32), "z", light.astype(np.float32))
+        )
+    return frames
+
+
+@pytest.fixture(scope="module")
+def turn():
+    return turning()
+
+
+def codes(frames, **options) -> set[str]:
+    return {f.code for f in tofuse.inspect(of(frames, **options)).findings}
+
+
+def seen_by(frames, camera):
+    return [replace(f, camera=camera) for f in frames]
+
+
+def stamped(frames, times):
+    return [replace(f, timestamp=float(t)) for f, t in zip(frames, times, strict=True)]
+
+
+def colored(frames, shift):
+    light = [np.log(f.amplitude_image) for f in frames]
+    low, high = np.min(light), np.max(light)
+    grey = [((np.roll(a, shift, 1) - low) / (high - low) * 255).astype(np.uint8) for a in light]
+    return [
+        replace(f, color_image=np.repeat(g[..., None], 3, -1))
+        for f, g in zip(frames, grey, strict=True)
+    ]
+
+
+def saturating(frames):
+    out = []
+    for f in frames:
+        full = f.amplitude_image > np.percentile(f.amplitude_image, 85)
+        light = np.where(full, np.float32(65535), f.amplitude_image)
+        out.append(replace(f, depth=np.where(full, 0, f.depth), amplitude_image=light))
+    return out
+
+
+def walking(frames):
+    """Something 1.2 m away goes from left to right."""
+    out = []
+    for k, f in enumerate(frames):
+        depth = f.depth.copy()
+        depth[20:66, 8 + 9 * k : 30 + 9 * k] = 1.2
+        out.append(replace(f, depth=depth))
+    return out
+
+
+BROWN = Pinhole(96, 72, 70.0, 70.0, 47.0, 36.0)
+TIMES = np.arange(16) / 10
+FAULTS = {
+    "depth_unit": lambda f: [replace(a, depth=a.depth * 1000) for a in f],
+    "range_taken_for_z": lambda f: [replace(a, depth=a.radial_range) for a in f],
+    "z_taken_for_range": lambda f: [replace(a, depth_kind="range") for a in f],
+    "lens_distortion": lambda f: seen_by(f, BROWN),
+    "other_intrinsics": lambda f: seen_by(f, Pinhole(96, 72, 500.0, 500.0, 480.0, 270.0)),
+    "mirrored": lambda f: [replace(a, amplitude_image=a.amplitude_image[:, ::-1]) for a in f],
+    "color_unregistered": lambda f: colored(f, 7),
+    "time_unsorted": lambda f: stamped(f, TIMES[[0, 2, 1, *range(3, 16)]]),
+    "time_repeated": lambda f: stamped(f, TIMES[[0, 1, 1, *range(3, 16)]]),
+    "frames_missing": lambda f: stamped(f, TIMES + 0.4 * (TIMES > 0.6)),
+    "frames_repeated": lambda f: [*f[:8], replace(f[7], index=8, timestamp=0.8), *f[9:]],
+    "phase_wrap": lambda f: wrapping(f, 2.5),
+    "saturated": saturating,
+    "flying_pixels": lambda f: [replace(a, depth=cv2.GaussianBlur(a.depth, (0, 0), 2)) for a in f],
+    "few_valid": lambda f: [a.keep(np.arange(96 * 72).reshape(72, 96) % 15 == 0) for a in f],
+}
+
+
+def test_nothing_is_wrong_with_a_good_recording(turn) -> None:
+    assert codes(turn) == set()
+    assert codes(colored(turn, 0)) == set()
+    ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in turn]
+    assert codes(ranges) == set()
+
+
+@pytest.mark.parametrize("code", FAULTS)
+def test_a_fault_is_named(code, turn) -> None:
+    found = tofuse.inspect(of(FAULTS[code](turn)))
+    (named,) = [f for f in found.findings if f.code == code]
+    assert named.severity == CODES[code][0]
+    assert named.text.endswith((".", "?"))
+    assert named.remedy.endswith(".")
+    assert named.evidence
+    assert all(np.isfinite(v) for v in named.evidence.values())
+    assert found.severe == any(f.severity == "severe" for f in found.findings)
+    assert str(named) in found.warnings
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_wrong_focal_length_is_measured(factor) -> None:
+    plain = turning(camera=BROWN)
+    wrong = replace(BROWN, fx=70 * factor, fy=70 * factor)
+    ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in plain]
+    # Of z only views that the camera turned between tell, and of a longer one more clearly.
+    for frames in (ranges, plain)[: 1 + (factor > 1)]:
+        said = tofuse.inspect(of(seen_by(frames, wrong))).findings
+        (found,) = [f for f in said if f.code == "focal_length"]
+        assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
+
+
+@pytest.mark.parametrize("boxes", [False, True])
+def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool) -> None:
+    """Edges that all run the same way fit anywhere along themselves."""
+    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
+    rng = np.random.default_rng(61)
+    frames = []
+    for k in range(4):
+        depth = np.full((120, 160), 2.0, np.float32)
+        grey = np.full((120, 160), 60, np.uint8)
+        for at in rng.integers(15, 120, 4):
+            top, bottom = int(rng.integers(10, 60)), int(rng.integers(70, 110))
+            rows = slice(top, bottom) if boxes else slice(None)
+            depth[rows, at : at + 18] -= 0.3
+            grey[rows, at + 10 : at + 28] += 45  # 10 pixels beside
+        depth += rng.normal(0, 0.002, depth.shape).astype(np.float32)
+        color = np.repeat(grey[..., None], 3, -1)
+        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=color))
+    found = list(channels.check_color(Sample.of(of(frames), 8)))
+    assert [f.code for f in found] == ["color_unregistered"] * boxes
+    if found:
+        assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
+
+
+def test_how_the_camera_moves() -> None:
+    still = turning(6, 0.0)
+    assert codes(still) == {"static"}
+    assert codes(turning(6, 13.0)) == {"fast_motion"}
+    assert "little_overlap" in codes(turning(6, 40.0))
+    assert "moving_objects" in codes(walking(still))
+    found = tofuse.inspect(of(walking(still)), turning=True)
+    assert not {"static", "moving_objects"} & {f.code for f in found.findings}
+
+
+def test_a_bare_wall_and_no_planes_at_all() -> None:
+    rng = np.random.default_rng(3)
+    wall = [image(2.0, k) for k in range(4)]
+    noisy = [replace(f, depth=f.depth + rng.normal(0, 0.004, f.depth.shape)) for f in wall]
+    assert "wall_only" in codes(noisy)
+    v, u = np.mgrid[:72, :96]
+    hills = [
+        RangeFrame(k, k / 10, BROWN, 2 + 0.3 * np.sin((u + 3 * k) / 9) * np.cos(v / 7))
+        for k in range(8)
+    ]
+    said = codes([replace(f, depth=f.depth.astype(np.float32)) for f in hills])
+    assert not said & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
+
+
+def test_steps_between_joined_recordings_are_none_of_time(turn) -> None:
+    twice = stamped([*turn[:5], *turn[:5]], np.tile(TIMES[:5], 2))
+    parts = {"parts": [{"frames": 5}, {"frames": 5}]}
+    assert "time_unsorted" not in codes(twice, metadata=parts)
+    assert "time_unsorted" in codes(twice)
+
+
+def test_a_contact_sheet(turn, tmp_path, capsys) -> None:
+    path = tofuse.inspect(of(FAULTS["range_taken_for_z"](turn))).save_sheet(
+        tmp_path / "a/sheet.png"
+    )
+    picture = read_image(path)
+    assert picture.shape[1] > 800
+    assert picture[..., :3].std() > 20
+    with pytest.raises(OutputError, match="can't be written"):
+        tofuse.inspect(of(turn[:3])).save_sheet(path / "below.png")
+
+
+def test_a_run_tells_what_it_finds(copy, tmp_path, capfd) -> None:
+    camera = json.loads((copy / "camera.json").read_text())
+    (copy / "camera.json").write_text(json.dumps(camera | {"depth_unit_m": 0.01}))
+    main(["run", str(copy), "--out", str(tmp_path / "out"), "--every", "3"])
+    assert "note: The median depth is" in capfd.readouterr().err
+    data = json.loads((tmp_path / "out/run.json").read_text())
+    assert "depth_unit" in [f["code"] for f in data["findings"]]
+    assert data["verdict"] != "good"
+    assert "faulty_recording" in [r["code"] for r in data["reasons"]]
+    assert any("median depth" in w for w in data["warnings"])
+    assert "The median depth is" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
+
+
+def test_real_recordings_raise_only_what_is_true_of_them(shared_data) -> None:
+    explained = {
+        "sr4000_corridor": {"phase_wrap", "flying_pixels"},  # longer than 5 m; a shiny floor
+        "kinectv2_loop/recording": {"fast_motion", "little_overlap"},  # steps of 23 degrees
+        "iphone_record3d": {"wall_only"},  # a door
+        "pcl_pairwise": {"fast_motion", "little_overlap", "time_repeated"},  # far apart as well
+    }
+    for name in (
+        "sevenscenes_kitchen", "iphone_chair_3dscannerapp", "iphone_stray",
+        "azure_kinect_mkv/recording.mkv", "ifm_o3r/O3RBuffer.data", "pico_zense_static",
+        "open3d_rgbd5", "slam6d_scans", *explained,
+    ):  # fmt: skip
+        said = {f.code for f in tofuse.inspect(shared_data / name).findings}
+        assert said <= explained.get(name, set()) | {"static"}, name
+
+
+def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording: Path) -> None:
+    result = tofuse.reconstruct(tofuse.open(room_recording))
+    result = replace(result, recording={**result.recording, "warnings": []})
+    wrap = Finding("phase_wrap", "Far surfaces look near.", "Drop them.", {})
+    moving = with_findings(result, [wrap])
+    turning = with_findings(result, [wrap], turning=True)
+    assert "faulty_recording" in {r.code for r in moving.diagnostics.reasons}
+    assert "faulty_recording" not in {r.code for r in turning.diagnostics.reasons}
+    assert turning.recording["findings"] == moving.recording["findings"]
+
+
+@pytest.mark.parametrize("degrees", [6.0, 15.0])
+def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(degrees) -> None:
+    """Its background stands, so a run without --object would give the camera no motion."""
+    frames = []
+    for k in range(16):
+        thing = ((0.0, 0.3, 0.4), (0.5, 0.6, 0.15), np.radians(degrees) * k)
+        frames.append(made_rooms.seen(made_rooms.at(0, -1.2, 0), k, boxes=[thing]))
+    findings = inspect_recording(of(frames)).findings
+    hints = [str(f) for f in findings if "--object" in str(f)]
+    assert hints, [str(f) for f in findings]
+    told = inspect_recording(of(frames), turning=True).findings
+    assert not any("--object" in str(f) for f in told)

@@ -1,0 +1,132 @@
+"""The normal equations of a pair of views, against derivatives by differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from corner_views import SHARP, corner, unpack
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.projective import points_of
+
+KNOWN = np.ones(kernels.ERRORS, np.int64)
+SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
+
+
+def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
+    out = np.empty(kernels.SIZE)
+    surface = prepare_view(target, SHARP)
+    points = points_of(prepare_view(source, SHARP), 1)
+    kernels.pair_equations(
+        points,
+        surface.target,
+        surface.projection.lookup,
+        surface.projection.frame,
+        np.ascontiguousarray(T),
+        *settings,
+        np.zeros(kernels.ERRORS) if errors is None else errors,
+        known,
+        out,
+    )
+    return out
+
+
+@pytest.fixture
+def pair():
+    T_target_source = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
+    return corner(T_target_source), corner(np.eye(4)), T_target_source
+
+
+def test_the_step_leads_back_to_the_truth(pair):
+    source, target, T = pair
+    xi = np.array([0.01, -0.008, 0.006, 0.004, 0.006, -0.005])
+    start = T @ se3.exp(xi)
+    for _ in range(6):
+        H, g = unpack(evaluate(source, target, start, settings=(0.0, 1.0, 0.1, 0.02, 4.0, 0.5)))
+        H[7:, 7:] = np.eye(kernels.ERRORS)
+        step = -np.linalg.solve(H, g)
+        start = start @ se3.exp(step[:6])
+    away = se3.log(se3.inverse(T) @ start)
+    assert np.abs(away[:3]).max() < 1e-3
+    assert np.abs(away[3:]).max() < 5e-4
+
+
+@pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
+@pytest.mark.parametrize("error", range(kernels.ERRORS))
+def test_an_error_of_the_camera_moves_the_gradient_as_the_matrix_says(
+    pair, error, scale_p, tolerance
+):
+    """To first order g(e) = g(0) + H e: the mixed block is the slope of the gradient."""
+    _, _, T = pair
+    # A pattern so coarse that it makes no difference at which pixel a point lands.
+    source, target = corner(T, waves=0.1), corner(np.eye(4), waves=0.1)
+    known = KNOWN.copy()
+    known[error] = 0
+    wide = (0.0, 1.0, scale_p, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
+    h = 1e-4
+    plus, minus = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS)
+    plus[error], minus[error] = h, -h
+    # Where both views agree, so that second derivatives, which H leaves out, don't count.
+    H, _ = unpack(evaluate(source, target, T, known=known, settings=wide))
+    ends = [unpack(evaluate(source, target, T, e, known, wide))[1] for e in (plus, minus)]
+    slope = (ends[0] - ends[1]) / (2 * h)
+    column = H[:, 7 + error]
+    chosen = [*range(6), 7 + error]
+    scale = np.sqrt(np.diag(H)[chosen] * H[7 + error, 7 + error])
+    assert np.abs((slope - column)[chosen] / scale).max() < tolerance
+
+
+def test_what_is_not_asked_for_has_no_equations(pair):
+    source, target, T = pair
+    H, g = unpack(evaluate(source, target, T))
+    assert not H[7:].any()
+    assert not g[7:].any()
+    assert np.linalg.eigvalsh(H[:7, :7]).min() > 0
+
+
+def test_free_space_and_support_are_counted(pair):
+    source, target, T = pair
+    agree = evaluate(source, target, T)
+    assert agree[kernels.SUPPORT] > 0.9 * agree[kernels.TERMS] > 0
+    assert agree[kernels.IN_FRONT] == 0
+    nearer = replace(source, depth=source.depth * np.float32(0.6))
+    out = evaluate(nearer, target, T)
+    assert out[kernels.IN_FRONT] > 0.8 * out[kernels.COMPARED]
+    assert out[kernels.SUPPORT] < 0.1 * out[kernels.TERMS]
+
+
+def test_overlap_counts_what_both_see_from_the_same_side(pair):
+    source, target, T = pair
+    surface = prepare_view(target, SurfaceOptions(radii=(2,)))
+    points = points_of(prepare_view(source, SurfaceOptions(radii=(2,))), 2)
+
+    def share(pose, cosine=0.5, least=0.0):
+        out = np.empty(1)
+        kernels.overlaps(
+            points,
+            np.array([0, len(points)]),
+            np.array([0]),
+            surface.target,
+            surface.projection.lookup,
+            surface.projection.frame,
+            np.ascontiguousarray(pose),
+            np.eye(4)[None],
+            0.1,
+            cosine,
+            least,
+            out,
+        )
+        return out[0]
+
+    assert share(T) > 0.8
+    assert share(T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))) == 0
+    aside = T @ se3.exp(np.array([0, 0, 0, 0, 0.4, 0]))
+    assert 0 < share(aside) < share(T)
+    assert share(aside, least=share(aside) - 0.01) == share(aside)
+    assert share(aside, least=share(aside) + 0.01) == 0
+    # All of it is behind what the target sees, so nothing is seen by both.
+    assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05

@@ -1,0 +1,102 @@
+"""Registration by the planes of two images, and what they leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import tofuse
+from searched_pair import TRUE, A, B, error, seen
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.lab.methods.features import Features
+from tofuse.lab.methods.plane_sets import PlaneSets
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration.plane_detection import detect_planes
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+
+WORLD = [((0, 1, 0), 1.0), ((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)]
+
+
+def in_view(T_world_camera):
+    """(3, 4) normals and offsets of the floor and the walls of the scene."""
+    out = []
+    for normal, offset in WORLD:
+        length = np.linalg.norm(normal)
+        n = np.array(normal) / length
+        out.append([*(n @ T_world_camera[:3, :3]), offset / length - n @ T_world_camera[:3, 3]])
+    return np.array(out)
+
+
+def test_planes_of_a_view_are_those_of_the_scene():
+    view = prepare_view(seen(A, seed=1), SurfaceOptions())
+    found = detect_planes(view, np.random.default_rng(0))
+    assert len(found) >= 3
+    assert [p.share for p in found[:3]] == sorted((p.share for p in found[:3]), reverse=True)
+    planes = np.array([[*p.normal, p.offset] for p in found])
+    for *normal, offset in in_view(A)[:2]:  # of the other wall hardly anything is seen
+        angle = np.degrees(np.arccos(np.clip(planes[:, :3] @ normal, -1, 1)))
+        k = int(np.argmin(angle))
+        assert angle[k] < 1.0
+        assert abs(planes[k, 3] - offset) < 0.01
+    assert all(p.rms_m < 0.02 for p in found)
+
+
+def test_a_furnished_corner_is_registered_without_a_guess():
+    found = tofuse.register(seen(B, seed=1), seen(A, seed=2), method=PlaneSets())
+    shift, angle = error(found.T_target_source, TRUE)
+    assert shift < 0.05
+    assert angle < 1.5
+    assert found.correspondences >= 3
+    assert len(found.unobservable) == 0
+    assert found.margin > 0.1
+    assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+def test_a_floor_alone_leaves_three_directions_to_the_guess():
+    source, target = (seen(T, boxes=[], walls=False, seed=k) for k, T in ((1, B), (2, A)))
+    guess = TRUE @ se3.exp(np.array([0.1, 0.05, -0.1, 0.05, 0.1, -0.05]))
+    found = tofuse.register(source, target, guess=guess, method=PlaneSets())
+    floor = in_view(B)[0]
+    turned = found.T_target_source[:3, :3] @ floor[:3]
+    assert np.degrees(np.arccos(np.clip(turned @ in_view(A)[0, :3], -1, 1))) < 0.7
+    offset = floor[3] + turned @ found.T_target_source[:3, 3]
+    assert abs(offset - in_view(A)[0, 3]) < 0.01
+    assert found.unobservable.shape == (3, 6)
+    # Along the floor, and turning upon it.
+    basis = np.vstack([np.zeros((3, 6))])
+    basis[0, 3:] = floor[:3]
+    basis[1:, :3] = np.linalg.svd(floor[None, :3])[2][1:]
+    np.testing.assert_allclose(np.abs(np.linalg.det(found.unobservable @ basis.T)), 1, atol=0.02)
+    # These are as guessed.
+    along = basis[1:, :3] @ (se3.inverse(guess) @ found.T_target_source)[:3, 3]
+    assert np.abs(along).max() < 0.03
+    gap = se3.log(se3.inverse(guess) @ found.T_target_source)
+    assert abs(gap[3:] @ floor[:3]) < 0.02
+
+
+def test_one_seed_gives_one_result():
+    views = seen(B, seed=1), seen(A, seed=2)
+    a, b = (tofuse.register(*views, method=PlaneSets(), seed=4) for _ in range(2))
+    np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
+
+
+def test_views_without_planes_are_refused():
+    rough = seen(A, sigma=0.4, seed=1)
+    with pytest.raises(RegistrationError, match=r"no plane|contradicts"):
+        tofuse.register(rough, rough, method=PlaneSets(least_share=0.3))
+    cloud = CloudFrame(0, 0.0, rough.points)
+    with pytest.raises(RegistrationError, match="is no image"):
+        tofuse.register(cloud, cloud, method=PlaneSets())
+
+
+def test_what_has_no_light_has_planes():
+    views = seen(B, seed=1), seen(A, seed=2)
+    with pytest.raises(RegistrationError, match="has no amplitude nor colour"):
+        tofuse.register(*views, method=Features())
+
+
+@pytest.mark.parametrize("options", [{"planes": 0}, {"angle": 0.0}, {"least_share": -1}])
+def test_options_are_checked(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        PlaneSets(**options)

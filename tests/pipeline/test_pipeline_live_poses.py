@@ -1,0 +1,176 @@
+"""Loops that close while frames arrive."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from corner_views import corner
+from revisited_path import ALL, DRIFT, away_and_back
+from tofuse.geometry import se3
+from tofuse.odometry.base import Step, Tracker
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.frame_log import FrameLog
+from tofuse.pipeline.live_poses import DELAY, LiveLoops, LivePoses
+from tofuse.pipeline.mapper import Mapper
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.loops import ClosedLoop
+from tofuse.posegraph.refinement import NoRefinement
+from tofuse.posegraph.revisits import Revisits
+from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.results.types import FrameRecord
+
+COUNT = 24
+SMALL = se3.exp(se3.log(DRIFT) / 2)
+
+
+@dataclass(frozen=True)
+class Drifting:
+    """Odometry that errs by the same little motion at every step."""
+
+    part_kind: ClassVar[str] = "odometry"
+    part_name: ClassVar[str] = "drifting"
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def start(self, seed):
+        return _Drifting()
+
+
+class _Drifting(Tracker):
+    def __init__(self):
+        self.before = None
+
+    def push(self, frame, T_odometry=None, surface=None):
+        at = min(frame.index, COUNT - 1)
+        truth = away_and_back(COUNT)
+        view = prepare_view(frame, SurfaceOptions(radii=(2,)))
+        if self.before is None:
+            self.before = 0, np.eye(4)
+            return Step("tracked", "", np.eye(4), surface=view)
+        k, T = self.before
+        motion = se3.inverse(truth[k]) @ truth[at] @ SMALL
+        self.before = at, T @ motion
+        # As certain as the drift is large, so that the graph knows where to give way.
+        information = np.diag([1 / 0.004**2] * 3 + [1 / 0.003**2] * 3)
+        registration = Registration(motion, True, 1, 100, 100, 0.0, 0.001, information)
+        return Step("tracked", "", self.before[1], frame.index - 1, registration, view)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return [
+        replace(corner(T), index=k, timestamp=float(k)) for k, T in enumerate(away_and_back(COUNT))
+    ]
+
+
+def live(frames, threads):
+    loops = Revisits(spacing=ALL, searches=0)
+    config = replace(
+        from_method("default"),
+        corrections=(),
+        model_filters=(),
+        odometry=Drifting(),
+        loops=loops,
+        refinement=NoRefinement(),
+    )
+    mapper = Mapper(config, threads=threads)
+    poses = [mapper.push(frame) for frame in frames]
+    # The camera stands still at the end, long enough for what was found last to count.
+    for k in range(COUNT, COUNT + DELAY + 1):
+        poses += [mapper.push(replace(frames[-1], index=k, timestamp=float(k)))]
+    return np.stack(poses)
+
+
+def test_loops_move_the_pose_while_frames_arrive_and_always_equally_late(frames):
+    truth = away_and_back(COUNT)
+    poses = live(frames, 1)
+
+    def off(found):
+        return np.linalg.norm(found[:3, 3] - truth[-1, :3, 3])
+
+    # Where the odometry alone ends.
+    drifted = np.eye(4)
+    for before, after in itertools.pairwise(truth):
+        drifted = drifted @ se3.inverse(before) @ after @ SMALL
+    for _ in range(DELAY + 1):
+        drifted = drifted @ SMALL
+    assert off(drifted) > 0.08
+    assert off(poses[-1]) < 0.5 * off(drifted)
+    np.testing.assert_array_equal(poses, live(frames, 2))
+
+
+def scripted(pairs):
+    """Loops of which some frames close one, and which count how often they were asked."""
+
+    class Scripted:
+        asked = 0
+
+        def push(self, view, T_component_camera):
+            """Nothing to remember."""
+
+        def look(self):
+            self.asked += 1
+            here = [p for p in pairs if p[1] == self.asked - 1]
+            if not here:
+                return None
+            record = LoopRecord(*here[0], True, "")
+            return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
+
+        def finish(self, poses):
+            return []
+
+    return Scripted()
+
+
+def test_what_is_found_counts_so_many_frames_later():
+    loops = LiveLoops(scripted([(0, 3)]))
+    new = [loops.advance() for _ in range(3 + DELAY + 3)]
+    assert [k for k, known in enumerate(new) if known] == [3 + DELAY]
+    assert [(c.record.i, c.record.j) for c in loops.closed] == [(0, 3)]
+    loops.finish()
+
+
+def test_an_error_in_a_job_is_not_swallowed():
+    class Broken:
+        def look(self):
+            def work():
+                raise ZeroDivisionError
+
+            return work
+
+    loops = LiveLoops(Broken())
+    assert not loops.advance()
+    assert not any(loops.advance() for _ in range(DELAY - 1))
+    with pytest.raises(ZeroDivisionError):
+        loops.advance()
+
+
+class _AlwaysClosing:
+    """Loops of which every look finds one."""
+
+    points: ClassVar[bool] = False
+
+    def look(self):
+        record = LoopRecord(0, 1, True, "")
+        return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
+
+
+def test_the_graph_is_solved_less_often_the_longer_it_is():
+    live, log = LivePoses(_AlwaysClosing()), FrameLog()
+    solved = []
+    for k in range(3000):
+        step = Step("tracked", "", np.eye(4))
+        log.add(FrameRecord(k, float(k), "tracked", ""), step)
+        if live.update(step, log):
+            solved.append(k)
+    live.finish()
+    gaps = np.diff(solved)
+    # Of up to a thousand frames every loop counts when it is due.
+    assert (gaps[: np.searchsorted(solved, 900)] == DELAY).all()
+    assert (gaps >= 0.01 * np.array(solved[1:])).all()
+    assert gaps[-1] <= 40

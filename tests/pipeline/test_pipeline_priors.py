@@ -1,0 +1,131 @@
+"""What a device knows of its poses counts as far as it was asked for and agrees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from report_results import lonely
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.priors import with_prior
+from tofuse.pipeline.reconstruct import device_up, reconstruct
+from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.phones import POSES_BY
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.results.output import read_run_json
+from tofuse.results.types import FrameRecord
+
+
+@pytest.fixture(scope="module")
+def recording(room_recording: Path) -> Recording:
+    return open_recording(room_recording)
+
+
+def by_phone(recording: Recording, poses=None) -> Recording:
+    """The recording as if a phone had found its reference poses, or others."""
+    frames = list(recording)
+    found = recording.reference if poses is None else poses
+    source = ArraySource(frames, found, metadata={**recording.metadata, POSES_BY: "ARKit"})
+    return Recording.of(source, recording.path, recording.format)
+
+
+def kinds(config) -> list[type]:
+    return [type(sensor) for sensor in config.outside]
+
+
+def test_a_phone_knows_its_poses(recording) -> None:
+    phone = by_phone(recording)
+    led, config = with_prior(phone, from_method("default"), "auto")
+    assert kinds(config) == [GravityEdges, OdometryEdges]
+    np.testing.assert_array_equal(led.odometry, recording.reference)
+    # They stay what the result is compared with.
+    np.testing.assert_array_equal(led.reference, recording.reference)
+    assert led[0].index == phone[0].index
+
+
+def test_reference_poses_of_other_recordings_are_only_compared_with(recording) -> None:
+    same, config = with_prior(recording, from_method("default"), "auto")
+    assert same is recording
+    assert kinds(config) == [GravityEdges]
+    with pytest.raises(InputError, match="no poses of its device"):
+        with_prior(recording, from_method("default"), "device")
+
+
+def test_a_phone_knows_which_way_up_it_was(recording) -> None:
+    # Its world has y up, and is turned about that and moved against the result's.
+    T_device_world = np.eye(4)
+    T_device_world[:3, :3] = [[0.0, 0.0, 1.0], [-0.6, -0.8, 0.0], [0.8, -0.6, 0.0]]
+    T_device_world[:3, 3] = [3.0, 1.0, -2.0]
+    phone = by_phone(recording, T_device_world @ recording.reference)
+    n = len(recording)
+    poses = recording.reference @ se3.exp(np.tile([0.1, 0, 0, 0, 0, 0], (n, 1)))
+    frames = tuple(FrameRecord(int(k), 0.0, "tracked") for k in recording.indices)
+    result = lonely(trajectory=poses, timestamps=np.arange(n), sequential=poses, frames=frames)
+    np.testing.assert_allclose(device_up(phone, result), [-0.6, -0.8, 0.0], atol=1e-9)
+    assert device_up(recording, result) is None
+    lost = replace(result, trajectory=np.full_like(poses, np.nan))
+    assert device_up(phone, lost) is None
+
+
+def test_nothing_but_the_images(recording) -> None:
+    same, config = with_prior(by_phone(recording), from_method("default"), "none")
+    assert same.odometry is None
+    assert config.outside == ()
+
+
+def test_the_thesis_listens_to_nothing_unless_asked(recording) -> None:
+    phone, thesis = by_phone(recording), from_method("thesis")
+    assert with_prior(phone, thesis, "auto") == (phone, thesis)
+    assert kinds(with_prior(phone, thesis, "device")[1]) == [GravityEdges, OdometryEdges]
+
+
+def test_a_file_of_odometry_comes_before_the_poses_of_the_phone(recording) -> None:
+    phone = by_phone(recording)
+    odometry = np.tile(np.eye(4), (len(phone), 1, 1))
+    phone.source.odometry = odometry
+    led, config = with_prior(phone, from_method("default"), "device")
+    np.testing.assert_array_equal(led.odometry, odometry)
+    assert kinds(config) == [GravityEdges, OdometryEdges]
+    # What a configuration says of odometry stays.
+    said = replace(from_method("default"), outside=(OdometryEdges(share=0.1),))
+    assert with_prior(phone, said, "device")[1] is said
+
+
+def test_an_unknown_prior_is_refused(recording) -> None:
+    with pytest.raises(InputError, match="auto, none or device"):
+        with_prior(recording, from_method("default"), "some")
+
+
+def test_poses_of_another_place_do_not_count(recording) -> None:
+    """A phone that lost itself: what it says disagrees with the images."""
+    rng = np.random.default_rng(0)
+    wrong = recording.reference.copy()
+    wrong[:, :3, 3] = rng.uniform(-2, 2, (len(wrong), 3))
+    phone, config = with_prior(by_phone(recording, wrong), from_method("default"), "auto")
+    alone = reconstruct(recording)
+    result = reconstruct(phone, config)
+    gap = np.linalg.norm(result.trajectory[:, :3, 3] - alone.trajectory[:, :3, 3], axis=1)
+    assert gap.max() < 0.01
+    [sensor] = result.diagnostics.outside
+    assert sensor.scale is not None
+    assert sensor.scale > 2
+
+
+@pytest.mark.parametrize(
+    ("prior", "sensors"), [("auto", ["gravity"]), ("none", []), ("device", None)]
+)
+def test_the_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
+    given = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--prior", prior]
+    assert main([*given, "--end", "4"]) == (2 if sensors is None else 0)
+    if sensors is None:
+        assert "--prior" in capsys.readouterr().err
+        return
+    config = read_run_json(tmp_path / "out" / "run.json")["config"]
+    assert [sensor["part"] for sensor in config["outside"]] == sensors

@@ -1,0 +1,105 @@
+"""Graphs that can not be meant or improved: each optimiser says so, and harms nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios
+from tofuse.posegraph.castellani import Castellani
+from tofuse.posegraph.g2o import read_g2o, write_g2o
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from walked_graph import walk
+
+OPTIMISERS = [LevenbergMarquardt(), Castellani(), LuMilios(), Elch()]
+GRAPH, TRUTH, _ = walk(10, 4)
+
+
+def spoilt(name: str, k: int, value: object) -> PoseGraph:
+    values = getattr(GRAPH, name).copy()
+    values[k] = value
+    return replace(GRAPH, **{name: values})
+
+
+FAR = np.eye(4)
+FAR[0, 3] = 1e200
+MOTIONS = {
+    "pose 2 is not finite": spoilt("poses", 2, np.nan),
+    "measurement 3 is not finite": spoilt("measurements", 3, np.inf),
+    "pose 4 is not a rigid motion": spoilt("poses", 4, np.diag([2.0, 2, 2, 1])),
+    "pose 5 is not a rigid motion": spoilt("poses", 5, np.diag([1.0, 1, -1, 1])),
+    "measurement 6 is not a rigid motion": spoilt("measurements", 6, FAR),
+}
+INFORMATION = {
+    "information 3 is not finite": spoilt("information", 3, np.nan),
+    "edge 3 4: the information matrix is not positive": spoilt("information", 3, -np.eye(6)),
+}
+
+
+@pytest.mark.parametrize("says", [*MOTIONS, *INFORMATION])
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
+def test_what_can_not_be_meant_is_refused(optimiser, says):
+    if says in INFORMATION and isinstance(optimiser, Castellani):
+        optimiser.optimise(INFORMATION[says])  # which does not look at it
+        return
+    with pytest.raises(InputError, match=says):
+        optimiser.optimise({**MOTIONS, **INFORMATION}[says])
+
+
+@pytest.mark.parametrize(("ends", "says"), [((5, 5), "to itself"), ((5, 10), "not there")])
+def test_edges_that_join_nothing_are_refused(ends, says):
+    edges = GRAPH.edges.copy()
+    edges[3] = ends
+    with pytest.raises(InputError, match=says):
+        replace(GRAPH, edges=edges)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
+def test_parts_do_not_disturb_each_other(optimiser):
+    n = len(GRAPH.ids)
+    both = PoseGraph(
+        np.concatenate([GRAPH.ids, 100 + GRAPH.ids, [500]]),
+        np.concatenate([GRAPH.poses, GRAPH.poses, se3.exp(np.ones((1, 6)))]),
+        np.concatenate([GRAPH.edges, GRAPH.edges + n]),
+        np.concatenate([GRAPH.measurements] * 2),
+        np.concatenate([GRAPH.information] * 2),
+        np.concatenate([GRAPH.loop] * 2),
+    )
+    alone, done = optimiser.optimise(GRAPH).graph.poses, optimiser.optimise(both).graph.poses
+    np.testing.assert_allclose(done[:n], alone, atol=1e-5)
+    np.testing.assert_allclose(done[n:-1], alone, atol=1e-5)
+    np.testing.assert_allclose(done[-1], both.poses[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
+def test_what_can_not_be_improved_stays_and_is_told(optimiser):
+    i, j = GRAPH.edges.T
+    exact = replace(GRAPH, poses=TRUTH, measurements=se3.inverse(TRUTH[i]) @ TRUTH[j])
+    np.testing.assert_allclose(optimiser.optimise(exact).graph.poses, TRUTH, atol=1e-9)
+    nothing = replace(
+        GRAPH, **{name: getattr(GRAPH, name)[:0] for name in ("edges", "measurements")},
+        information=GRAPH.information[:0], loop=GRAPH.loop[:0],
+    )  # fmt: skip
+    done = optimiser.optimise(nothing)
+    np.testing.assert_allclose(done.graph.poses, GRAPH.poses, atol=1e-12)
+    assert not done.improved
+    assert optimiser.optimise(GRAPH).improved or isinstance(optimiser, Elch)
+
+
+@pytest.mark.parametrize("name", ["levenberg-marquardt", "lu-milios"])
+def test_the_command_says_that_nothing_better_was_found(name, tmp_path, capsys):
+    best = LevenbergMarquardt(tolerance=1e-15).optimise(GRAPH).graph
+    i, j = best.edges.T
+    exact = replace(best, measurements=se3.inverse(best.poses[i]) @ best.poses[j])
+    write_g2o(tmp_path / "in.g2o", exact)
+    words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
+    assert main([*words, "--optimiser", name]) == 0
+    assert "nothing better was found" in capsys.readouterr().out
+    np.testing.assert_allclose(read_g2o(tmp_path / "out.g2o").poses, best.poses, atol=1e-12)

@@ -1,0 +1,114 @@
+"""Views that tell what is wrong with their camera, and views that don't."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import OPTIONS, path, surfaces
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.calibration_check import Gap, check_calibration, longest_loop
+from tofuse.posegraph.joint_alignment import Priors, Refined, refine, response
+from tofuse.posegraph.view_store import KeptView
+
+
+def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
+    """Views of a camera whose ranges are short by `offset`, refined as if they were right."""
+    truth = path(12)[:views]
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
+    return views, refine(views, truth, OPTIONS)
+
+
+def test_a_camera_that_errs_is_suspected(monkeypatch):
+    views, refined = kept(0.06)
+    # Where there are many pairs, some of them and of their points tell as much.
+    monkeypatch.setattr("tofuse.posegraph.calibration_check._ENOUGH_PAIRS", len(refined.pairs) // 2)
+    some = check_calibration(views, refined, OPTIONS, Priors.none())
+    monkeypatch.undo()
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert found.alarm
+    assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
+    assert found.sigmas["offset"] < 0.01
+    assert found.gap is not None
+    assert (found.gap.i, found.gap.j) == (0, 11)
+    # This path is not bent by it.
+    assert found.gap.before[0] < 0.01
+    assert found.gap.closes
+    assert found.support is not None
+    assert found.support[1] > found.support[0]
+    assert some.alarm
+    assert some.errors["offset"] == pytest.approx(found.errors["offset"], abs=0.01)
+    assert some.errors != found.errors
+    assert some.gap is not None
+    assert some.gap.before == found.gap.before
+
+
+def test_a_camera_that_does_not_err_is_not():
+    views, refined = kept(0.0)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert not found.alarm
+    assert found.gap is None
+
+
+def test_a_focal_length_that_nothing_holds_is_not_known():
+    # Without rotation a wrong focal length makes everything wider alike: views agree all the same.
+    truth = path(12)
+    truth[:, :3, :3] = np.eye(3)
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
+    turned = [KeptView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
+
+    def sigma(views: list[KeptView], poses: np.ndarray) -> float:
+        pairs = refine(views, poses, OPTIONS).pairs
+        said = response(views, poses, pairs, OPTIONS)
+        return float(said.sigma(pairs, len(views))[kernels.FOCAL])
+
+    assert sigma(views, truth) > 0.1
+    assert sigma(turned, path(12)) < 0.02
+
+
+def test_few_views_suspect_nothing():
+    views, refined = kept(0.06, views=5)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert not found.alarm
+    assert not found.errors
+
+
+def test_what_does_not_close_a_loop_is_no_cure():
+    assert Gap(0, 9, (0.3, 0.2), (0.1, 0.19)).closes
+    assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # not by half
+    assert not Gap(0, 9, (0.09, 0.048), (0.17, 0.059)).closes
+    assert not Gap(0, 9, (0.3, 0.02), (0.1, 0.04)).closes  # turned instead
+    # Of a turn on the spot the angle counts, a few centimetres more or less do not.
+    assert Gap(0, 9, (0.047, 0.18), (0.063, 0.046), 2.5).closes
+    assert not Gap(0, 9, (0.047, 0.18), (0.063, 0.16), 2.5).closes
+    assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
+
+
+def test_the_longest_loop_goes_by_neighbours_alone():
+    pairs = np.array([(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (0, 5), (3, 5)])
+    assert longest_loop(pairs) == (0, 2)  # 2 and 3 are not joined, so 0 to 5 is none
+    joined = np.concatenate([pairs, [(2, 3)]])
+    assert longest_loop(joined) == (0, 5)
+    assert longest_loop(pairs[[0, 1]]) is None
+    assert longest_loop(pairs[:0]) is None
+
+
+def test_the_kinect_loop_raises_the_alarm(shared_data):
+    """Its intrinsics are wrong by 5 %, as box corners of 87 degrees say as well."""
+    from tofuse.pipeline.reconstruct import reconstruct
+    from tofuse.recordings.open import open_recording
+
+    result = reconstruct(open_recording(shared_data / "kinectv2_loop" / "recording"))
+    assert "calibration_alarm" in {r.code for r in result.diagnostics.reasons}
+    refinement = result.diagnostics.refinement
+    assert refinement is not None
+    found = refinement.calibration_check
+    assert found is not None
+    assert found.errors["focal"] == pytest.approx(-0.05, abs=0.015)
+    assert found.gap is not None
+    assert found.gap.before[0] > 0.25
+    assert found.gap.after[0] < 0.5 * found.gap.before[0]
+    # A proposal: nothing was changed by it.
+    assert refinement.errors == {}
+    assert se3.angle(result.trajectory[0]) == pytest.approx(0, abs=1e-12)

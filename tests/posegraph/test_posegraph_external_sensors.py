@@ -1,0 +1,267 @@
+"""Gravity and odometry priors the camera: how they are weighed, and that wrong ones do no harm."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.covariances import pose_covariances
+from tofuse.posegraph.external_sensors import (
+    GravityEdges,
+    OdometryEdges,
+    SensorData,
+    SensorPriors,
+    measure_all,
+    with_sensors,
+)
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.joint_alignment import Priors, RefineOptions, refine
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.view_store import KeptView
+
+N = 60
+SIGMA = np.array([0.004] * 3 + [0.004] * 3)
+STATED = 3 * SIGMA
+DOWN = np.array([0.1, 0.97, -0.2]) / np.linalg.norm([0.1, 0.97, -0.2])
+
+
+def truth() -> np.ndarray:
+    """A turn with some nodding."""
+    a = np.linspace(0, 2 * np.pi, N)
+    turn = se3.so3_exp(np.stack([0.1 * np.sin(3 * a), a, 0.1 * np.cos(2 * a) - 0.1], 1))
+    out = np.tile(np.eye(4), (N, 1, 1))
+    out[:, :3, :3] = turn[0].T @ turn
+    out[:, :3, 3] = np.stack([np.sin(a), 0 * a, 1 - np.cos(a)], 1)
+    return out
+
+
+def tracked(
+    poses: np.ndarray, bias: np.ndarray, seed: int = 0, stated: np.ndarray = SIGMA
+) -> PoseGraph:
+    """A chain whose every step errs by noise and by a bias, and states its errors."""
+    rng = np.random.default_rng([7, seed])
+    chain, steps = [poses[0]], []
+    for k, (a, b) in enumerate(itertools.pairwise(poses)):
+        T = se3.inverse(a) @ b @ se3.exp(bias + SIGMA * rng.standard_normal(6))
+        steps.append(Measured(k, k + 1, T, np.diag(stated**-2)))
+        chain.append(chain[-1] @ T)
+    return build_graph(range(N), np.stack(chain), steps)
+
+
+def sensed(odometry: np.ndarray | None = None, gravity: np.ndarray | None = None) -> SensorData:
+    return SensorData(
+        np.arange(N),
+        np.full((N, 4, 4), np.nan) if odometry is None else odometry,
+        np.full((N, 4), np.nan) if gravity is None else gravity,
+        np.zeros(N, np.intp),
+    )
+
+
+def seen_down(poses: np.ndarray, sigma: float = 0.02, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    d = np.einsum("kji,j->ki", poses[:, :3, :3], DOWN) + sigma * rng.standard_normal((N, 3))
+    return np.concatenate([d / np.linalg.norm(d, axis=1)[:, None], np.full((N, 1), sigma)], 1)
+
+
+def tilt(poses: np.ndarray, right: np.ndarray) -> float:
+    """Rms angle between the vertical as the poses have it and as it is, rad."""
+    d = np.einsum("kij,klj,l->ki", poses[:, :3, :3], right[:, :3, :3], DOWN)
+    return float(np.sqrt(((d - DOWN) ** 2).sum(1).mean()))
+
+
+def ate(poses: np.ndarray, right: np.ndarray) -> float:
+    return float(np.sqrt(((poses - right)[:, :3, 3] ** 2).sum(1).mean()))
+
+
+NODDING = np.array([0, 0, 0, 0.004, 0, 0])
+
+
+def solved(graph: PoseGraph, told: SensorPriors) -> np.ndarray:
+    return LevenbergMarquardt().optimise(with_sensors(graph, told)).graph.poses
+
+
+def test_gravity_takes_out_the_drift_of_roll_and_pitch():
+    right = truth()
+    graph = tracked(right, NODDING, stated=STATED)
+    told = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
+    held = solved(graph, told)
+    assert tilt(graph.poses, right) > np.radians(2.5)
+    assert tilt(held, right) < 0.4 * tilt(graph.poses, right)
+    np.testing.assert_array_equal(held[0], graph.poses[0])
+    assert told.records[0].used == N
+    up = told.up(graph.with_poses(held))
+    assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
+    assert SensorPriors().up(graph) is None
+    # It says nothing of the heading, nor of where the cameras are.
+    C, free = pose_covariances(with_sensors(graph, told)), pose_covariances(graph)
+    assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])
+    assert C[-1, 4, 4] > 0.5 * free[-1, 4, 4]
+
+
+def test_an_accelerometer_in_motion_does_not_count_for_gravity():
+    """A third of the time the camera is pushed to one side with a third of g."""
+    right = truth()
+    graph = tracked(right, NODDING, stated=STATED)
+    lying = seen_down(right)
+    lying[20:40, :3] += 0.33 * right[20:40, 0, :3]
+    lying[:, :3] /= np.linalg.norm(lying[:, :3], axis=1)[:, None]
+    believed = replace(GravityEdges(), gate=np.inf)
+    robust = tilt(
+        solved(graph, measure_all((GravityEdges(),), sensed(gravity=lying), graph)), right
+    )
+    plain = tilt(solved(graph, measure_all((believed,), sensed(gravity=lying), graph)), right)
+    assert robust < 0.5 * tilt(graph.poses, right)
+    assert robust < 0.7 * plain
+    record = measure_all((GravityEdges(),), sensed(gravity=lying), graph).records[0]
+    assert 35 <= record.used <= 45
+
+
+def test_the_vertical_is_never_known_better_than_the_error_that_all_frames_share():
+    right = truth()
+    graph = tracked(right, 0 * NODDING)
+    told = measure_all((GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph)
+    assert told.gravity is not None
+    together = (told.gravity[:, 3] ** -2.0).sum() ** -0.5
+    assert 0.0095 < together < 0.0115
+    few = sensed(gravity=np.where(np.arange(N)[:, None] < 2, seen_down(right), np.nan))
+    none = measure_all((GravityEdges(),), few, graph)
+    assert not none
+    assert "only 2 frames" in none.records[0].text
+
+
+def odometer(right: np.ndarray, share: float = 0.01) -> np.ndarray:
+    """Poses in another frame, of steps that err by a share."""
+    rng = np.random.default_rng(5)
+    out = [se3.exp(np.array([1.0, 2, 3, 0.5, -1, 0.2]))]
+    for a, b in itertools.pairwise(right):
+        step = se3.inverse(a) @ b
+        noise = share * np.repeat([np.linalg.norm(step[:3, 3]), se3.angle(step)], 3)
+        out.append(out[-1] @ step @ se3.exp(noise * rng.standard_normal(6)))
+    return np.stack(out)
+
+
+def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
+    right = truth()
+    graph = tracked(right, 0 * NODDING)
+    before = ate(graph.poses, right)
+    good = measure_all((OdometryEdges(share=0.01, share_rad=0.01),), sensed(odometer(right)), graph)
+    assert len(good.steps) == N - 1
+    assert ate(solved(graph, good), right) < 0.6 * before
+    # Of another camera: in other axes, and half as long again.
+    other = odometer(right) @ se3.exp(np.array([0, 0, 0, 0, 1.2, 0]))
+    other[:, :3, 3] *= 1.5
+    wrong = measure_all((OdometryEdges(),), sensed(other), graph)
+    assert not wrong
+    assert "not used" in wrong.records[0].text
+    assert with_sensors(graph, wrong) is graph
+
+
+def test_odometry_counts_with_the_errors_that_it_has():
+    """Ten times the noise that is stated: it is taken for that, and spoils nothing."""
+    right = truth()
+    graph = tracked(right, 0 * NODDING)
+    noisy = odometer(right, 0.1)
+    told = measure_all((OdometryEdges(share=0.03, share_rad=0.03),), sensed(noisy), graph)
+    record = told.records[0]
+    assert record.scale is not None
+    assert 1.5 < record.scale < 5
+    assert ate(solved(graph, told), right) < 1.1 * ate(graph.poses, right)
+
+
+def test_a_jump_of_the_odometry_is_left_out():
+    right = truth()
+    graph = tracked(right, 0 * NODDING)
+    jumped = odometer(right)
+    jumped[30:] = jumped[30:] @ np.eye(4)
+    jumped[30:, :3, 3] += [0.5, 0, 0.2]
+    told = measure_all((OdometryEdges(),), sensed(jumped), graph)
+    assert {step.i for step in told.steps} == set(range(N - 1)) - {29}
+    # Nor are steps made up where odometry is missing, or another recording begins.
+    holes = odometer(right)
+    holes[10] = np.nan
+    parts = (np.arange(N) >= 40).astype(np.intp)
+    told = measure_all((OdometryEdges(),), replace(sensed(holes), parts=parts), graph)
+    assert {step.i for step in told.steps} == set(range(N - 1)) - {9, 10, 39}
+    steps = told.between([0, 4, 8, 12, 39, 42])
+    assert [(s.i, s.j) for s in steps] == [(0, 4), (4, 8), (12, 39)]
+    expected = se3.inverse(holes[4]) @ holes[8]
+    np.testing.assert_allclose(steps[1].T_i_j, expected, atol=1e-9)
+
+
+def test_without_files_nothing_changes():
+    graph = tracked(truth(), NODDING)
+    told = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)
+    assert not told
+    assert told.records == ()
+    assert with_sensors(graph, told) is graph
+
+
+@pytest.mark.parametrize(
+    ("part", "options"),
+    [
+        (GravityEdges, {"shared_rad": 0}),
+        (GravityEdges, {"gate": -1}),
+        (GravityEdges, {"min_frames": 0}),
+        (OdometryEdges, {"share": -1}),
+        (OdometryEdges, {"min_m": 0}),
+        (OdometryEdges, {"limit": 0.5}),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(part, options):
+    with pytest.raises(ValueError, match=r"is|must"):
+        part(**options)
+
+
+def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
+    """Views of a bare wall, which any turn about its normal and shift along it leaves as it is."""
+    from test_kernels_refinement import SHARP, corner
+
+    from tofuse.registration.prepared_view import prepare_view
+
+    poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))
+    views = []
+    for k, T in enumerate(poses):
+        frame = replace(corner(T), index=k)
+        wall = frame.keep(np.zeros_like(frame.valid))
+        assert wall.camera is frame.camera
+        rays = frame.camera.rays()
+        n = T[:3, :3].T @ np.array([0, 0, 1.0])
+        z = (2.0 - T[2, 3]) / (rays @ n[:2] + n[2])
+        frame = replace(frame, depth=z.astype(np.float32), amplitude_image=None)
+        views.append(KeptView.of(prepare_view(frame, SHARP), 800))
+    rolled = poses.copy()
+    for k in range(6):
+        rolled[k] = rolled[k] @ se3.exp(np.array([0, 0, 0, 0, 0, 0.02 * k]))
+    options = RefineOptions(photometric=False)
+    down = np.array([0, 1.0, 0])
+    gravity = measure_all(
+        (GravityEdges(),),
+        SensorData(
+            np.arange(6),
+            np.full((6, 4, 4), np.nan),
+            np.concatenate(
+                [np.einsum("kji,j->ki", poses[:, :3, :3], down), np.full((6, 1), 0.01)], 1
+            ),
+            np.zeros(6, np.intp),
+        ),
+        build_graph(range(6), rolled, []),
+    ).gravity_of(range(6))
+    priors = replace(Priors.none(), gravity=gravity)
+    free = refine(views, rolled, options)
+    held = refine(views, rolled, options, priors=priors)
+
+    def off(found: np.ndarray) -> float:
+        return float(se3.angle(se3.inverse(poses[-1]) @ found[-1]))
+
+    assert off(free.poses) > 0.05
+    assert off(held.poses) < 0.01
+    # Nothing priors them: the same to the last bit.
+    same = refine(views, rolled, options, priors=Priors.none(), calibrate=[kernels.FOCAL])
+    again = refine(views, rolled, options, calibrate=[kernels.FOCAL])
+    np.testing.assert_array_equal(same.poses, again.poses)

@@ -1,0 +1,334 @@
+"""The default optimiser: exact derivatives, weights, false loops, gravity, anchors, parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.arrays import Float64
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.posegraph import robust
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.g2o import read_g2o
+from tofuse.posegraph.graph import Anchors, Gravity, PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.solve import Settings, solve
+from tofuse.posegraph.sparse import PairSystem
+from walked_graph import SIGMA, walk
+
+
+def ate(poses: Float64, truth: Float64) -> float:
+    """Position error without alignment: the first pose is the truth's."""
+    return float(np.sqrt(((poses - truth)[:, :3, 3] ** 2).sum(1).mean()))
+
+
+def objective(graph: PoseGraph, poses: Float64) -> float:
+    return graph.with_poses(poses).chi2()
+
+
+@pytest.mark.parametrize("rotation", ["tangent", "quaternion", "cosines"])
+def test_the_minimum_is_a_minimum_in_every_direction(rotation):
+    """At the solution no small motion of any pose lowers the objective, and slopes are zero."""
+    graph, _, _ = walk(20, 10)
+    done = LevenbergMarquardt(robust="none", rotation=rotation, tolerance=1e-14).optimise(graph)
+    least = done.graph.chi2()
+    assert least == pytest.approx(done.objective[-1])
+    assert least < 0.1 * graph.chi2()
+    for k in range(1, 20):
+        for axis in range(6):
+            step = np.zeros(6)
+            step[axis] = 1e-4
+            values = []
+            for sign in (1, -1):
+                poses = done.graph.poses.copy()
+                poses[k] = poses[k] @ se3.exp(sign * step)
+                values.append(objective(graph, poses))
+            assert min(values) > least
+            # The slope, in units of the curvature over one standard deviation.
+            slope, curvature = (values[0] - values[1]) / 2e-4, (sum(values) - 2 * least) / 1e-8
+            assert abs(slope / curvature) < 1e-6
+
+
+def test_gradient_and_curvature_are_those_of_the_objective():
+    """The assembled system against numerical derivatives, far from the minimum."""
+    graph, _, _ = walk(8, 5)
+    rng = np.random.default_rng(1)
+    poses = graph.poses @ se3.exp(rng.normal(size=(8, 6)) * 0.3)
+    i, j = graph.edges.T
+    system = PairSystem(8, graph.edges)
+    e = graph.with_poses(poses).residuals()
+    J = se3.jacobian_inverse(e)
+    H = np.swapaxes(J, 1, 2) @ graph.information @ J
+    g = (np.swapaxes(J, 1, 2) @ graph.information @ e[..., None])[..., 0]
+    matrix, gradient = system.relative(H, g, se3.inverse(poses[i]) @ poses[j])
+
+    root = np.linalg.cholesky(graph.information)
+
+    def whitened(x: Float64) -> Float64:
+        moved = poses.copy()
+        moved[system.free] = poses[system.free] @ se3.exp(x.reshape(-1, 6))
+        r = graph.with_poses(moved).residuals()
+        return np.einsum("mji,mj->mi", root, r).ravel()
+
+    h = 1e-6
+    numeric = np.stack([(whitened(h * u) - whitened(-h * u)) / (2 * h) for u in np.eye(42)], axis=1)
+    scale = np.abs(numeric.T @ numeric).max()
+    np.testing.assert_allclose(matrix.toarray(), numeric.T @ numeric, atol=1e-7 * scale)
+    expected = numeric.T @ whitened(np.zeros(42))
+    np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_one_step_solves_the_damped_system():
+    graph, _, _ = walk(12, 8)
+    rng = np.random.default_rng(2)
+    m = len(graph.edges)
+    root = rng.normal(size=(m, 6, 6))
+    H, g = root @ np.swapaxes(root, 1, 2), rng.normal(size=(m, 6))
+    system = PairSystem(12, graph.edges)
+    matrix, gradient = system.relative(H, g, graph.measurements)
+    dense = matrix.toarray()
+    for damping in (0.0, 0.5):
+        step = system.solve(H, g, graph.measurements, damping)
+        expected = np.linalg.solve(dense + damping * np.diag(np.diag(dense)), -gradient.ravel())
+        np.testing.assert_allclose(step[system.free].ravel(), expected, rtol=1e-8, atol=1e-12)
+        assert (step[0] == 0).all()
+    # What single poses add, here enough to hold a pose that no pair reaches.
+    lonely = PairSystem(13, graph.edges, np.zeros(13, bool))
+    single = np.tile(np.eye(6), (13, 1, 1)), np.tile(np.arange(6.0), (13, 1))
+    np.testing.assert_allclose(
+        lonely.solve(H, g, graph.measurements, single=single)[12], -np.arange(6.0)
+    )
+    assert lonely.solve(H, g, graph.measurements) is None
+
+
+def test_covariances_are_those_of_repeated_measurements():
+    """Marginals of the dense inverse, and the spread over many graphs, are the same."""
+    graph, truth, _ = walk(16, 8)
+    solution = solve(graph.poses, graph.edges, graph.measurements, graph.information)
+    factor = solution.factor()
+    assert factor is not None
+    C = factor.covariances()
+    np.testing.assert_array_equal(C[0], 0)
+    joint = factor.joint_covariance(np.array([3, 0, 9]))
+    np.testing.assert_allclose(joint[:6, :6], C[3], rtol=1e-9)
+    np.testing.assert_allclose(joint[12:, 12:], C[9], rtol=1e-9)
+    np.testing.assert_array_equal(joint[6:12], 0)
+    # Relative ones, from the joint covariance of the two ends.
+    i, j = graph.edges.T
+    T_i_j = se3.inverse(solution.poses[i]) @ solution.poses[j]
+    relative = factor.relative_covariances(T_i_j)
+    for m in (0, 4, len(i) - 1):
+        both = factor.joint_covariance(graph.edges[m])
+        J = np.concatenate([-se3.adjoint(se3.inverse(T_i_j[m])), np.eye(6)], axis=1)
+        np.testing.assert_allclose(relative[m], J @ both @ J.T, rtol=1e-7, atol=1e-14)
+    rng = np.random.default_rng(5)
+    exact = se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    errors = []
+    for _ in range(150):
+        noisy = exact @ se3.exp(rng.normal(size=(len(exact), 6)) * SIGMA)
+        found = solve(truth, graph.edges, noisy, graph.information).poses
+        errors.append(se3.log(se3.inverse(truth) @ found)[15])
+    x = np.array(errors)
+    mahalanobis = np.einsum("ki,ij,kj->k", x, np.linalg.inv(C[15]), x)
+    # 150 chi-square variables with six degrees of freedom: 6 with a deviation of 0.28.
+    assert mahalanobis.mean() == pytest.approx(6, abs=1)
+
+
+def test_information_decides_which_edge_gives_way():
+    """Two measurements of one motion: the mean, weighted by the whole matrix."""
+    rng = np.random.default_rng(3)
+    roots = rng.normal(size=(2, 6, 6))
+    information = roots @ np.swapaxes(roots, 1, 2)
+    small = rng.normal(size=(2, 6)) * 1e-4
+    edges = [Measured(0, 1, se3.exp(x), W) for x, W in zip(small, information, strict=True)]
+    graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), edges)
+    found = se3.log(LevenbergMarquardt(tolerance=1e-14).optimise(graph).graph.poses[1])
+    expected = np.linalg.solve(
+        information.sum(0), sum(W @ x for x, W in zip(small, information, strict=True))
+    )
+    np.testing.assert_allclose(found, expected, atol=5e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_loops_are_left_out_and_true_ones_kept(seed):
+    clean, truth, _ = walk(seed=seed)
+    graph, _, false = walk(false=12, seed=seed)
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.weights == 0, false)
+    alone = ate(LevenbergMarquardt().optimise(clean).graph.poses, truth)
+    assert ate(done.graph.poses, truth) < 1.01 * alone
+    plain = LevenbergMarquardt(robust="none").optimise(graph).graph.poses
+    assert ate(plain, truth) > 20 * alone
+
+
+@pytest.mark.parametrize("seed", [0, 4, 5])
+def test_a_false_loop_can_not_hide_where_odometry_is_weak(seed):
+    """It bends the odometry and fits then; but the other loops contradict it."""
+    rng = np.random.default_rng(7)
+    graph, truth, false = walk(loops=5, false=2, seed=seed)
+    i, j = graph.edges[:59].T
+    measurements = graph.measurements.copy()
+    noise = se3.exp(rng.normal(size=(59, 6)) * SIGMA * 10)
+    measurements[:59] = se3.inverse(truth[i]) @ truth[j] @ noise
+    loose = np.where(graph.loop, 1.0, 0.01)[:, None, None]
+    graph = replace(graph, measurements=measurements, information=loose * graph.information)
+    plain = LevenbergMarquardt(robust="none").optimise(graph).graph
+    r = plain.residuals()[false]
+    assert np.einsum("mi,mij,mj->m", r, plain.information[false], r).max() < 6
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.weights == 0, false)
+    assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
+
+
+def test_few_loops_that_hardly_matter_are_no_reason_to_leave_any_out():
+    graph, _, _ = walk(60, 600)
+    measurements = graph.measurements.copy()
+    # One that is 11 standard deviations off, among 600 that share a squared error of 3600.
+    off = np.zeros(6)
+    off[0] = 11 * SIGMA[0]
+    measurements[-1] = measurements[-1] @ se3.exp(off)
+    graph = replace(graph, measurements=measurements)
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.weights.all()
+    np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
+    measurements[-1] = measurements[-1] @ se3.exp(10 * off)
+    assert LevenbergMarquardt().optimise(graph).weights[-1] == 0
+
+
+def test_without_false_loops_it_is_least_squares():
+    graph, _, _ = walk()
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
+    assert done.objective == plain.objective
+    assert (done.weights == 1).all()
+    # Standard deviations that are three times too small do not make true loops false.
+    boast = replace(graph, information=9 * graph.information)
+    assert (LevenbergMarquardt().optimise(boast).weights == 1).all()
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs", "switchable"])
+def test_kernels(kernel):
+    """Weights are the slope of the cost; small errors count in full, large ones less."""
+    x = np.array([1e-6, 0.5, 3.9, 4.1, 7.0, 40.0, 1e4])
+    h = 1e-6 * x
+    slope = (robust.cost(kernel, x + h, 4.0) - robust.cost(kernel, x - h, 4.0)) / (2 * h)
+    np.testing.assert_allclose(robust.weight(kernel, x, 4.0), slope, rtol=1e-5)
+    assert robust.weight(kernel, x, 4.0)[0] == pytest.approx(1, abs=1e-5)
+    assert robust.weight(kernel, x, 4.0)[-1] < 0.03
+    graph, truth, _ = walk(false=3, seed=4)
+    done = LevenbergMarquardt(robust=kernel, gate=16.0).optimise(graph)
+    assert (np.diff(done.objective) <= 0).all()
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
+
+
+def test_a_switch_at_its_best_costs_what_the_kernel_says():
+    x = np.array([0.1, 4.0, 100.0])
+    s = np.linspace(0, 1, 200001)[:, None]
+    best = (s**2 * x + 4.0 * (1 - s) ** 2).min(axis=0)
+    np.testing.assert_allclose(robust.cost("switchable", x, 4.0), best, rtol=1e-6)
+
+
+def test_gravity_holds_the_tilt_of_a_chain():
+    """Without loops the tilt drifts; edges to the vertical stop it, the heading stays as it was."""
+    graph, truth, _ = walk(60, 0)
+    down = np.swapaxes(truth[:, :3, :3], 1, 2) @ np.array([0.1, 0.9, np.sqrt(1 - 0.82)])
+    for world in (None, np.array([0.1, 0.9, np.sqrt(1 - 0.82)])):
+        gravity = Gravity(np.arange(60), down, np.full(60, 1e-4), world)
+        done = LevenbergMarquardt(tolerance=1e-10).optimise(replace(graph, gravity=gravity))
+
+        def tilt(poses: Float64) -> Float64:
+            up = poses[:, :3, :3] @ down[..., None]
+            return np.linalg.norm(np.cross(up[..., 0], truth[0, :3, :3] @ down[0]), axis=1)
+
+        assert tilt(graph.poses).max() > 0.01
+        assert tilt(done.graph.poses).max() < 5e-4
+        assert done.converged
+        np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
+
+
+def test_anchors_hold_the_path_in_a_frame_of_their_own():
+    graph, truth, _ = walk(60, 0)
+    elsewhere = se3.exp([5.0, -3.0, 1.0, 0.3, 2.0, -0.4])
+    k = np.arange(0, 60, 10)
+    anchors = Anchors(k, elsewhere @ truth[k], np.tile(np.eye(6) * 1e8, (6, 1, 1)))
+    done = LevenbergMarquardt().optimise(replace(graph, anchors=anchors))
+    assert ate(graph.poses, truth) > 0.1
+    assert np.abs((done.graph.poses - truth)[k]).max() < 1e-3
+    assert done.graph.poses.shape == (60, 4, 4)
+
+
+def test_parts_are_solved_by_themselves_and_told_apart():
+    a, _, _ = walk(20, 8)
+    b, _, _ = walk(12, 5, seed=1)
+    n, m = len(a.ids), len(a.edges)
+    both = PoseGraph(
+        np.concatenate([a.ids, 100 + b.ids, [500]]),
+        np.concatenate([a.poses, b.poses, np.eye(4)[None]]),
+        np.concatenate([a.edges, b.edges + n]),
+        np.concatenate([a.measurements, b.measurements]),
+        np.concatenate([a.information, b.information]),
+        np.concatenate([a.loop, b.loop]),
+    )
+    optimiser = LevenbergMarquardt()
+    done = optimiser.optimise(both)
+    np.testing.assert_array_equal(done.graph.poses[:n], optimiser.optimise(a).graph.poses)
+    np.testing.assert_array_equal(done.graph.poses[n:-1], optimiser.optimise(b).graph.poses)
+    assert [(p.first, p.vertices, p.edges) for p in done.parts] == [
+        (0, 20, m),
+        (100, 12, len(b.edges)),
+        (500, 1, 0),
+    ]
+    assert [p.improved for p in done.parts] == [True, True, False]
+    assert done.objective[-1] == pytest.approx(sum(p.after for p in done.parts))
+
+
+def test_where_nothing_is_better_the_input_stays():
+    graph, truth, _ = walk(10, 4)
+    i, j = graph.edges.T
+    exact = replace(graph, poses=truth, measurements=se3.inverse(truth[i]) @ truth[j])
+    best = LevenbergMarquardt(tolerance=1e-15).optimise(exact)
+    again = LevenbergMarquardt(tolerance=1e-15).optimise(best.graph)
+    assert not again.parts[0].improved
+    np.testing.assert_array_equal(again.graph.poses, best.graph.poses)
+    empty = LevenbergMarquardt().optimise(PoseGraph.empty())
+    assert (len(empty.graph.ids), empty.converged) == (0, True)
+
+
+def test_what_can_not_be_meant_is_refused():
+    graph, _, _ = walk(8, 2)
+    poses = graph.poses.copy()
+    poses[2, 0, 3] = np.nan
+    with pytest.raises(InputError, match="pose 2 is not finite"):
+        LevenbergMarquardt().optimise(graph.with_poses(poses))
+    information = graph.information.copy()
+    information[3, 1, 1] *= -1
+    with pytest.raises(InputError, match="edge 3 4: the information matrix is not positive"):
+        LevenbergMarquardt().optimise(replace(graph, information=information))
+    with pytest.raises(ValueError, match="gate is 0"):
+        LevenbergMarquardt(gate=0.0)
+    with pytest.raises(InputError, match="names no vertex"):
+        replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
+
+
+@pytest.mark.parametrize(
+    ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
+)
+def test_benchmark_graphs_end_where_gtsam_does(shared_data, name, least):
+    """Half the squared error, as GTSAM 4.3's Levenberg-Marquardt reports it from the same start."""
+    graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o")
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.converged
+    assert done.graph.chi2() / 2 < 1.00001 * least
+    assert (done.weights == 1).all()
+
+
+def test_settings_of_the_part_are_those_of_the_function():
+    part, function = LevenbergMarquardt(), Settings()
+    for name in ("robust", "gate", "max_inflation", "rotation", "tolerance", "max_iterations"):
+        assert getattr(part, name) == getattr(function, name)

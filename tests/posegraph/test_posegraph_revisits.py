@@ -1,0 +1,165 @@
+"""Loops of range images: the camera looks away from a corner, and comes back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from corner_views import corner
+from revisited_path import ALL, DRIFT, pushed
+from tofuse.geometry import se3
+from tofuse.posegraph import revisits
+from tofuse.posegraph.appearance import Appearance
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.revisits import Revisits
+from tofuse.posegraph.view_store import ViewStore
+from tofuse.registration.base import Registration
+from tofuse.registration.confidence import BELIEVED
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.verification import Assessment
+
+
+def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
+    frames, truth, start = turn
+    found = pushed(Revisits(spacing=ALL, searches=0), frames, start)
+    closed = [c for c in found if c.record.accepted]
+    assert closed
+    assert any(c.record.i == 0 and c.record.j >= 11 for c in closed)
+    for c in closed:
+        i, j = c.record.i, c.record.j
+        true = se3.inverse(truth[i]) @ truth[j]
+        drifted = se3.inverse(start[i]) @ start[j]
+        error = np.linalg.norm((se3.inverse(true) @ c.T_i_j)[:3, 3])
+        assert error < 0.01
+        assert error < 0.3 * np.linalg.norm((se3.inverse(true) @ drifted)[:3, 3])
+        assert np.linalg.eigvalsh(c.information).min() > 0
+        assert c.record.overlap > 0.3
+
+
+def test_views_that_never_left_each_other_are_no_loop(turn):
+    frames, _truth, start = turn
+    half = 6
+    assert pushed(Revisits(spacing=ALL), frames[:half], start[:half]) == []
+    # Standing still sees the same all the time, and never left it.
+    still = [replace(frames[0], index=k) for k in range(5)]
+    assert pushed(Revisits(spacing=ALL), still, np.stack([np.eye(4)] * 5)) == []
+
+
+def test_a_view_of_something_else_is_refused_with_a_reason(turn):
+    """The last views show another place: the trajectory says that they see the first again."""
+    frames, truth, start = turn
+    strange = [
+        *frames[:11],
+        *(
+            replace(corner(truth[k] @ se3.exp(np.array([0, 0, -0.8, 0.5, 0.4, 0.6]))), index=k)
+            for k in (11, 12)
+        ),
+    ]
+    options = Revisits(spacing=ALL, overlap=0.15, searches=0)
+    found = pushed(options, strange, start)
+    late = [c for c in found if c.record.j >= 11]
+    assert late
+    for c in late:
+        assert not c.record.accepted
+        assert c.record.reason
+        assert c.T_i_j is None
+
+
+def test_what_a_person_gives_counts(turn):
+    frames, truth, start = turn
+    T = se3.inverse(truth[0]) @ truth[12]
+    given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
+    found = pushed(Revisits(spacing=ALL, per_view=0), frames, start, given)
+    by_pair = {(c.record.i, c.record.j): c for c in found}
+    assert list(by_pair) == [(1, 11), (0, 12), (0, 99)]
+    np.testing.assert_array_equal(by_pair[0, 12].T_i_j, T)
+    measured = by_pair[1, 11]
+    assert measured.record.accepted
+    gap = se3.inverse(se3.inverse(truth[1]) @ truth[11]) @ measured.T_i_j
+    assert np.linalg.norm(gap[:3, 3]) < 0.01
+    assert by_pair[0, 99].record.reason == "frame 99 has no pose"
+
+
+def registered(T, probability):
+    believed = probability >= BELIEVED
+    reason = "" if believed else "another pose fits nearly as well"
+    return Registration(
+        T, True, 9, 1800, 2000, 0.1, 0.003, 1e4 * np.eye(6), margin=0.1,
+        believed=believed, probability=probability, reason=reason,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("probable", "wrong", "accepted"),
+    [
+        ((0.99, 0.99), (), 2),  # each is believed
+        ((0.7, 0.7), (), 2),  # both say the same
+        ((0.7, 0.7), (1,), 0),  # each says something else
+        ((0.7, 0.99), (0,), 1),  # only the one that is believed counts
+        ((0.3, 0.3), (), 0),  # hardly probable at all
+    ],
+)
+def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong, accepted):
+    frames, truth, start = turn
+    options = Revisits(spacing=ALL, per_view=3)
+    asked = []
+
+    def scripted(source, target, **_):
+        k = len(asked)
+        asked.append((target.index, source.index))
+        if k >= len(probable):
+            return None
+        T = se3.inverse(truth[target.index]) @ truth[source.index]
+        if k in wrong:
+            T = T @ se3.exp(np.array([0.5, 0, 0, 0, 0, 0]))
+        return registered(T, probable[k])
+
+    monkeypatch.setattr(revisits, "register_pair", scripted)
+    # Nothing fits from the drifted pose, so all is left to the search.
+    monkeypatch.setattr(
+        revisits.UsualFit, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
+    )
+    found = pushed(options, frames, start)
+    assert len(asked) >= 2
+    assert sum(c.record.accepted for c in found) == accepted
+    for c in found:
+        if c.record.accepted:
+            assert "search" in c.record.reason
+            gap = se3.inverse(se3.inverse(truth[c.record.i]) @ truth[c.record.j]) @ c.T_i_j
+            assert np.linalg.norm(gap[:3, 3]) < 0.05
+
+
+@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"weak": 6}])
+def test_options_are_checked(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Revisits(**options)
+
+
+def test_loops_are_looked_for_again_where_views_have_moved(turn):
+    frames, truth, start = turn
+    # Drift that bends the path so far that no candidate is left.
+    far = [truth[0]]
+    bend = se3.exp(5 * se3.log(DRIFT))
+    for k in range(1, len(truth)):
+        far.append(far[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ bend)
+    store = ViewStore(ALL)
+    loops = Revisits(spacing=ALL, searches=0, appearance=Appearance(most=0)).start(0, (), store)
+    for frame, T in zip(frames, far, strict=True):
+        store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
+        loops.push(frame, T)
+    unsure = {f.index: np.zeros((6, 6)) for f in frames}
+
+    def accepted(poses):
+        known = {f.index: T for f, T in zip(frames, poses, strict=True)}
+        return {(c.record.i, c.record.j) for c in loops.finish(known, unsure) if c.record.accepted}
+
+    first = accepted(far)
+    assert (0, 12) not in first
+    assert not loops.look_again(dict(enumerate(far)))
+    assert loops.look_again(dict(enumerate(start)))
+    again = accepted(start)
+    assert again >= first
+    assert any(i == 0 and j >= 11 for i, j in again)
+    assert not loops.many

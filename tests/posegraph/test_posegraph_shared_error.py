@@ -1,0 +1,174 @@
+"""Errors that patches of views share, in a refinement: their sums, size, and what they cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import path
+from corner_views import SHARP, corner, unpack
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.kernels import shared_error as patch_kernels
+from tofuse.posegraph import shared_error
+from tofuse.posegraph.joint_alignment import RefineOptions, refine
+from tofuse.posegraph.view_store import KeptView
+from tofuse.registration.prepared_view import prepare_view
+
+WIDE = (1.0, 50.0, 0.5)  # scale, robust limit (so wide that robust weights are 1), cosine
+
+
+def view(frame) -> KeptView:
+    return KeptView.of(prepare_view(frame, SHARP), 1500)
+
+
+def bent(frame, rng, size: float):
+    """The frame with errors of the depth that vary over some 15 pixels, other ones in each."""
+    v, u = np.indices(frame.depth.shape) / 15.0
+    waves = rng.standard_normal((4, 2))
+    phase = rng.uniform(0, 2 * np.pi, 4)
+    field = sum(np.sin(a * u + b * v + c) for (a, b), c in zip(waves, phase, strict=True))
+    depth = frame.depth + size / np.sqrt(2.0) * field
+    return replace(frame, depth=np.where(frame.depth > 0, depth, 0).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    T = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
+    near = T @ se3.exp(np.array([0.004, -0.003, 0.002, 0.002, 0.001, -0.002]))
+    return view(corner(T)), view(corner(np.eye(4))), near
+
+
+def sums_of(source, target, T):
+    sums = np.empty((shared_error.PATCHES, patch_kernels.PATCH_SIZE))
+    surface = target.surface
+    lookup, frame = surface.projection.lookup, surface.projection.frame
+    patch_kernels.patch_sums(
+        source.points, source.patches, surface.target, lookup, frame, T, *WIDE, sums
+    )
+    row = np.empty(kernels.SIZE)
+    kernels.pair_equations(
+        source.points, surface.target, lookup, frame, T, 0.0, WIDE[0], 0.0, 0.0, *WIDE[1:],
+        np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64), row,
+    )  # fmt: skip
+    return sums, row
+
+
+def test_patches_cut_the_image_into_rows_of_equal_ones(pair):
+    source, _, _ = pair
+    u, v = source.patches % shared_error.ACROSS, source.patches // shared_error.ACROSS
+    x, y = (source.points[:, :2] / source.points[:, 2:3]).T
+    assert set(u) == set(range(shared_error.ACROSS))
+    assert set(v) == set(range(shared_error.DOWN))
+    # Neighbours meet where one ends.
+    for k in range(1, shared_error.ACROSS):
+        assert x[u == k - 1].max() < x[u == k].min()
+    for k in range(1, shared_error.DOWN):
+        assert y[v == k - 1].max() < y[v == k].min()
+    alike = shared_error.most_similar(source.surface)
+    np.testing.assert_array_equal(np.diag(alike), 1)
+    assert np.linalg.eigvalsh(alike).min() > 0
+
+
+def test_sums_of_all_patches_are_the_normal_equations(pair):
+    source, target, T = pair
+    sums, row = sums_of(source, target, T)
+    H, g = unpack(row)
+    response = sums[:, patch_kernels.RESPONSE :]
+    # A patch of its own for each point would give all of H; here its mean goes into each patch.
+    R = response / np.sqrt(np.maximum(sums[:, :1], 1e-12))
+    assert np.linalg.eigvalsh(H[:6, :6] - R.T @ R).min() > -1e-6 * np.trace(H)
+    middle = len(source.points) // 2
+    single = KeptView(source.surface, source.points[middle : middle + 1])
+    one, row = sums_of(single, target, T)
+    H, g = unpack(row)
+    (k,) = np.flatnonzero(one[:, patch_kernels.WEIGHT])
+    weight, r, J = one[k, 0], one[k, 1] / one[k, 0], one[k, 2:] / one[k, 0]
+    expected = weight * np.outer(J, J)
+    np.testing.assert_allclose(H[:6, :6], expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(g[:6], weight * r * J, atol=1e-5 * np.abs(weight * r * J).max())
+
+
+def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
+    source, target, T = pair
+    sums, row = sums_of(source, target, T)
+    alike, variance = shared_error.most_similar(target.surface), 0.004**2
+    H, g = unpack(row.copy())
+    # The same by the whole system: pose, then the errors of the patches with their prior.
+    D, h, M = sums[:, 0], sums[:, 1], sums[:, 2:]
+    big = np.diag(D) + np.linalg.inv(variance * alike)
+    H[:6, :6] -= M.T @ np.linalg.solve(big, M)
+    g[:6] -= M.T @ np.linalg.solve(big, h)
+    allowed = row.copy()
+    patch_kernels.discount_shared_errors(sums, alike, variance, allowed)
+    found_H, found_g = unpack(allowed)
+    np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
+    np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
+    # What is counted stays, and without errors everything does.
+    np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
+    same = row.copy()
+    patch_kernels.discount_shared_errors(sums, alike, 0.0, same)
+    np.testing.assert_allclose(same, row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
+
+
+@pytest.mark.parametrize("size", [0.0, 0.01])
+def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
+    """With no errors but the pixels' none are found; else about as large as they are."""
+    rng = np.random.default_rng(5)
+    T = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
+    seen = []
+    for _ in range(12):
+        frames = []
+        for pose in (T, np.eye(4)):
+            frame = bent(corner(pose), rng, size)
+            noise = 0.005 * rng.standard_normal(frame.depth.shape)
+            frames.append(replace(frame, depth=(frame.depth + noise).astype(np.float32)))
+        source, target = (view(frame) for frame in frames)
+        sums, row = sums_of(source, target, T)
+        alike = shared_error.most_similar(target.surface)
+        found = shared_error.disagreement(sums[None], row[None], alike)
+        seen.append((found.seen - found.noise) / found.share)
+    sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
+    # Two views err, and along their rays, which surfaces meet at an angle.
+    assert sigma < 0.002 if size == 0 else 0.5 * size < sigma < 2 * size
+
+
+def bent_views(seed: int, size: float, *, lit: bool = True) -> tuple[list[KeptView], np.ndarray]:
+    rng = np.random.default_rng(seed)
+    truth, views = path(8), []
+    for k, T in enumerate(truth):
+        frame = bent(corner(T), rng, size)
+        depth = frame.depth + 0.005 * rng.standard_normal(frame.depth.shape)
+        light = frame.amplitude_image if lit else None
+        views.append(
+            view(replace(frame, index=k, depth=depth.astype(np.float32), amplitude_image=light))
+        )
+    return views, truth
+
+
+def test_albedo_counts_for_more_where_patches_err():
+    """Errors of each view of its own drag a refinement that takes all pixels for independent."""
+    errors = []
+    for seed in (1, 2, 3, 4):
+        views, truth = bent_views(seed, 0.01)
+        for shared in (0.0, 1.0):
+            poses = refine(views, truth, RefineOptions(shared=shared)).poses
+            errors.append(float(np.sqrt(((poses - truth)[:, :3, 3] ** 2).sum(1).mean())))
+    without, allowed = np.reshape(errors, (4, 2)).mean(0)
+    assert allowed < 0.92 * without
+
+
+def test_all_pixels_count_where_nothing_is_shared_or_nothing_else_tells():
+    views, truth = bent_views(1, 0.0)
+    some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
+    assert np.abs(some - none).max() < 2e-3
+    views, truth = bent_views(1, 0.01, lit=False)
+    some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
+    np.testing.assert_array_equal(some, none)
+
+
+def test_a_share_below_none_is_refused():
+    with pytest.raises(ValueError, match="shared is -1"):
+        RefineOptions(shared=-1.0)

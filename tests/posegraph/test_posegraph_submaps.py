@@ -1,0 +1,168 @@
+"""Refinement in submaps, beside that of all views at once, and what finds pairs among many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import away, drifted, path, surfaces
+from refined_submaps import refined
+from tofuse.files.spill import Scratch
+from tofuse.geometry import se3
+from tofuse.posegraph import view_store as of_views
+from tofuse.posegraph.calibration_check import CalibrationCheck, of_submaps
+from tofuse.posegraph.refinement import Joint
+from tofuse.posegraph.submaps import cut, submaps
+from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, nearby, overlaps
+from tofuse.registration.likeness import alike, mutual_unlikeness, unlikeness_of_pairs
+
+COUNT = 40
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[list, np.ndarray]:
+    truth = path(COUNT)
+    return surfaces(truth, noise=0.005), truth
+
+
+def test_submaps_find_what_all_views_at_once_find(swing) -> None:
+    views, truth = swing
+    start = drifted(truth)
+    whole, parts = (refined(Joint(submap=n), views, start) for n in (COUNT, 14))
+    assert parts.kept
+    assert away(start, truth) > 0.15
+    assert away(whole.poses, truth) < 0.004
+    assert away(parts.poses, truth) < 0.006
+    assert parts.views == COUNT
+    assert parts.support[1] > parts.support[0]
+    assert abs(parts.support[1] - whole.support[1]) < 0.02
+    np.testing.assert_array_equal(parts.poses[0], start[0])
+    # All look at one place: of the pairs across submaps some are left out.
+    assert 0.5 * whole.pairs < parts.pairs < whole.pairs
+    assert {i for e in parts.edges for i in (e.i, e.j)} == set(range(COUNT))
+
+
+def test_memory_does_not_change_what_is_found(swing, tmp_path: Path) -> None:
+    views, truth = swing
+    start = drifted(truth)
+    some = [views[:20], start[:20]]
+    for submap in (20, 10):
+        much = refined(Joint(submap=submap), *some)
+        little = refined(Joint(submap=submap), *some, Scratch(200_000, tmp_path))
+        np.testing.assert_array_equal(much.poses, little.poses)
+        assert [e.i for e in much.edges] == [e.i for e in little.edges]
+
+
+def test_a_store_keeps_views_on_disk_and_spaces_them_by_motion_alone(swing, tmp_path: Path) -> None:
+    views, _ = swing
+    spacing = Spacing(angle=1e-3, distance=1e-3, most=8, loosest=4)
+    little, much = (
+        ViewStore(spacing, scratch=scratch) for scratch in (Scratch(100_000, tmp_path), Scratch())
+    )
+    steps = [se3.exp(np.array([0.02 * k, 0, 0, 0, 0, 0])) for k in range(COUNT)]
+    for view, T in zip(views, steps, strict=True):
+        for store in (little, much):
+            store.push(view, T)
+    kept = [p.index for p in little.views]
+    assert kept == [p.index for p in much.views]
+    assert max(np.diff(kept)) <= 4  # and not every 8th or 16th, to be 8 in all
+    assert len(kept) > 8
+    for a, b in zip(little.views, much.views, strict=True):
+        assert a.index == a.view.index
+        np.testing.assert_array_equal(a.view.z, b.view.z)
+        np.testing.assert_array_equal(a.view.target, b.view.target)
+        np.testing.assert_array_equal(a.view.albedo, b.view.albedo)
+        assert a.view.projection is views[0].projection
+        assert a.depth == a.view.depth
+
+
+def test_places_are_cut_into_parts_of_like_size() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.random((1000, 3)) * [40, 10, 2]
+    label = cut(places, 300)
+    counts = np.bincount(label)
+    assert len(counts) == 4
+    assert counts.max() - counts.min() <= 2
+    # Each is a piece of the path: as wide as a quarter of it.
+    assert max(np.ptp(places[label == k, 0]) for k in range(4)) < 12
+    assert (cut(places[:300], 300) == 0).all()
+    np.testing.assert_array_equal(cut(np.zeros((10, 3)), 4), cut(np.zeros((10, 3)), 4))
+
+
+def test_every_pair_is_in_one_submap_at_most() -> None:
+    rng = np.random.default_rng(1)
+    places = np.stack([np.linspace(0, 50, 500), rng.random(500), rng.random(500)], 1)
+    i, j = np.triu_indices(500, 1)
+    near = j - i <= 6
+    pairs = np.stack([i[near], j[near]], 1)
+    found = submaps(places, pairs, 100)
+    assert len(found) == 5
+    asked = np.concatenate([s.pairs for s in found])
+    assert len(np.unique(asked, axis=0)) == len(asked)
+    assert len(asked) == len(pairs)  # borders are narrow here, so that none is left out
+    for s in found:
+        assert np.isin(s.pairs, s.views).all()
+        assert len(s.views) <= 125
+    assert len(np.unique(np.concatenate([s.views for s in found]))) == 500
+
+
+def test_of_many_views_those_of_near_places_are_compared(monkeypatch) -> None:
+    for name, number in (("_ALL", 50), ("_NEAREST", 12), ("_JUST_BEFORE", 5)):
+        monkeypatch.setattr(of_views, name, number)
+    rng = np.random.default_rng(2)
+    there = np.stack([np.linspace(0, 40, 200), np.zeros(200), np.zeros(200)], 1)
+    middles = np.concatenate([there, there[::-1]]) + 0.01 * rng.standard_normal((400, 3))
+    i, j = nearby(middles)
+    assert (i < j).all()
+    assert len(i) < 400 * 17
+    pairs = set(zip(i.tolist(), j.tolist(), strict=True))
+    assert all((k, 399 - k) in pairs for k in range(190))  # the way back
+    assert all((j - n, j) in pairs for j in range(5, 400) for n in range(1, 6))
+    # Of the newest view alone it is the same, but for those that ask for it from further away.
+    a, b = nearby(middles, 399)
+    assert set(b.tolist()) == {399}
+    assert {(0, 399), (398, 399), (394, 399)} <= set(zip(a.tolist(), b.tolist(), strict=True))
+    assert len(nearby(middles[:50])[0]) == 50 * 49 // 2
+
+
+def test_the_nearest_views_are_those_that_overlap(swing, monkeypatch) -> None:
+    views, truth = swing
+    kept = [KeptView.of(view, 600) for view in views]
+    every, shares = overlaps(kept, truth, 0.6)
+    for name, number in (("_ALL", 10), ("_NEAREST", 20), ("_JUST_BEFORE", 5)):
+        monkeypatch.setattr(of_views, name, number)
+    some, of_some = overlaps(kept, truth, 0.6)
+    known = {(int(i), int(j)): s for (i, j), s in zip(every, shares, strict=True)}
+    assert all(known[int(i), int(j)] == s for (i, j), s in zip(some, of_some, strict=True))
+    assert len(some) > 0.6 * len(every)
+
+
+def test_the_index_of_looks_finds_what_looks_most_alike() -> None:
+    rng = np.random.default_rng(4)
+    places = rng.normal(0, 0.3, (200, 2, 15, 24)).astype(np.float32)
+    # 200 places, each seen again later, turned by two cells and with noise.
+    first, again = places[:, :, 3:12, 6:18], places[:, :, 3:12, 4:16]
+    noise = 0.02 * rng.standard_normal(again.shape).astype(np.float32)
+    looks = np.concatenate([first, again + noise])
+    looks[rng.random(looks.shape) < 0.05] = np.nan
+    i, j = alike(looks, 0.25)
+    pairs = set(zip(i.tolist(), j.tolist(), strict=True))
+    assert sum((k, k + 200) in pairs for k in range(200)) > 180
+    assert len(pairs) < 0.5 * 400 * 399 / 2
+    far = unlikeness_of_pairs(looks, i, j, 0.25)
+    np.testing.assert_allclose(far, mutual_unlikeness(list(looks), 0.25)[i, j], atol=0.06)
+    true = np.array([b == a + 200 for a, b in zip(i, j, strict=True)])
+    assert far[true].max() < far[~true].min()
+
+
+def test_submaps_share_their_camera() -> None:
+    quiet, alarm = (
+        CalibrationCheck(),
+        CalibrationCheck(alarm=True, errors={"focal": 0.05}, best="focal"),
+    )
+    other = CalibrationCheck(alarm=True, errors={"focal": 0.04}, best="focal")
+    assert not of_submaps([]).alarm
+    assert not of_submaps([quiet, alarm]).alarm
+    assert of_submaps([quiet, alarm, other]).errors == {"focal": 0.05}

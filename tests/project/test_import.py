@@ -1,0 +1,86 @@
+"""``import tofuse`` and ``tofuse --help`` are light."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+import tofuse
+from paths import DOCS, ROOT
+
+HEAVY = {"numba", "scipy", "cv2", "matplotlib", "jinja2", "rich"}
+
+
+def _python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_import_pulls_in_nothing_heavy() -> None:
+    done = _python("import json, sys, tofuse; print(json.dumps(sorted(sys.modules)))")
+    assert done.stderr == ""
+    loaded = set(json.loads(done.stdout))
+    assert not loaded & (HEAVY | {"numpy"})
+    assert {m for m in loaded if m.startswith("tofuse")} == {"tofuse", "tofuse._version"}
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["--version"], ["run"], []])
+def test_help_pulls_in_nothing_heavy(words) -> None:
+    done = _python(
+        "import json, sys\n"
+        "from tofuse.cli import main\n"
+        "try:\n"
+        f"    main({words!r})\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "print('MODULES' + json.dumps(sorted(sys.modules)))"
+    )
+    loaded = set(json.loads(done.stdout.rsplit("MODULES", 1)[1]))
+    assert not loaded & (HEAVY | {"numpy"})
+
+
+def test_every_public_name_is_there() -> None:
+    for name in tofuse.__all__:
+        assert getattr(tofuse, name) is not None, name
+    assert dir(tofuse) == sorted(tofuse.__all__)
+    assert tofuse.open.__name__ == "open_recording"
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        tofuse.nonsense  # noqa: B018
+
+
+def test_errors_say_what_where_and_what_to_do_on_one_line() -> None:
+    error = tofuse.InputError("is\n broken", where="a.txt", remedy="mend\tit")
+    assert str(error) == "a.txt: is broken; mend it"
+    assert (error.where, error.problem, error.remedy) == ("a.txt", "is\n broken", "mend\tit")
+    assert str(tofuse.OutputError("can't be written")) == "can't be written"
+    for kind in (tofuse.InputError, tofuse.OutputError, tofuse.RegistrationError):
+        assert issubclass(kind, tofuse.TofuseError)
+
+
+def test_all_extras_go_together() -> None:
+    """`make lock` resolves the package with every extra at once: one version of each serves all."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].values()
+    wanted = [*project["dependencies"], *(line for extra in extras for line in extra)]
+    pins: dict[str, set[Version]] = {}
+    for line in (ROOT / "requirements" / "extras.txt").read_text().splitlines():
+        found = re.match(r"([\w.-]+)==([^\s;]+)", line)
+        if found:
+            pins.setdefault(canonicalize_name(found[1]), set()).add(Version(found[2]))
+    for line in wanted:
+        requirement = Requirement(line)
+        versions = pins[canonicalize_name(requirement.name)]
+        assert all(version in requirement.specifier for version in versions), line
+
+
+def test_the_reference_shows_every_public_name() -> None:
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^::: tofuse\.(\S+)$", page, re.MULTILINE)
+    assert sorted(shown) == sorted(set(tofuse.__all__) - {"__version__"})

@@ -1,0 +1,53 @@
+"""Damaged recordings of cameras and phones: only the package's own errors come out, on one line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_files import MAKERS, read_through
+from damaged_files import damage
+from tofuse.recordings.open import open_recording
+
+ROUNDS = {"kinect2": 30, "mkv": 30, "helios": 30, "csv": 30}
+CUTS = 30
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_only_our_errors_come_out(tmp_path: Path, name: str) -> None:
+    make, file, format_ = MAKERS[name]
+    original = tmp_path / "original"
+    make(original / (file or "."))
+    assert open_recording(original / (file or ".")).format == format_
+    totals = np.zeros(3, int)
+    for k in range(ROUNDS.get(name, 60)):
+        rng = np.random.default_rng([70, len(name), k])
+        copy = tmp_path / "copy"
+        shutil.copytree(original, copy)
+        for _ in range(1 + int(rng.integers(2))):
+            if files := sorted(p for p in copy.rglob("*") if p.is_file()):
+                damage(files, rng)
+        totals += read_through(copy / (file or "."), format_ if k % 2 else None)
+        shutil.rmtree(copy)
+    whole, unread, refused = totals
+    # The damage must have been of all kinds: noticed, and harmless.
+    assert unread + refused > 0
+    assert whole > 0
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_files_cut_off_anywhere(tmp_path: Path, name: str) -> None:
+    make, file, format_ = MAKERS[name]
+    folder = tmp_path / "original"
+    make(folder / (file or "."))
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    rng = np.random.default_rng([71, len(name)])
+    for _ in range(CUTS):
+        path = files[rng.integers(len(files))]
+        data = path.read_bytes()
+        path.write_bytes(data[: rng.integers(len(data))])
+        read_through(folder / (file or "."), format_)
+        path.write_bytes(data)

@@ -1,0 +1,329 @@
+"""The report in a browser: it turns, slides and switches, on a phone and in the dark."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+
+from browser import changed, chromium, watched
+from report_results import make_room
+from tofuse.report.html import write_report
+from tofuse.report.images import viridis
+from tofuse.report.pictures import draw
+from tofuse.results.samples import FrameSample, FrameSamples
+
+DESK, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 800}
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    result, extras = make_room()
+    write_report(result, path, extras)
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+def opened(browser, report, **options):
+    return watched(browser, report.as_uri(), ours=report.as_uri(), **options)
+
+
+CANVAS = "#viewer .stage canvas"
+
+
+def rested(seen):
+    """The picture once nothing moves: with all triangles, and smooth edges."""
+    seen.page.wait_for_timeout(900)
+    return seen.pixels(CANVAS)
+
+
+def ready(seen):
+    seen.page.locator("#viewer.live").wait_for(timeout=20_000)
+    return rested(seen)
+
+
+def middle(page):
+    box = page.locator(CANVAS).bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_model_turns_and_toggles_switch(browser, report, tmp_path):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        first = ready(seen)
+        assert len(np.unique(first.reshape(-1, 3), axis=0)) > 50  # something is drawn
+        assert changed(first, seen.pixels(CANVAS)) == 0
+        x, y = middle(page)
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 160, y + 40, steps=4)
+        page.mouse.up()
+        assert changed(first, rested(seen)) > 0.1
+        for name in ("Above", "Front", "Side", "Zoom in", "Zoom out"):
+            was = seen.pixels(CANVAS)
+            page.get_by_role("button", name=name).click()
+            assert changed(was, rested(seen)) > 0.02, name
+        page.get_by_role("button", name="Reset").click()
+        assert changed(first, rested(seen)) < 0.002
+        page.locator("#viewer summary").click()
+        for name, orange in (("before", True), ("after", False)):
+            was = seen.pixels(CANVAS)
+            page.locator(f"input[name={name}]").click()
+            now = rested(seen)
+            assert changed(was, now) > 0.0005, name
+            # BGR: the cameras before are orange, those after blue.
+            ink = now if orange else was
+            blue, red = ink[..., 0], ink[..., 2]
+            strong = (red - blue > 100) if orange else (blue - red > 100)
+            assert strong.sum() > 50
+        page.screenshot(path=tmp_path / "desk.png", full_page=True)
+        seen.check()
+
+
+def test_colours_of_values_are_those_of_the_bar(browser, report, tmp_path):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        ready(seen)
+        page.locator("#viewer summary").click()
+        for name in ("after", "loops"):
+            page.locator(f"input[name={name}]").click()
+        bar = page.locator("#viewer .bar")
+        assert bar.is_hidden()
+        ramp = viridis(np.linspace(0, 1, 256)).astype(int)
+        for by, end in (("height", "0"), ("accuracy", "±"), ("views", "")):
+            was = seen.pixels(CANVAS)
+            page.select_option("select[name=by]", by)
+            now = rested(seen)
+            assert changed(was, now) > 0.01, by
+            assert bar.locator("span").first.inner_text().startswith(end)
+            # Nothing is lit: what is drawn has a colour of the bar.
+            drawn = now[60:-90, 8:-8, ::-1].reshape(-1, 3)
+            drawn = drawn[drawn.max(1) > 90][::37]
+            off = np.abs(drawn[:, None] - ramp).max(2).min(1)
+            assert np.mean(off < 14) > (0.5 if by == "views" else 0.9), (
+                by
+            )  # counts change from point to point
+        page.screenshot(path=tmp_path / "bar.png")
+        seen.check()
+
+
+def test_two_taps_measure_with_an_error(browser, report, tmp_path):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        ready(seen)
+        page.get_by_role("button", name="Front").click()
+        bright = rested(seen).min(-1) > 70
+        page.get_by_role("button", name="Measure").click()
+        said = page.locator("#viewer .measured")
+        assert said.inner_text() == "Tap the first point"
+        box = page.locator(CANVAS).bounding_box()
+
+        def tap(left, right):
+            rows, columns = np.nonzero(bright[100:500, left:right])
+            page.mouse.click(box["x"] + left + int(columns[0]), box["y"] + 100 + int(rows[0]))
+
+        page.mouse.click(box["x"] + 5, box["y"] + box["height"] - 5)
+        assert said.inner_text() == "No surface there: tap the model"
+        tap(150, 300)
+        assert said.inner_text() == "Tap the second point"
+        tap(450, 600)
+        words = said.inner_text()
+        match = re.fullmatch(r"([\d.]+) (m|mm) ± ([\d.]+) mm", words)
+        assert match, words
+        # Across a room of 6 m.
+        assert 0.5 < float(match[1]) * {"m": 1, "mm": 1e-3}[match[2]] < 6
+        assert 2 < float(match[3]) < 150
+        page.screenshot(path=tmp_path / "measured.png")
+        page.keyboard.press("Escape")
+        assert said.is_hidden()
+        seen.check()
+
+
+def test_section_cuts_and_is_taken_back(browser, report):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        whole = ready(seen)
+        page.get_by_role("button", name="Section").click()
+        panel = page.locator("#viewer .section")
+        covered = rested(seen)
+        for k in range(6):
+            panel.locator("input").nth(k).fill("500")
+            assert changed(covered, rested(seen)) > 0.02, k
+            panel.get_by_role("button").click()
+            assert changed(covered, rested(seen)) < 0.002
+        page.get_by_role("button", name="Section").click()
+        assert changed(whole, rested(seen)) < 0.002
+        seen.check()
+
+
+def test_screenshot_and_full_screen(browser, report, tmp_path):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        ready(seen)
+        page.select_option("select[name=by]", "height")
+        with page.expect_download() as saved:
+            page.get_by_role("button", name="Screenshot").click()
+        saved.value.save_as(tmp_path / "model.png")
+        shot = cv2.imread(str(tmp_path / "model.png"))
+        box = page.locator(CANVAS).bounding_box()
+        assert shot.shape[:2] == (2 * round(box["height"]), 2 * round(box["width"]))
+        assert len(np.unique(shot.reshape(-1, 3), axis=0)) > 50
+        page.get_by_role("button", name="Full screen").click()
+        page.wait_for_timeout(500)
+        wide = page.locator(CANVAS).bounding_box()
+        assert wide["width"] == DESK["width"]
+        assert wide["height"] > box["height"]
+        page.get_by_role("button", name="Full screen").click()
+        page.wait_for_timeout(500)
+        assert page.locator(CANVAS).bounding_box()["width"] == box["width"]
+        seen.check()
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_a_reason_leads_to_its_frames(browser, report, tmp_path, size):
+    with opened(browser, report, viewport=size) as seen:
+        page = seen.page
+        before = ready(seen)
+        link = page.locator(".reasons a.where", has_text="frame 15")
+        link.click()
+        rested(seen)
+        assert page.locator("#viewer .inset").is_visible()
+        assert page.locator("#viewer .timeline span").inner_text() == "Frame 15: skipped"
+        assert page.locator("#viewer").bounding_box()["y"] >= 0
+        assert page.locator("#strip.marks .marked").count() == 1
+        page.screenshot(path=tmp_path / "reason.png")
+        page.locator(".reasons a.where", has_text="frames 9–10").click()
+        rested(seen)
+        assert page.locator("#viewer figcaption").inner_text().startswith("Frame 9")
+        assert page.locator("#strip .marked").count() == 2
+        page.locator("#viewer [data-close]").click()
+        page.locator("a.where.on").click()  # again: all frames
+        assert page.locator("#strip .marked").count() == 0
+        page.get_by_role("button", name="Reset").click()
+        assert changed(before, rested(seen)) < 0.02
+        seen.check()
+
+
+def test_cameras_and_the_time_line_choose_frames(browser, report):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        ready(seen)
+        line = page.locator("#viewer .timeline canvas").bounding_box()
+        page.mouse.click(line["x"] + line["width"] * 5.5 / 24, line["y"] + 10)
+        assert page.locator("#viewer .timeline span").inner_text() == "Frame 5: predicted"
+        assert page.locator("#viewer .inset").is_visible()
+        assert page.locator("#frame-said").inner_text().startswith("Frame 4")  # the nearest kept
+        outside = rested(seen)
+        page.get_by_role("button", name="Look through this camera").click()
+        page.locator("#viewer [data-close]").click()
+        page.wait_for_timeout(700)
+        through = rested(seen)
+        assert changed(outside, through) > 0.2
+        ink = through[..., 0] - through[..., 2]  # no camera is in the way
+        assert (ink > 100).sum() < 20
+        page.get_by_role("button", name="Reset").click()
+        rested(seen)
+        seen.check()
+
+
+def test_a_phone_scrolls_past_the_model(browser, report):
+    with opened(browser, report, viewport=PHONE, has_touch=True, is_mobile=True) as seen:
+        page = seen.page
+        first = ready(seen)
+        session = page.context.new_cdp_session(page)
+        x, y = middle(page)
+
+        def swipe(dx, dy):
+            for k in range(9):
+                kind = "touchStart" if k == 0 else "touchMove"
+                at = [{"x": x + dx * k / 8, "y": y + dy * k / 8}]
+                session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+                page.wait_for_timeout(16)
+            session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+        swipe(120, 0)
+        assert page.evaluate("scrollY") == 0
+        assert changed(first, rested(seen)) > 0.05  # a finger across turns it
+        swipe(0, -160)
+        page.wait_for_timeout(400)
+        assert page.evaluate("scrollY") > 80
+        seen.check()
+
+
+def test_slider_shows_frames_and_why_one_is_lost(browser, report, tmp_path):
+    with opened(browser, report, viewport=DESK) as seen:
+        page = seen.page
+        shot = "#player img[data-kind=range]"
+        first = seen.pixels(shot)
+        yellow = ready(seen)
+        page.locator("#frame").focus()
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(900)
+        assert page.locator("#frame-said").inner_text().startswith("Frame 4: tracked")
+        assert changed(first, seen.pixels(shot)) > 0.1
+        assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is chosen
+        page.get_by_role("button", name="Next with a problem").click()
+        said = page.locator("#frame-said").inner_text()
+        assert said.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
+        page.locator("#strip rect[data-frame='0']").click(force=True)
+        assert page.locator("#frame-said").inner_text().startswith("Frame 0:")
+        page.locator("#player").screenshot(path=tmp_path / "player.png")
+        seen.check()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_looks_follow_the_reader(browser, report, tmp_path, scheme, size):
+    with opened(browser, report, viewport=size, color_scheme=scheme) as seen:
+        page = seen.page
+        brightness = page.evaluate(
+            "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)"
+        )
+        assert (min(brightness) > 200) == (scheme == "light")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.screenshot(path=tmp_path / f"{scheme}.png", full_page=True)
+        ready(seen)
+        # The model fills the canvas, all but a border on all sides.
+        bright = seen.pixels(CANVAS)[8:-8, 8:-8].max(-1) > 60  # its corners are round
+        rows, columns = bright.any(1), bright.any(0)
+        assert not rows[[0, -1]].any()
+        assert not columns[[0, -1]].any()
+        assert max(rows.mean(), columns.mean()) > 0.7
+        seen.check()
+
+
+def test_without_scripts_there_is_a_picture_and_the_first_frame(browser, report):
+    with opened(browser, report, viewport=PHONE, java_script_enabled=False) as seen:
+        assert seen.page.locator("#viewer .stage > img").is_visible()
+        assert seen.page.locator("#player img").first.is_visible()
+        assert not seen.page.locator("#frame").is_visible()
+        seen.check()
+
+
+def test_a_long_recording_of_large_images_stays_below_the_limit(tmp_path):
+    result, extras = make_room()
+    rng = np.random.default_rng(0)
+    collector = FrameSamples()
+    color = rng.integers(0, 255, (131, 176, 3)).astype(np.uint8)
+    depth = rng.uniform(1, 5, (131, 176)).astype(np.float16)
+    taken = FrameSample(0, depth, (depth > 2).astype(np.uint8), depth.astype(np.float32), color)
+    for k in range(3000):
+        collector.take(lost=k % 7 == 0, make=partial(replace, taken, index=k))
+    kept = collector.all
+    assert 80 <= len(kept) <= 200
+    assert sum(s.index % 7 == 0 for s in kept) >= 20
+    # Pure noise, the worst there is for an image format, in all of them.
+    detailed = replace(result, diagnostics=replace(result.diagnostics, samples=kept))
+    write_report(detailed, tmp_path / "r.html", replace(extras, pictures=draw(kept)))
+    assert (tmp_path / "r.html").stat().st_size < 20e6

@@ -1,0 +1,661 @@
+"""The report: that it is one valid file, and that what it says is what came out."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from report_results import lonely, make_room
+from tofuse.errors import OutputError
+from tofuse.fusion.cloud import Cloud, empty_cloud
+from tofuse.fusion.colors import UNSEEN, seen_colors
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.pose_errors import UNKNOWN_M
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.report import images, plots
+from tofuse.report.extras import ReportExtras
+from tofuse.report.fields import fields
+from tofuse.report.html import write_report
+from tofuse.report.packing import squeezed, unsqueezed
+from tofuse.report.pictures import draw
+from tofuse.report.scene import (
+    MAX_FACES,
+    PITCH,
+    YAW,
+    make_scene,
+    opening_yaw,
+    packed,
+)
+from tofuse.report.subject import Subject
+from tofuse.results.samples import FrameSample
+from tofuse.results.types import Component, FrameRecord, Reason
+
+
+@cache
+def room():
+    return make_room()
+
+
+class Page(HTMLParser):
+    """Text of each section and of all tables, addresses, identifiers; tags must balance."""
+
+    VOID = frozenset({"meta", "link", "img", "br", "input", "hr"})
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.sections, self.links, self.ids, self.scripts = [], {}, [], [], []
+        self.rows, self.images, self.titles = [], [], []
+        self.section, self.text = None, text
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "section":
+            self.section = attrs["id"]
+            self.sections[self.section] = ""
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag == "img":
+            assert attrs["alt"]
+            self.images.append(attrs["src"])
+        self.ids += [attrs["id"]] if "id" in attrs else []
+        self.links += [v for k, v in attrs.items() if k in ("href", "src", "xlink:href", "action")]
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        if tag == "section":
+            self.section = None
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(data)
+            return
+        if self.open and self.open[-1] == "title" and "svg" in self.open:
+            self.titles.append(data)
+        if self.section:
+            self.sections[self.section] += data
+        if "td" in self.open or "th" in self.open:
+            self.rows[-1][-1] += data
+
+    def row(self, *start):
+        """The one table row that begins with these cells."""
+        (found,) = [r for r in self.rows if tuple(r[: len(start)]) == start]
+        return found
+
+
+def page(folder, result, extras):
+    path = Path(folder) / "report.html"
+    write_report(result, path, extras)
+    assert [p.name for p in Path(folder).iterdir()] == ["report.html"]
+    return Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    return page(tmp_path_factory.mktemp("room"), *room())
+
+
+ORDER = [
+    "model",
+    "verdict",
+    "frames",
+    "views",
+    "cameras",
+    "error",
+    "objective",
+    "filters",
+    "loops",
+    "recording",
+    "timings",
+    "settings",
+    "reading",
+]
+
+
+def test_sections_come_in_order_and_the_model_first(shown):
+    assert list(shown.sections) == [name for name in ORDER if name != "recording"]
+    text = " ".join(shown.sections["verdict"].split())
+    assert "Degraded: use this model with care." in text
+    assert "2 readable frames have no pose (frames 9-10)." in text
+    for name, number in (("tracked", 20), ("predicted", 1), ("lost", 2), ("skipped", 1)):
+        assert f"frames {name}{number}" in shown.sections["frames"]
+    assert f"{len(room()[0].cloud):,} points" in shown.sections["frames"]
+
+
+def test_nothing_is_fetched_from_elsewhere(shown, tmp_path):
+    assert shown.links
+    assert all(link.startswith(("#", "data:")) for link in shown.links)
+    write_report(room()[0], tmp_path / "r.html", room()[1])
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "://" not in text
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+    assert not re.search(r"url\((?!#)", text)
+    assert len(text) < 20e6
+
+
+def test_identifiers_are_unique_and_contents_lead_somewhere(shown):
+    assert len(shown.ids) == len(set(shown.ids))
+    anchors = {link[1:] for link in shown.links if link.startswith("#")}
+    assert anchors <= set(shown.ids)
+    assert set(ORDER) - {"recording"} <= anchors
+
+
+def test_same_result_gives_the_same_file(tmp_path):
+    result, extras = room()
+    for name in "ab":
+        write_report(result, tmp_path / name, extras)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_errors_shown_are_those_against_the_reference(shown):
+    result, extras = room()
+    assert "Estimated minus reference" in shown.sections["error"]
+    for name, poses in (("Before", result.diagnostics.sequential), ("After", result.trajectory)):
+        error = poses[:, :3, 3] - extras.reference[:, :3, 3]
+        error = error[np.isfinite(error[:, 0])]
+        row = shown.row(f"{name}, rms")
+        expected = [*np.sqrt((error**2).mean(0)), np.sqrt((error**2).sum(1).mean())]
+        for cell, value in zip(row[1:5], expected, strict=True):
+            number, unit = cell.split()
+            assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(value, rel=0.06)
+    last = se3.angle(se3.inverse(extras.reference[-1]) @ result.diagnostics.sequential[-1])
+    assert shown.row("Before, last frame")[5] == f"{np.degrees(last):.2f}°"
+    worst = np.nanargmax(
+        np.linalg.norm(
+            result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3], axis=1
+        )
+    )
+    assert f"most at frame {worst}." in shown.sections["cameras"]
+
+
+def test_without_a_reference_the_displacement_is_shown(tmp_path):
+    result, extras = room()
+    got = page(tmp_path, result, replace(extras, reference=None))
+    assert "Displacement from the first camera" in got.sections["error"]
+    moved = np.abs(result.trajectory[-1, 0, 3] - result.trajectory[0, 0, 3])
+    number, unit = got.row("After, last frame")[1].split()
+    assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(moved, rel=0.06)
+
+
+def test_true_and_measured_sizes(shown, tmp_path):
+    result, extras = room()
+    row = shown.row("width")
+    low, high = np.percentile(result.cloud.points[:, 0], [0.25, 99.75])
+    assert row[1:3] == ["6.00 m", f"{high - low:.2f} m"]
+    assert shown.row("height")[1] == "2.50 m"
+    assert shown.row("depth")[1] == "3.20 m"
+    bare = page(tmp_path, result, replace(extras, truth_points=None))
+    number, unit = bare.row("width")[1].split()
+    assert unit == "m"
+    assert float(number) == pytest.approx(high - low, abs=0.05)
+    assert "true outline" not in bare.sections["views"]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_turned_model_is_measured_along_its_own_sides(exact, tmp_path):
+    rng = np.random.default_rng(2)
+    surface = rng.uniform(-0.5, 0.5, (20_000, 3))
+    axis = rng.integers(0, 3, len(surface))
+    surface[np.arange(len(surface)), axis] = rng.choice([-0.5, 0.5], len(surface))
+    box = surface * [0.3, 0.4, 0.6]
+    # Tilted as well where the truth tells what is upright; a cloud alone can only be turned.
+    T = se3.exp([0.2, 0, 1, 0.3 if exact else 0, 0.4, -0.1 if exact else 0])
+    points = se3.transform(T, box).astype(np.float32)
+    cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.zeros(3))
+    got = page(
+        tmp_path, lonely(cloud=cloud), ReportExtras("x", truth_points=points if exact else None)
+    )
+    for name, size in (("width", 0.3), ("height", 0.4), ("depth", 0.6)):
+        for cell in got.row(name)[1:3]:
+            assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
+
+
+def test_a_camera_that_hardly_moves_is_drawn_in_millimetres():
+    points = np.random.default_rng(2).uniform(-1, 1, (500, 3))
+    for size, unit in ((3.0, "m"), (0.01, "mm")):
+        drawn = plots.model(size * points, np.zeros((1, 3)), None, "above", measured=None, label="")
+        assert f"forward, {unit}<" in drawn
+
+
+def test_reasons_of_one_kind_are_said_together(tmp_path):
+    reasons = tuple(Reason("loop_gap", ((k, 90),), f"Loop {k}-90 drifted.") for k in range(7))
+    reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
+    text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
+    said = " ".join(text.sections["verdict"].split())
+    assert said.count("Distances across the loop may be stretched") == 1
+    assert all(r.text in said for r in reasons)
+    # The gravest comes first, wherever it stands.
+    assert said.index("Only one.") > said.rindex("drifted.")
+
+
+def test_reasons_name_their_frames(tmp_path):
+    frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(90))
+    reason = Reason("images_differ", ((3, 4), (20, 34), (50, 50)), "Surfaces do not agree.")
+    result = lonely(verdict="degraded", reasons=(reason,), frames=frames)
+    said = " ".join(page(tmp_path, result, ReportExtras("x")).sections["verdict"].split())
+    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in said
+
+
+def in_parts(number=20):
+    """Frames 0 to 9 in the main component, 10 and 11 linked to it, the rest apart."""
+    result = many(number)
+    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(number)
+    poses[12:] = np.nan
+    component = [0] * 10 + [1] * 2 + [2] * (number - 14) + [3] * 2
+    frames = tuple(FrameRecord(k, k / 10, "tracked", component=c) for k, c in enumerate(component))
+    components = (
+        Component(((0, 9),), np.eye(4), None),
+        Component(((10, 11),), np.eye(4), "links"),
+        Component(((12, number - 3),), None, None, lonely()),
+        Component(((number - 2, number - 1),), None, None),
+    )
+    diagnostics = replace(result.diagnostics, frames=frames, sequential=poses, loops=())
+    return replace(result, trajectory=poses, diagnostics=diagnostics, components=components)
+
+
+def test_components_are_listed_with_their_own_models(tmp_path):
+    got = page(tmp_path, in_parts(), ReportExtras("x"))
+    assert got.row("0 (main)")[1:] == ["0–9", "this one", "–", "10"]
+    assert got.row("1")[1:] == ["10–11", "this one", "links between views", "2"]
+    assert got.row("2")[1:] == ["12–17", "component-2", "not connected", "6"]
+    assert got.row("3")[1:] == ["18–19", "none: too few frames", "not connected", "2"]
+    assert "2 of them could not be connected" in " ".join(got.sections["components"].split())
+    assert got.links.count("component-2/report.html") == 1
+    assert "#components" in got.links
+    assert any(t.endswith("component 2 (not connected to the main one)") for t in got.titles)
+    assert any(t.endswith("component 1") for t in got.titles)
+    assert "not all of them could be connected" in got.sections["frames"]
+    one = replace(in_parts(), components=in_parts().components[:1])
+    records = tuple(replace(r, component=0) for r in one.diagnostics.frames)
+    one = replace(one, diagnostics=replace(one.diagnostics, frames=records))
+    plain = page(tmp_path, one, ReportExtras("x"))
+    assert "components" not in plain.sections
+    assert not any("component" in t for t in plain.titles)
+
+
+def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):
+    result, extras = room()
+    (_, raw), (_, first), (_, second) = extras.filter_steps
+    here = [1 - len(first) / len(raw), 1 - len(second) / len(first)]
+    for name, part in zip(("confidence", "neighbours"), here, strict=True):
+        whole = result.diagnostics.removed[name]
+        assert shown.row(name) == [name, f"{100 * whole:.1f} %", f"{100 * part:.1f} %"]
+
+
+def test_each_frame_says_why_it_is_lost(shown):
+    assert len([t for t in shown.titles if t.startswith("Frame ")]) == 24
+    assert any(
+        t.startswith("Frame 9: lost – too few correspondences: 31 of 1000") for t in shown.titles
+    )
+    assert shown.row("frames 9–10")[1:] == ["2", "lost", "too few correspondences: 31 of 1000"]
+    assert shown.row("frame 15")[2:] == ["skipped", "depth/000015.png: is truncated"]
+
+
+def test_loops_timings_and_objective(shown):
+    assert shown.row("0 and 23")[1:] == ["✓ accepted", "–", "62.0 %", "14 mm", "1.0 %", "–"]
+    assert shown.row("2 and 22")[1:3] == ["✗ rejected", "overlap is below 25 %"]
+    assert shown.row("odometry")[1] == "2.4 s"
+    assert shown.row("total")[1] == "4.7 s"
+    objective = room()[0].diagnostics.objective
+    assert f"From {objective[0]:.4g} to {objective[-1]:.4g} in 13" in shown.sections["objective"]
+    assert '"minimum": 4' in shown.sections["settings"]
+    assert "no timestamps.txt" in shown.sections["settings"]
+
+
+def test_arrays_come_back_as_they_were():
+    rng = np.random.default_rng(3)
+    for array in (
+        rng.integers(0, 2**16, (50, 3)).astype(np.uint16),
+        rng.integers(0, 2**32, (40, 3)).astype(np.uint32),
+        rng.integers(-128, 128, (30, 3)).astype(np.int8),
+        rng.normal(0, 1e3, (20, 12)).astype(np.float32),
+        np.arange(1).astype(np.uint8)[:, None],
+    ):
+        back = unsqueezed(squeezed(array), array.dtype.str, array.shape[1])
+        np.testing.assert_array_equal(back, array)
+
+
+def test_viewer_holds_a_surface_with_not_too_many_faces():
+    # A wavy sheet of far more faces than a phone should draw.
+    n = 520
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    z = 2 + 0.05 * np.sin(6 * x)
+    vertices = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = k[:-1, :-1].ravel(), k[:-1, 1:].ravel(), k[1:, 1:].ravel(), k[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]).astype(np.int32)
+    normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
+    color = np.full((n * n, 3), 90, np.uint8)
+    ones = np.ones(n * n)
+    mesh = Mesh(
+        vertices, faces, normals, color, ones.astype(np.float32), ones.astype(np.int32), np.zeros(3)
+    )
+    result, rows = room()[0], {}
+    scene = make_scene(replace(result, mesh=mesh), rows)
+    assert len(scene.mesh.faces) <= MAX_FACES
+    assert len(scene.mesh.faces) > MAX_FACES / 4
+    data = packed(scene)
+    model = data["model"]
+    shown = unsqueezed(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]
+    off = shown[:, 2] - (2 + 0.05 * np.sin(6 * shown[:, 0]))
+    assert np.abs(off).max() < 0.003
+    triangles = unsqueezed(model["faces"], "<u4", 3)
+    assert triangles.max() == len(shown) - 1
+    assert len(unsqueezed(model["colors"], "u1", 3)) == len(shown) == data["count"]
+    assert packed(make_scene(result, rows))["model"]["faces"] is None
+
+
+def test_view_opens_on_the_side_that_shows_most():
+    scene = make_scene(room()[0], {})
+    for k in (0, 2, 5):
+        yaw = YAW + k * np.pi / 4
+        facing = -images.turned(yaw, PITCH)[2]
+        normals = np.tile(facing, (len(scene.points), 1))
+        found = opening_yaw(replace(scene, normals=normals))
+        assert np.cos(found - yaw) == pytest.approx(1)
+    # What looks alike from all sides is shown as ever.
+    normals = np.random.default_rng(0).normal(0, 1, (len(scene.points), 3))
+    assert opening_yaw(replace(scene, normals=normals)) == YAW
+    assert opening_yaw(replace(scene, normals=None)) == YAW
+
+
+def test_nothing_is_black_where_no_image_showed_a_colour():
+    colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
+    shown = seen_colors(colors)
+    assert shown[0].tolist() == list(UNSEEN)
+    np.testing.assert_array_equal(shown[1:], colors[1:])
+
+
+def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
+    result, extras = room()
+    subject = Subject.of(result, extras)
+    R = subject.straight
+    scene = json.loads(shown.scripts[0])
+    model = scene["model"]
+    points = (
+        np.array(scene["low"]) + unsqueezed(model["points"], "<u2", 3) / 65535 * scene["extent"]
+    )
+    np.testing.assert_allclose(points, result.cloud.points @ R.T, atol=1e-4)
+    colors = unsqueezed(model["colors"], "u1", 3)
+    np.testing.assert_array_equal(colors, seen_colors(result.cloud.color))
+    normals = unsqueezed(model["normals"], "i1", 3) / 127
+    np.testing.assert_allclose(normals, result.cloud.normals @ R.T, atol=0.01)
+    loops = unsqueezed(scene["lines"]["loops"], "<f4", 3)
+    np.testing.assert_allclose(loops, result.trajectory[[0, 23], :3, 3] @ R.T, atol=1e-6)
+    frames = scene["frames"]
+    assert unsqueezed(frames["index"], "<u4", 1)[:, 0].tolist() == list(range(24))
+    assert frames["status"] == "000001000220000300000000"
+    for name, poses in (("before", result.diagnostics.sequential), ("after", result.trajectory)):
+        found = unsqueezed(frames[name], "<f4", 12).reshape(-1, 3, 4)
+        known = np.isfinite(poses[:, 0, 0])
+        np.testing.assert_allclose(found[known], R @ poses[known, :3], atol=1e-6)
+        assert not found[~known].any()
+
+
+def test_model_can_be_coloured_by_what_its_points_know():
+    points = np.array([[0, -2.0, 1], [0, -1, 1], [0, 0, 1], [1, 0, 2]], np.float32)
+    cloud = Cloud(
+        points,
+        None,
+        None,
+        np.array([1, 2, 3, 4], np.int32),
+        np.zeros(3),
+        np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32),
+    )
+    found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
+    assert list(found) == ["accuracy", "height", "views"]
+    of = {
+        name: unsqueezed(f.packed()["values"], "u1", 1)[:, 0].astype(int)
+        for name, f in found.items()
+    }
+    assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
+    assert (np.diff(of["views"]) > 0).all()
+    # The bar is of what is constrained; what is not lies beyond its end, and is named there.
+    accuracy = found["accuracy"]
+    assert of["accuracy"][3] == 255
+    np.testing.assert_allclose(np.diff(of["accuracy"][:3]), np.log(2) / np.log(1.049), atol=1)
+    assert accuracy.low == pytest.approx(0.00196, rel=0.1)
+    assert accuracy.high == pytest.approx(0.00784, rel=0.1)
+    assert accuracy.said[2].endswith("mm or not constrained")
+    # The page reads it back from the byte, for the ± of a distance.
+    low, high = accuracy.span
+    assert low * (high / low) ** (of["accuracy"][1] / 255) == pytest.approx(0.00392, rel=0.03)
+    # Cameras are coloured by the same bar.
+    wider = fields(make_scene(lonely(cloud=cloud), {}), np.array([0.05, np.nan]))[0]
+    assert wider.high == pytest.approx(0.05)
+
+
+def test_viewer_thins_a_large_model(tmp_path):
+    points = np.random.default_rng(1).uniform(-2, 2, (200_000, 3)).astype(np.float32)
+    cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))
+    got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
+    scene = json.loads(got.scripts[0])
+    assert scene["count"] == len(unsqueezed(scene["model"]["points"], "<u2", 3)) == 150_000
+    assert scene["model"]["normals"] is None
+    assert scene["center"][0] == pytest.approx(100, abs=0.1)  # the offset counts
+    assert "150,000 of 200,000 points are shown" in got.sections["model"]
+
+
+def test_what_comes_from_outside_is_escaped(tmp_path):
+    bad = "</script><script>alert('1')</script><b>&"
+    result, extras = room()
+    d = result.diagnostics
+    result = replace(
+        result,
+        config={"method": bad, bad: bad},
+        recording={"path": bad, "format": bad, "frames": 1, "warnings": [bad]},
+        diagnostics=replace(
+            d,
+            reasons=(Reason("lost_frames", ((1, 2),), bad),),
+            frames=(*d.frames[:-1], replace(d.frames[-1], status="lost", reason=bad)),
+            loops=(replace(d.loops[0], reason=bad),),
+            removed={bad: 0.5},
+            seconds={bad: 1.0},
+        ),
+    )
+    steps = ((bad, extras.filter_steps[0][1]), (bad, extras.filter_steps[1][1]))
+    write_report(result, tmp_path / "r.html", replace(extras, title=bad, filter_steps=steps))
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "alert('1')" not in text
+    assert "<b>" not in text
+    got = Page(text)
+    assert len(got.scripts) == 3
+    for name in ("verdict", "filters", "frames", "loops", "timings", "settings"):
+        assert "alert(" in got.sections[name]
+
+
+def many(number):
+    """A long recording whose every third frame is lost, for another reason each time."""
+    frames = [
+        FrameRecord(
+            k, k / 10, "lost" if k % 3 == 1 else "tracked", f"reason {k}" if k % 3 == 1 else ""
+        )
+        for k in range(number)
+    ]
+    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses[:, 0, 3] = np.arange(number) * 0.01
+    poses[1::3] = np.nan
+    loops = tuple(LoopRecord(k, k + 50, False, "too far") for k in range(300))
+    return lonely(
+        trajectory=poses,
+        timestamps=np.arange(number) / 10,
+        sequential=poses,
+        frames=tuple(frames),
+        loops=loops,
+    )
+
+
+def test_a_long_recording_stays_readable(tmp_path):
+    got = page(tmp_path, many(2000), ReportExtras("long"))
+    titles = [t for t in got.titles if t.startswith("Frame ")]
+    assert len(titles) == 500
+    assert all("lost" in t for t in titles)  # a cell shows the worst of its frames
+    assert "517 more are not shown" in got.sections["frames"]
+    assert "150 more are not shown" in got.sections["loops"]
+
+
+def test_ten_thousand_frames_are_told_in_a_page_that_opens(tmp_path):
+    got = page(tmp_path, many(10_000), ReportExtras("very long"))
+    assert (tmp_path / "report.html").stat().st_size < 4e6
+    titles = [t for t in got.titles if t.startswith("Frame ")]
+    assert 500 <= len(titles) < 600
+    assert "more are not shown" in got.sections["frames"]
+    assert list(got.sections) == [s for s in ORDER if s != "recording"]
+
+
+def cloud_frame():
+    return CloudFrame.of(np.random.default_rng(0).normal(0, 1, (500, 3)), index=4)
+
+
+def unlit():
+    return RangeFrame(0, 0.0, Pinhole(8, 6, 8, 8, 4, 3), np.zeros((6, 8), np.float32))
+
+
+def dark():
+    return FrameSample.of(unlit(), unlit(), unlit())
+
+
+POOR = {
+    "one cloud": (
+        lonely(),
+        ReportExtras("x", (("raw", cloud_frame()),), clouds=(cloud_frame(),)),
+    ),
+    "nothing read": (
+        lonely(
+            trajectory=np.zeros((0, 4, 4)),
+            timestamps=np.zeros(0),
+            cloud=empty_cloud(),
+            frames=(),
+            sequential=np.zeros((0, 4, 4)),
+            reasons=(),
+            verdict="failed",
+        ),
+        ReportExtras("x"),
+    ),
+    "all lost": (
+        lonely(
+            trajectory=np.full((2, 4, 4), np.nan),
+            timestamps=np.zeros(2),
+            cloud=empty_cloud(),
+            frames=(FrameRecord(0, 0.0, "lost", "why"), FrameRecord(1, 1.0, "lost", "why")),
+            sequential=np.full((2, 4, 4), np.nan),
+            reasons=(Reason("few_poses", ((0, 1),), "no frame has a pose"),),
+            verdict="failed",
+        ),
+        ReportExtras("x", reference=np.tile(np.eye(4), (2, 1, 1))),
+    ),
+    "cameras without a model": (lonely(cloud=empty_cloud()), ReportExtras("x")),
+    "one point": (
+        lonely(
+            cloud=Cloud(np.ones((1, 3), np.float32), None, None, np.ones(1, np.int32), np.zeros(3))
+        ),
+        ReportExtras("x", truth_points=np.ones((1, 3), np.float32)),
+    ),
+    "objective of zero": (lonely(objective=(0.5, 0.0, 0.0)), ReportExtras("x")),
+    "objective of one value": (lonely(objective=(0.5,)), ReportExtras("x")),
+    "no valid pixel": (
+        lonely(),
+        ReportExtras("x", (("raw", unlit()), ("median", unlit())), None, None, draw((dark(),))),
+    ),
+    "stationary camera": (
+        lonely(
+            trajectory=np.tile(np.eye(4), (3, 1, 1)),
+            timestamps=np.arange(3.0),
+            sequential=np.tile(np.eye(4), (3, 1, 1)),
+            frames=tuple(FrameRecord(k, k, "tracked", "", 0.0, 0.0, 0.0) for k in range(3)),
+        ),
+        ReportExtras("x", reference=np.full((3, 4, 4), np.nan)),
+    ),
+    "skipped frames without a row": (
+        lonely(
+            trajectory=np.tile(np.eye(4), (2, 1, 1)),
+            timestamps=np.arange(2.0),
+            sequential=np.tile(np.eye(4), (2, 1, 1)),
+            frames=tuple(
+                FrameRecord(k, k, status)
+                for k, status in enumerate(("tracked", "skipped", "tracked"))
+            ),
+            loops=(LoopRecord(0, 2, True, ""), LoopRecord(0, 7, True, "")),
+        ),
+        ReportExtras("x"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", POOR)
+def test_poor_results_give_a_sensible_report(name, tmp_path):
+    result, extras = POOR[name]
+    got = page(tmp_path, result, extras)
+    assert [s for s in ORDER if s != "recording" or extras.clouds] == list(got.sections)
+    for section, text in got.sections.items():
+        assert len(text.split()) > 4, section
+        assert not re.search(r"\b(nan|None|inf)\b", text), section
+    verdict = result.diagnostics.verdict.capitalize()
+    assert f"{verdict}:" in got.sections["verdict"]
+
+
+def test_poor_results_say_what_is_missing(tmp_path):
+    got = page(tmp_path, *POOR["one cloud"])
+    assert "Nothing was optimised" in got.sections["objective"]
+    assert "No loop closure was found" in got.sections["loops"]
+    assert "Every frame was tracked." in got.sections["frames"]
+    assert "Good: the only frame has a pose" in got.sections["verdict"]
+    (tmp_path / "report.html").unlink()
+    got = page(tmp_path, *POOR["all lost"])
+    said = " ".join(got.sections["verdict"].split())
+    assert "Failed: do not rely on this model." in said
+    assert "No frame has a pose." in said
+    assert "There is nothing to show" in got.sections["model"]
+
+
+@pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \""), '\u202e\u062e\u0631<b>"x"', ""])
+def test_any_name_of_a_file_is_shown(title, tmp_path):
+    result, extras = room()
+    record = replace(result.diagnostics.frames[9], reason=title)
+    frames = (*result.diagnostics.frames[:9], record, *result.diagnostics.frames[10:])
+    result = replace(
+        result,
+        recording={**result.recording, "path": title},
+        diagnostics=replace(result.diagnostics, frames=frames),
+    )
+    got = page(tmp_path, result, replace(extras, title=title))
+    shown = re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title)
+    assert any(f"Frame 9: lost – {shown}" in t or not title for t in got.titles)
+
+
+def test_reasons_point_at_their_frames(shown):
+    text = re.findall(r'class="where" href="#frames" data-ranges="(.*?)">(.*?)<', shown.text)
+    assert ("[[9, 10]]", "Show frames 9–10") in text
+    assert ("[[9, 10]]", "frames 9–10") in text  # the table of problems
+    assert ("[[0, 0], [23, 23]]", "0 and 23") in text  # a loop closure
+
+
+def test_an_unwritable_place_leaves_nothing(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(OutputError, match="report"):
+        write_report(lonely(), tmp_path / "report.html", ReportExtras("x"))
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

@@ -1,0 +1,139 @@
+"""A rig that is carried through a room: from the cameras' own trajectories to the rig and back."""
+
+from functools import cache
+
+import numpy as np
+
+from rig_room import ROOM
+from rig_scene import CAMERA, looked_at
+from tofuse.geometry import se3
+from tofuse.lab.simulation.paths import look_at, rotation
+from tofuse.pipeline.config import from_method
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.recordings.rig_source import RigSource
+from tofuse.rigs.calibrate import Calibration, calibrate_cameras
+from tofuse.rigs.inputs import Camera
+from tofuse.rigs.run import reconstruct_rig
+from tofuse.rigs.walked import refined
+
+CLOCK = 0.012
+COUNT = 50
+# Boards on all sides, so that each camera has something that holds it.
+BOARDS = (
+    *ROOM,
+    ((-1.0, 0.0, 0.0), 1.8, 9.0),
+    ((0.0, -1.0, 0.0), 1.8, 9.0),
+    ((0.1, -0.8, 0.5), 0.9, 0.4),
+    ((-0.7, -0.5, 0.4), 1.0, 0.4),
+)
+
+
+def path(t: float) -> np.ndarray:
+    at = np.array([0.1 * np.sin(1.9 * t), 0.12 * np.sin(2.6 * t), 0.9 + 0.08 * np.sin(3.1 * t)])
+    T = look_at(at, np.add(at, [1.0, 0.0, -0.35]))
+    angles = [0.16 * np.sin(2.9 * t), 0.35 * np.sin(1.7 * t), 0.16 * np.sin(3.7 * t + 1)]
+    return T @ rotation(angles)
+
+
+def mounted() -> np.ndarray:
+    T = rotation([0.03, -1.2, 0.02])
+    T[:3, 3] = [-0.08, 0.01, -0.03]
+    return T
+
+
+@cache
+def cameras() -> tuple[Camera, Camera]:
+    found = []
+    for k, (rate, clock, T) in enumerate(((30.03, 0.0, np.eye(4)), (30.14, CLOCK, mounted()))):
+        rng = np.random.default_rng([k, 2])
+        frames = []
+        for i in range(COUNT):
+            stamp = i / rate + 1.0 - clock
+            pose = path(stamp + clock) @ T
+            image = looked_at(pose, rng, 0.0, BOARDS)
+            frames.append(RangeFrame(i, stamp, CAMERA, image.depth, "z", None))
+        found.append(Camera(f"cam{k}", Recording.of(ArraySource(frames), f"cam{k}", "array")))
+    return found[0], found[1]
+
+
+@cache
+def calibrated() -> Calibration:
+    return calibrate_cameras(cameras(), ["a", "b"])
+
+
+def test_a_walk_tells_where_the_cameras_are() -> None:
+    found = calibrated()
+    assert found.how == "a walk"
+    assert not found.rig.unplaced
+    camera = found.rig.cameras[1]
+    off = se3.inverse(camera.T_rig_camera) @ mounted()
+    assert np.linalg.norm(off[:3, 3]) < 0.03
+    assert np.degrees(se3.angle(off)) < 1.0
+    assert abs(camera.time_offset_s - CLOCK) < 0.004
+    e = se3.log(off)
+    assert e @ np.linalg.solve(camera.covariance, e) < 22.5  # 99.9 % of chi-square, 6 degrees
+
+
+def test_each_instant_of_a_walk_has_one_pose() -> None:
+    rig = calibrated().rig
+    source = RigSource(rig, [camera.recording for camera in cameras()])
+    recording = Recording.of(source, "rig", "rig")
+    config = from_method("default", "range")
+    found = reconstruct_rig(rig, cameras(), recording, config)
+    assert len(found.times) == len(found.poses) == len(recording) // 2
+    truth = np.stack([path(t) for t in found.times])
+    off = se3.inverse(se3.inverse(truth[0]) @ truth) @ found.poses
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.003
+    # The clocks run freely: each image is where its camera was at a time of its own.
+    images = np.stack(
+        [
+            path(t) @ (mounted() if camera else np.eye(4))
+            for t, camera in zip(recording.timestamps, source.camera, strict=True)
+        ]
+    )
+    away = se3.inverse(se3.inverse(truth[0]) @ images) @ found.result.trajectory
+    assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.003
+    assert np.degrees(se3.angle(away)).max() < 0.1
+    between = se3.inverse(found.result.trajectory[::2]) @ found.result.trajectory[1::2]
+    strayed = se3.inverse(between) @ rig.cameras[1].T_rig_camera
+    assert np.degrees(se3.angle(strayed)).max() > 0.2  # at times of the first camera's images
+    # The second camera sees a single wall for a while; the first one knows where the rig is.
+    assert result_is_bounded(found.result)
+
+
+def result_is_bounded(result) -> bool:
+    d = result.diagnostics
+    assert d.verdict == "good"
+    assert not d.accuracy.unbounded
+    return d.accuracy.position_m < 0.02
+
+
+def test_views_of_all_cameras_refine_the_path_of_the_rig() -> None:
+    rig = calibrated().rig
+    recording = Recording.of(RigSource(rig, [c.recording for c in cameras()]), "rig", "rig")
+    of_rig = np.repeat(np.arange(len(recording) // 2), 2)
+    truth = np.stack([path(t) for t in recording.timestamps[::2]])
+    truth = se3.inverse(truth[0]) @ truth
+    drift = np.linspace(0, 1, len(truth))[:, None] * [0.01, -0.01, 0.005, 0.003, -0.004, 0.002]
+    T_rig_frame = se3.inverse(truth[of_rig]) @ np.stack(
+        [
+            se3.inverse(path(recording.timestamps[0]))
+            @ path(t)
+            @ (mounted() if k % 2 else np.eye(4))
+            for k, t in enumerate(recording.timestamps)
+        ]
+    )
+    start = truth @ se3.exp(drift)
+    found = refined(cameras(), recording, start, T_rig_frame, of_rig)
+    before, after = (
+        np.linalg.norm((se3.inverse(truth) @ poses)[:, :3, 3], axis=1)
+        for poses in (start, found.poses)
+    )
+    assert before.max() > 0.014
+    assert after.max() < 0.3 * before.max()
+    (ends,) = found.disagreement
+    assert ends == (0, 1)
+    assert found.disagreement[ends][0] < 0.004
+    assert found.disagreement[ends][1] > 1000
+    assert len(found.measured) > 100

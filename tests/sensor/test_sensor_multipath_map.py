@@ -1,0 +1,221 @@
+"""Surfaces out of view: remembered from earlier views, placed by the motion of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
+from tofuse.corrections.base import Correction, Corrector
+from tofuse.corrections.multipath import Multipath
+from tofuse.geometry import se3
+from tofuse.kernels.multipath import PATCH
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.mapper import Mapper
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.sensor.multipath import MultipathModel, ToFImage
+from tofuse.sensor.multipath_map import OffscreenCells, ReflectorMap
+from tofuse.sensor.multipath_surfaces import Surfaces, block_nodes, fit_planes
+
+ALBEDO = 0.6
+
+
+def surfaces_of(seen: Seen, step: int = 1) -> Surfaces:
+    """Surfaces of a view that no indirect light has spoilt."""
+    z = (seen.range / seen.length).astype(np.float32)
+    nodes = block_nodes(z, seen.camera.rays(), seen.own.astype(np.float32), step)
+    fit_planes(nodes)
+    return Surfaces.of(nodes, np.ones(nodes.shape[:2]))
+
+
+def everywhere(surfaces: Surfaces) -> np.ndarray:
+    return np.ones(surfaces.good.shape, bool)
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    """T_world_camera of a camera turned to the right."""
+    return se3.exp(np.array([0, 0, 0, 0, angle_rad, 0]))
+
+
+def seen_from(T: np.ndarray, *planes: Plane) -> Seen:
+    """The planes of the world, seen from a pose; they go on for ever."""
+    moved = []
+    for normal, d in planes:
+        n = np.array(normal) / np.linalg.norm(normal)
+        moved.append((tuple(n @ T[:3, :3]), (d - n @ T[:3, 3])))
+    return Seen(*moved, albedo=ALBEDO)  # type: ignore[arg-type]
+
+
+def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
+    rays = CAMERA.rays().astype(float)
+    half = 0.5 / CAMERA.fx
+    low, high = rays.min((0, 1)) - half, rays.max((0, 1)) + half
+    around = OffscreenCells.of(CAMERA.rays(), 1.3)
+    left, right = around.rays - around.pitch / 2, around.rays + around.pitch / 2
+    overlap = np.clip(np.minimum(right, high) - np.maximum(left, low), 0, None).prod(1)
+    assert overlap.max() < 1e-6
+    # Whole cells next to the image, so that nothing is left out beside it.
+    beside = np.isclose(right[:, 0], low[0], atol=1e-6)
+    inside = (around.rays[:, 1] > low[1]) & (around.rays[:, 1] < high[1])
+    assert around.share[beside & inside].sum() * around.pitch[1] == pytest.approx(high[1] - low[1])
+    corner = np.arctan(np.hypot(*np.maximum(np.abs(low), np.abs(high))))
+    lit = np.pi * np.tan(1.3 * corner) ** 2 - (high - low).prod()
+    assert around.share.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
+
+
+def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
+    known = ReflectorMap()
+    # To and fro, so that the newest view is the one in the middle.
+    for angle in (-0.5, 0.5, 0.0):
+        T = turned(angle)
+        surfaces = surfaces_of(seen_from(T, LEFT, RIGHT, FLOOR))
+        known.add(surfaces, everywhere(surfaces), T)
+    around = OffscreenCells.of(CAMERA.rays(), 1.3)
+    assert not around.albedo.any()
+    around.recall(known, np.eye(4))
+    found = around.albedo > 0
+    sides = np.abs(around.rays[:, 0]) > 0.6
+    assert found[sides & (np.abs(around.rays[:, 1]) < 0.3)].all()
+    off = np.abs(around.albedo[found] / (ALBEDO * GAIN) - 1)
+    # Next to an edge a node may be given to the other plane.
+    assert np.percentile(off, 95) < 0.01
+    near = found & (np.abs(around.rays[:, 1]) < 0.2)
+    normals = -around.planes / np.linalg.norm(around.planes, axis=1, keepdims=True).clip(1e-9)
+    for side, (normal, d) in ((-1, LEFT), (1, RIGHT)):
+        pick = near & (np.sign(around.rays[:, 0]) == side)
+        assert pick.sum() > 3
+        np.testing.assert_allclose(normals[pick], np.tile(normal, (pick.sum(), 1)), atol=0.01)
+        np.testing.assert_allclose(
+            around.planes[pick], np.tile(np.array(normal) / d, (pick.sum(), 1)), atol=0.01
+        )
+
+
+def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -> None:
+    whole = Seen(LEFT, RIGHT, FLOOR)
+    known = ReflectorMap()
+    surfaces = surfaces_of(whole)
+    known.add(surfaces, everywhere(surfaces), np.eye(4))
+    # The image ends before the corner; the light of what it leaves out is there all the same.
+    part = np.s_[:, :26]
+    image = whole.image
+    cut = ToFImage(
+        np.ascontiguousarray(image.z[part]),
+        np.ascontiguousarray(image.rays[part]),
+        np.ascontiguousarray(image.light[part]),
+        PERIOD_M,
+    )
+    reflections = MultipathModel(columns=26, lamp=1.0)
+    errors = []
+    for T in (None, np.eye(4)):
+        found = reflections.solve(cut, GAIN, known, T)
+        assert found is not None
+        errors.append(np.abs((found.z - (whole.range / whole.length)[part]) * whole.length[part]))
+    assert np.median(errors[1]) < 0.5 * np.median(errors[0])
+    assert np.median(errors[1]) < 0.2 * np.median(whole.bias[part])
+
+
+def test_views_are_remembered_by_motion_and_no_more_than_a_fixed_number() -> None:
+    known = ReflectorMap()
+    surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
+    trusted = everywhere(surfaces)
+    known.add(surfaces, trusted, np.eye(4))
+    one = len(known.patches)
+    assert known.patches.shape[1] == PATCH
+    assert 100 < one < surfaces.good.sum() / 3
+    known.add(surfaces, trusted, turned(0.05))
+    assert len(known.patches) == one
+    known.add(surfaces, trusted, turned(0.15))
+    assert len(known.patches) == 2 * one
+    sizes = []
+    for k in range(130):
+        T = np.eye(4)
+        T[0, 3] = k + 1
+        known.add(surfaces, trusted, T)
+        sizes.append(len(known.patches))
+    assert sizes[-1] == sizes[-20] == max(sizes) < 110 * one
+    # The oldest ones went.
+    assert known.patches[:, 0].min() > 20
+
+
+def test_only_what_stands_still_is_remembered() -> None:
+    surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
+    trusted = everywhere(surfaces)
+    trusted[:, : trusted.shape[1] // 2] = False
+    known = ReflectorMap()
+    known.add(surfaces, trusted, np.eye(4))
+    assert len(known.patches) > 50
+    assert (known.patches[:, 0] > -0.1).all()
+
+
+def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
+    world = (LEFT, RIGHT, FLOOR)
+    T = turned(0.45)
+    first = replace(seen_from(T, *world).frame(), index=0)
+    second = replace(Seen(*world).frame(), index=1)
+
+    def corrected(placed: bool, T_expected: np.ndarray | None) -> np.ndarray:
+        corrector = Multipath(gain=GAIN, columns=30, lamp=1.2).start()
+        corrector.apply(first, None)
+        if placed:
+            # Of another frame: says nothing.
+            corrector.add_pose(second, np.eye(4))
+            corrector.add_pose(first, T)
+        fixed = corrector.apply(second, T_expected)
+        assert isinstance(fixed, RangeFrame)
+        return fixed.depth
+
+    guessed = corrected(False, np.eye(4))
+    np.testing.assert_array_equal(corrected(True, None), guessed)
+    assert np.abs(corrected(True, np.eye(4)) - guessed).max() > 2e-4
+    # Nothing of the view was left by the filters.
+    corrector = Multipath(gain=GAIN, columns=30, lamp=1.2).start()
+    corrector.apply(first, None)
+    corrector.add_pose(first.keep(np.zeros(first.depth.shape, bool)), T)
+    fixed = corrector.apply(second, np.eye(4))
+    assert isinstance(fixed, RangeFrame)
+    np.testing.assert_array_equal(fixed.depth, guessed)
+
+
+@dataclass(frozen=True)
+class Listening(Correction, Corrector):
+    """Changes nothing, and notes what it hears."""
+
+    expected: list[np.ndarray | None] = field(default_factory=list)
+    heard: list[tuple[int, np.ndarray]] = field(default_factory=list)
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def start(self) -> Listening:
+        return self
+
+    def apply(self, frame: Frame, T_world_camera: np.ndarray | None = None) -> Frame:
+        self.expected.append(T_world_camera)
+        return frame
+
+    def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+        self.heard.append((frame.index, T_world_camera))
+
+
+def test_the_mapper_tells_corrections_where_frames_are_and_where_the_next_is_expected() -> None:
+    ear = Listening()
+    mapper = Mapper(replace(from_method("default"), corrections=(ear,)))
+    world = (LEFT, RIGHT, FLOOR)
+    frames = [replace(seen_from(turned(0.03 * k), *world).frame(), index=k) for k in range(5)]
+    frames[3] = frames[3].keep(np.zeros(frames[3].depth.shape, bool))
+    poses = [mapper.push(frame) for frame in frames]
+    assert poses[3] is None
+    tracked = {k: T for k, T in enumerate(poses) if T is not None}
+    assert {0, 1, 2} <= set(tracked)
+    assert [index for index, _ in ear.heard] == list(tracked)
+    for index, T in ear.heard:
+        np.testing.assert_array_equal(T, tracked[index])
+    assert ear.expected[0] is None
+    assert ear.expected[1] is None
+    assert ear.expected[2] is not None
+    motion = se3.inverse(tracked[0]) @ tracked[1]
+    np.testing.assert_allclose(ear.expected[2], tracked[1] @ motion, atol=1e-9)
+    # Lost in between: nobody knows where it is.
+    assert ear.expected[4] is None
