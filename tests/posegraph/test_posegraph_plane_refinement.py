@@ -253,7 +253,7 @@ def test_single_recordings_differ_as_the_first_view_moves_all_others():
     [
         (PlaneOptions, {"shrink": 1.0}),
         (PlaneOptions, {"coarsest": 0.0}),
-        (PlaneOptions, {"least": 3}),
+        (PlaneOptions, {"min_points": 3}),
         (PlaneOptions, {"iterations": 0}),
         (PlaneOptions, {"divisions": 0}),
         (PlaneOptions, {"robust": 0.0}),

@@ -131,7 +131,7 @@ def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong
             assert np.linalg.norm(gap[:3, 3]) < 0.05
 
 
-@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"weak": 6}])
+@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"max_degenerate": 6}])
 def test_options_are_checked(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Revisits(**options)

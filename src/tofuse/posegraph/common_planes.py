@@ -1,10 +1,10 @@
-"""Refinement of clouds over all that overlap: planes that they share, and all poses, at once.
+"""Bundle adjustment of planes: all poses of overlapping clouds and the planes that they share.
 
-The maximum likelihood of eq 2.8 for a surface that nobody knows: the points of all views together
-are cut into cells, each with a plane, and the poses move to where the points lie nearest to these
-planes. The planes are unknowns as well, and are eliminated from the normal equations (bundle
-adjustment of planes; Liu and Zhang 2021, "BALM"). Then points look for their cells again, and
-cells shrink from coarse to fine, for as long as the noise leaves planes in them.
+The maximum likelihood of eq 2.8 for an unknown surface (Liu and Zhang 2021, "BALM"). The points of
+all views together are divided into cells, each with a plane, and the poses minimise the distances
+of the points from these planes. The planes are unknowns too, and are eliminated from the normal
+equations. Points are then assigned to cells anew, and cells shrink from coarse to fine as long as
+the noise leaves planes in them.
 """
 
 from __future__ import annotations
@@ -23,60 +23,60 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.sparse import Factor, PairSystem
 from tofuse.registration.reduce import extent
 
-# Rounds in which cells move to the middle of their points, which lays them along the surface.
-_SETTLING = 2
+# Iterations of moving cells to the centroids of their points, which aligns them with the surface.
+_CENTRING = 2
 # Each chunk has its own blocks of all pairs.
 _CHUNKS = 8
-# Little compared with what a cell knows of a pose, so that what nothing holds stays.
+# Small compared with the information of a cell, so that unconstrained poses stay.
 _DAMPING = 1e-6
-# The median cell holds so many times what a cell must.
+# Points of the median cell, as a multiple of the minimum.
 _FULL = 1.5
-# Sizes above the smallest that is flat to begin with, and beyond the last that is full.
-_BACK = 3
-_MORE = 3
-# By which the support of clouds changes when their points are cut in another way. The support of
-# pairs of images is counted otherwise, and has a limit of its own (`suspicion`).
+# Sizes above the smallest that is flat initially, and sizes below the last that is full.
+_SIZES_ABOVE = 3
+_SIZES_BELOW = 3
+# Change of the support of clouds when their points are divided in another way. The support of pairs
+# of images is defined differently, and has its own limit (`calibration_check`).
 CHANCE = 0.003
-# Farther than such a share of a cell no step moves the points of a view.
-_BOLDEST = 0.5
-# Cells much thinner than the others are so by chance.
-_THINNEST = 0.25
-# Cosine below which it does not show which side of a plane a view is on, and the thickness of each
-# side by which two sides are apart.
-_ASKANCE, _LAYERS = 0.15, 3.0
+# Largest mean motion of a view's points in a step, as a fraction of the size of the cells.
+_MAX_STEP = 0.5
+# Smallest variance of a cell, as a fraction of the median: smaller ones are so by chance.
+_MIN_VARIANCE = 0.25
+# Cosine of incidence below which the side of a plane that a view sees is unknown; and the distance
+# of two sides, in units of their thickness, above which they are separate surfaces.
+_MIN_COSINE, _LAYERS = 0.15, 3.0
 
 
 @dataclass(frozen=True)
 class PlaneOptions:
-    """How clouds are refined together.
+    """Options of the joint refinement of clouds.
 
     Attributes
     ----------
     coarsest
-        Size of the largest cells, as a share of the diagonal of the middle 90 % of all points; the
-        first that are used are three sizes above the smallest that are flat to begin with.
+        Size of the largest cells, as a fraction of the diagonal of the middle 90 % of all points;
+        refinement starts three sizes above the smallest that is flat initially.
     shrink
-        Size of the next cells by that of the last.
+        Ratio of successive sizes.
     iterations
-        With each size, unless nothing moves; three times as many with the last.
-    least
-        Points of a cell, at least; and half as many again in the median cell.
+        Largest number with each size; three times as many with the last.
+    min_points
+        Smallest number of points of a cell; the median cell must have half as many again.
     flatness
-        Cells shrink while the median cell's thickness is at most this share of its width (of the
+        Cells shrink while the median cell's thickness is at most this fraction of its width (of the
         shorter side; both as standard deviations).
     divisions
-        Ways of cutting the points into the last cells, each shifted; their mean counts.
+        Number of shifted divisions of the points into the last cells, which are averaged.
     robust
-        Residuals beyond so many standard deviations count nothing (Tukey's biweight; with 4.685 an
-        estimate from normal errors has 95 % of the efficiency of least squares).
+        Residuals beyond this many standard deviations have no weight (Tukey's biweight; with 4.685
+        it has 95 % of the efficiency of least squares for normal errors).
     convergence
-        Iterations end when points move by less, as a share of the size of the cells.
+        Iterations end when points move by less, as a fraction of the size of the cells.
     """
 
     coarsest: float = 0.2
     shrink: float = 0.8
     iterations: int = 4
-    least: int = 10
+    min_points: int = 10
     flatness: float = 0.6
     divisions: int = 4
     robust: float = 4.685
@@ -90,8 +90,8 @@ class PlaneOptions:
             raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
         if not 1 <= self.divisions <= 100:
             raise ValueError(f"divisions is {self.divisions}, not 1 to 100")
-        if self.least < 4:
-            raise ValueError(f"least is {self.least}, not 4 or more")
+        if self.min_points < 4:
+            raise ValueError(f"min_points is {self.min_points}, not 4 or more")
         for name in ("robust", "convergence"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
@@ -99,7 +99,7 @@ class PlaneOptions:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """What a refinement of clouds found.
+    """Result of the refinement of clouds.
 
     Attributes
     ----------
@@ -108,15 +108,15 @@ class Aligned:
     pairs
         (M, 2) positions of the views i < j that share planes.
     covariance
-        (M, 6, 6) of the right perturbations of their relative poses T_i_j, as far as the noise
-        tells, all views taken together.
+        (M, 6, 6) of the right perturbations of their relative poses T_i_j, from the noise, for all
+        views jointly.
     size
-        Of the last cells, m; 0 where there were none.
+        Of the last cells, m; 0 if there are none.
     sigma
         Standard deviation of the points across the surface, m.
     before, after
-        (N,) support of each view at the poses to start from and at those found: 1 where all its
-        points lie on planes that other views see as well.
+        (N,) support of each view at the initial and at the refined poses: 1 if all its points lie
+        on planes that other views see too.
     """
 
     poses: Float64
@@ -130,14 +130,14 @@ class Aligned:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """The points of all views, one view after the other."""
+    """The points of all views, concatenated."""
 
     p: Float64
     view: Int64
     count: int
 
     def world(self, poses: Float64) -> Float64:
-        """(M, 3) where the poses put them."""
+        """(M, 3) points in the world, by poses (N, 4, 4)."""
         chunks = run_chunks(
             lambda a, b: (
                 np.einsum("kij,kj->ki", poses[self.view[a:b], :3, :3], self.p[a:b])
@@ -168,7 +168,7 @@ class _Cells:
         return self.views > 1
 
     def typical(self) -> tuple[float, float, float]:
-        """Thickness and width (m) and number of points of the median cell that is shared."""
+        """Median thickness (m), width (m) and number of points of the shared cells."""
         if not self.shared.any():
             return np.inf, 1.0, 0.0
         deviation = np.sqrt(np.maximum(self.spread[self.shared], 0))
@@ -177,14 +177,16 @@ class _Cells:
 
 
 def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptions) -> Aligned:
-    """Move all views until their points lie nearest to the planes that they share.
+    """Minimise the distances of the points of all views from the planes that they share.
 
     Parameters
     ----------
     clouds
-        (n, 3) points of each view, in its frame.
+        (n, 3) points of each view, m, in its frame.
     poses
-        (N, 4, 4) T_world_camera to start from; the first of each connected part stays.
+        (N, 4, 4) initial T_world_camera; the first of each connected part stays.
+    options
+        See `PlaneOptions`.
     """
     start = poses
     points = _Points(
@@ -197,7 +199,7 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
         poses, cells = _level(points, poses, size, options.iterations, options)
         thick, wide, most = cells[0].typical()
         flat = thick <= options.flatness * wide
-        if most < _FULL * options.least or (best is not None and not flat):
+        if most < _FULL * options.min_points or (best is not None and not flat):
             break
         if flat:
             best = size, poses
@@ -226,22 +228,22 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
 
 
 def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
-    """Sizes of cells, falling, to begin with: coarser ones than needed would lose what is known.
+    """Decreasing sizes of cells.
 
-    The first is some steps above the smallest whose cells are flat already, as far as the poses
-    to start from are good for; all of them where none is flat.
+    The first is some steps above the smallest whose cells are flat at the initial poses; coarser
+    ones than needed would lose accuracy. If none is flat, all sizes are returned.
     """
     sizes, first = [options.coarsest * extent(points.world(poses))], 0
     while sizes[-1] > 0:
         cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
         thick, wide, most = cells.typical()
-        if most < _FULL * options.least:
+        if most < _FULL * options.min_points:
             break
         if thick <= options.flatness * wide:
-            first = max(0, len(sizes) - 1 - _BACK)
+            first = max(0, len(sizes) - 1 - _SIZES_ABOVE)
         sizes.append(options.shrink * sizes[-1])
-    # Once the poses are better, there may be more that share a cell.
-    more = sizes[-1] * options.shrink ** np.arange(1, _MORE + 1)
+    # With better poses, more views may share a cell.
+    more = sizes[-1] * options.shrink ** np.arange(1, _SIZES_BELOW + 1)
     return np.concatenate([sizes[first:], more[more > 0]])
 
 
@@ -258,9 +260,9 @@ def _level(
     options: PlaneOptions,
     divisions: int = 1,
 ) -> tuple[Float64, list[_Cells]]:
-    """Iterate with cells of one size; the cells are those of the poses found.
+    """Iterate with cells of one size; returns the poses and their cells.
 
-    These are the ones to start from, unless the views support each other about as well.
+    If the support of the views falls, these are the initial ones.
     """
     first = _divided(points, poses, size, divisions)
     found, cells = poses, first
@@ -269,12 +271,12 @@ def _level(
         step = factor.step() if factor is not None else None
         if step is None:
             break
-        step, motion = _bounded(points, found, step, _BOLDEST * size)
+        step, motion = _bounded(points, found, step, _MAX_STEP * size)
         found = se3.orthonormalise(found @ se3.exp(step))
         cells = [_cells(points, found, c.mean[np.diff(c.start) > 0]) for c in cells]
         if motion < options.convergence * size:
             break
-    # Cut afresh: cells that went along have had longer to fit.
+    # Divided anew, as cells that moved along have been fitted for longer.
     cells = _divided(points, found, size, divisions)
     limit = options.robust * first[0].typical()[0]
     before, after = (np.mean([_support(points, c, limit) for c in each]) for each in (first, cells))
@@ -282,13 +284,13 @@ def _level(
 
 
 def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> list[_Cells]:
-    """Cut all points into cells in several ways."""
+    """Divide all points into cells in several shifted ways."""
     shifts = np.arange(divisions) / divisions
     return [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
 
 
 def _bounded(points: _Points, poses: Float64, step: Float64, most: float) -> tuple[Float64, float]:
-    """The step, or as much of it as moves no view's points further; and how far points move, m."""
+    """Shorten a step until no view's points move further than `limit`; also their motion, m."""
     before = points.world(poses)
     while True:
         motion = np.linalg.norm(points.world(poses @ se3.exp(step)) - before, axis=1)
@@ -300,12 +302,12 @@ def _bounded(points: _Points, poses: Float64, step: Float64, most: float) -> tup
 
 
 def _centres(points: _Points, poses: Float64, size: float, shift: float = 0.0) -> Float64:
-    """Middles of cells of about one size: of cubes at first, then along the surface."""
+    """Centres of cells of about one size: of cubes at first, then along the surface."""
     x = points.world(poses)
     cube = np.floor((x - x.min(0)) / size + shift).astype(np.int64)
     _, cell = np.unique(cube, axis=0, return_inverse=True)
     centres = _means(x, cell.ravel())
-    for _ in range(_SETTLING):
+    for _ in range(_CENTRING):
         centres = _means(x, KdTree(centres).nearest(x)[0])
     return centres
 
@@ -317,26 +319,26 @@ def _means(x: Float64, cell: Int64) -> Float64:
 
 
 def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
-    """Give each point to the nearest centre, and fit the planes.
+    """Assign each point to the nearest centre, and fit the planes.
 
-    The two sides of a wall may be nearer to each other than a cell is wide: what was seen from
-    opposite sides is cut in two.
+    The two sides of a wall may be closer to each other than a cell is wide, so cells that were seen
+    from opposite sides are divided.
     """
     x = points.world(poses)
     cell, _ = KdTree(centres).nearest(x)
-    cells = _fitted(points, x, cell, len(centres))
+    cells = _fit(points, x, cell, len(centres))
     behind = _seen_from_behind(cells, poses)
     if not behind.any():
         return cells
     cell[cells.order[behind]] += len(centres)
     _, cell = np.unique(cell, return_inverse=True)
     cell = cell.ravel().astype(np.int64)
-    return _fitted(points, x, cell, int(cell.max()) + 1)
+    return _fit(points, x, cell, int(cell.max()) + 1)
 
 
-def _fitted(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
+def _fit(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
     """Sort points (M, 3) of the world into cells (M,), and fit the planes."""
-    # Points are in the order of their views already.
+    # Points are ordered by their views already.
     order = np.argsort(cell, kind="stable")
     start = np.searchsorted(cell[order], np.arange(size + 1)).astype(np.int64)
     x, view = x[order], points.view[order]
@@ -351,7 +353,7 @@ def _fitted(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
 
 
 def _seen_from_behind(cells: _Cells, poses: Float64) -> Bool:
-    """(M,) points, by cell, of the back of what has two sides that are apart."""
+    """(M,) mask of the points, ordered by cell, on the back of a cell with two separate sides."""
     size = len(cells.mean)
     cell = np.repeat(np.arange(size), np.diff(cells.start))
     towards = poses[cells.view, :3, 3] - cells.mean[cell]
@@ -359,25 +361,25 @@ def _seen_from_behind(cells: _Cells, poses: Float64) -> Bool:
     normal = cells.axes[cell, 0]
     cosine = (towards * normal).sum(1)
     height = ((cells.x - cells.mean[cell]) * normal).sum(1)
-    sides = [cosine > _ASKANCE, cosine < -_ASKANCE]
-    middles, squares, counts = [], np.zeros(size), np.zeros(size)
+    sides = [cosine > _MIN_COSINE, cosine < -_MIN_COSINE]
+    means, squares, counts = [], np.zeros(size), np.zeros(size)
     for side in sides:
         count = np.bincount(cell, side, size)
-        middle = np.bincount(cell, np.where(side, height, 0.0), size) / np.maximum(count, 1)
-        squares += np.bincount(cell, np.where(side, (height - middle[cell]) ** 2, 0.0), size)
+        mean = np.bincount(cell, np.where(side, height, 0.0), size) / np.maximum(count, 1)
+        squares += np.bincount(cell, np.where(side, (height - mean[cell]) ** 2, 0.0), size)
         counts += count
-        middles.append(np.where(count > 0, middle, np.nan))
+        means.append(np.where(count > 0, mean, np.nan))
     thick = np.sqrt(squares / np.maximum(counts, 1))
-    apart = middles[0] - middles[1] > _LAYERS * thick  # never where one side has no points
+    apart = means[0] - means[1] > _LAYERS * thick  # never where one side has no points
     return sides[1] & apart[cell]
 
 
 def _system(
     points: _Points, poses: Float64, divisions: Sequence[_Cells], options: PlaneOptions
 ) -> tuple[Factor | None, PairSystem]:
-    """Normal equations of all poses, the planes eliminated; the mean of several divisions."""
+    """Normal equations of all poses without the planes, averaged over several divisions."""
     n = points.count
-    variances = [_variance(cells, options.least) for cells in divisions]
+    variances = [_variance(cells, options.min_points) for cells in divisions]
     pairs = _pairs(divisions, variances, n)
     number = np.full((n, n), -1, np.int64)
     number[pairs[:, 0], pairs[:, 1]] = np.arange(len(pairs))
@@ -414,12 +416,12 @@ def _system(
     return system.factor(matrix, right, _DAMPING), system
 
 
-def _variance(cells: _Cells, least: int) -> Float64:
-    """(S,) of the residuals of each cell, 0 where it holds too few points or one view."""
-    enough = cells.shared & (np.diff(cells.start) >= least)
+def _variance(cells: _Cells, min_points: int) -> Float64:
+    """(S,) variance of the residuals of each cell, 0 if it has too few points or only one view."""
+    enough = cells.shared & (np.diff(cells.start) >= min_points)
     variance = np.where(enough, cells.spread[:, 0], 0.0)
     if enough.any():
-        floor = _THINNEST * float(np.median(variance[enough]))
+        floor = _MIN_VARIANCE * float(np.median(variance[enough]))
         variance[enough] = np.maximum(variance[enough], max(floor, 1e-18))
     return variance
 

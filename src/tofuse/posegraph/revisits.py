@@ -1,4 +1,4 @@
-"""Loops between range images: where the camera sees again what it had left."""
+"""Loop closure between range images: places that the camera revisits."""
 
 from __future__ import annotations
 
@@ -46,28 +46,28 @@ from tofuse.registration.view_pair import follow, register_pair
 View = PosedView[PreparedView]
 
 _POINTS = 600
-# The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
-# noise, so that all of them would say hardly more than every second one.
+# The trajectory has drifted when a loop closes. Neighbouring pixels share their noise, so that all
+# of them have hardly more information than every second one.
 _NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
-# Nothing keeps the prediction.
-_FREELY = ProjectiveOptions(
+# Nearly without a prior.
+_WEAK_PRIOR = ProjectiveOptions(
     levels=_NEAR, prior_m=3.0, prior_rad=3.0, held=1e6, common_tilt=0.0, common_slope=0.0
 )
-_UNLIKE = "does not fit as views of this camera usually do, or not the same from both ends"
-_TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
-# Of an alignment: a loop's views show each other more than by chance.
-_LEAST_OVERLAP = 0.3
-# Pairs of neighbouring views from which is learnt how views of this camera fit.
+_REJECTED = "does not fit as views of this camera usually do, or not the same from both ends"
+_TOO_FAR = "looks alike, but the trajectory can't have drifted that far"
+# Smallest overlap of an alignment, above what occurs by chance.
+_MIN_OVERLAP = 0.3
+# Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
 _LEARN = 40
-# Poses that have moved by more, as a share of the depth and in rad, have other candidates.
-_OFF = 0.1
-# Searches are for so many views, or for each so many of them.
-_FOR_SEARCHES = 200
+# Candidates are selected anew if poses have moved by more: fraction of the depth plus rad.
+_MAX_MOTION = 0.1
+# Number of views that the limits on searches refer to.
+_VIEWS_PER_BUDGET = 200
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What candidates are found by: little in memory for each view."""
+class _Entry:
+    """What candidates are selected by: little memory per view."""
 
     middle: Float64
     look: Float32
@@ -82,38 +82,38 @@ class _Seen:
 @part("loops", "revisits")
 @dataclass(frozen=True)
 class Revisits(LoopDetector):
-    """Aligns views that, as the trajectory has it, overlap again after they did not.
+    """Registers views that overlap again, according to the trajectory, after they did not.
 
-    A loop is registered from where the trajectory has it (`registration.view_pair.follow`), and
-    accepted if it is believed and constrained in most directions. The best of the other candidates
-    are searched exhaustively (`register_pair`). What a search found is accepted if it leads
-    clearly, or if another loop beside it says the same: places look alike, but not twice in the
-    same way.
+    A loop is registered from the relative pose of the trajectory (`registration.view_pair.follow`),
+    and accepted if it is verified and constrained in most directions. The best of the other
+    candidates are searched exhaustively (`register_pair`). The result of a search is accepted if
+    its margin is large enough or another loop nearby is consistent with it: places may look alike,
+    but not twice in the same way.
 
     Attributes
     ----------
     spacing
-        Which views are tried.
+        Selection of the views that are tried.
     overlap, apart
-        Least share that two views must see of each other, and the share below which a view in
-        between must have seen either.
+        Smallest overlap of a candidate, and the overlap below which some view in between must have
+        seen either.
     per_view
-        At most so many candidates for each view, those of the largest overlap.
+        Largest number of candidates of each view, those with the largest overlap.
     unusual
         A loop must fit as neighbouring views of this camera do: no statistic of the alignment may
-        be so many standard deviations above its median (`registration.verification`).
-    weak
-        Most directions that a loop may leave open: there its covariance says that it knows nothing.
+        be this many standard deviations above its median (`registration.verification`).
+    max_degenerate
+        Largest number of degenerate directions of a loop; its covariance is wide there.
     searches
-        At most so many of the candidates that did not fit are searched, those of the largest
-        overlap; so many again for each 200 views.
+        Largest number of rejected candidates that are searched, those with the largest overlap,
+        for each 200 views.
     search
-        How far and how finely.
+        Range and resolution of the search.
     same_m, same_rad
-        How far apart two loops may put a camera that say the same.
+        Largest difference of the poses of two consistent loops.
     appearance
-        Views that look alike are candidates too, wherever the trajectory has them; they are
-        searched.
+        Views with similar descriptors are candidates too, wherever they are on the trajectory; they
+        are searched.
     """
 
     spacing: Spacing = Spacing(angle=0.15, distance=0.08, most=200)  # noqa: RUF009 - immutable
@@ -121,7 +121,7 @@ class Revisits(LoopDetector):
     apart: float = 0.1
     per_view: int = 2
     unusual: float = 3.0
-    weak: int = 2
+    max_degenerate: int = 2
     searches: int = 6
     search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     same_m: float = 0.15
@@ -134,21 +134,28 @@ class Revisits(LoopDetector):
         for name in ("per_view", "searches"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
-        if not 0 <= self.weak <= 5:
-            raise ValueError(f"weak is {self.weak}, not 0 to 5")
+        if not 0 <= self.max_degenerate <= 5:
+            raise ValueError(f"max_degenerate is {self.max_degenerate}, not 0 to 5")
         if not 0.5 <= self.unusual <= 100:
             raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
 
     def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
-        """See `LoopDetector.start`. There is nothing random in it."""
+        """See `LoopDetector.start`; draws nothing."""
         return _RevisitLoops(self, given, views)
 
     def candidates(
         self, views: Sequence[Outlined], poses: Float64, *, first: int = 0
     ) -> list[tuple[int, int]]:
-        """Positions (i, j), i < j, first <= j, of the views that may form a loop.
+        """Return the positions (i, j), i < j, of the views that may form a loop.
 
-        `poses` is (N, 4, 4) T_world_camera.
+        Parameters
+        ----------
+        views
+            N views.
+        poses
+            (N, 4, 4) T_world_camera.
+        first
+            Smallest j.
         """
         pairs, shares = overlaps(views, poses, self.apart, first=first)
         found: list[tuple[int, int]] = []
@@ -156,7 +163,7 @@ class Revisits(LoopDetector):
         for j in range(first, len(views)):
             mine = slice(ends[j], ends[j + 1])
             partners, share = pairs[mine, 0], shares[mine]
-            # The unbroken run of partners up to this view is what it never left.
+            # The camera never left the unbroken run of partners up to this view.
             seen = np.zeros(j + 1, bool)
             seen[partners], seen[j] = True, True
             start = int(np.flatnonzero(~seen)[-1]) if not seen.all() else -1
@@ -177,12 +184,12 @@ class _RevisitLoops(Loops):
         self._chosen: ViewStore[PreparedView] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
-        self._seen: dict[int, _Seen] = {}
+        self._seen: dict[int, _Entry] = {}
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
         self._usual = UsualFit(options.unusual)
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
-        self._way: dict[int, Float64] = {}
+        self._path_length: dict[int, Float64] = {}
         # Of an earlier `finish`, at other poses.
         self._closed: dict[tuple[int, int], ClosedLoop] = {}
 
@@ -205,14 +212,14 @@ class _RevisitLoops(Loops):
         between = se3.inverse(before) @ np.array([poses[p.index] for p in posed])
         depth = np.array([p.depth for p in posed])
         off = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
-        if off.max() <= _OFF:
+        if off.max() <= _MAX_MOTION:
             return False
-        # From elsewhere, what was refused may fit.
+        # From other guesses, rejected loops may fit.
         self._confirmed = {p: c for p, c in self._confirmed.items() if c.record.accepted}
         return True
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.look`. Only in the present component are poses comparable so far."""
+        """See `Loops.look`. Poses are comparable only within the current component so far."""
         posed = self._chosen.views
         if not posed or posed[-1].index != next(reversed(self._poses)):
             return None
@@ -232,9 +239,9 @@ class _RevisitLoops(Loops):
     def finish(
         self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
     ) -> list[ClosedLoop]:
-        """See `Loops.finish`. What a person gives takes the place of what was found."""
+        """See `Loops.finish`. Given loops replace detected ones."""
         self._poses, self._covariances = dict(poses), dict(covariances)
-        self._way = _ways(poses)
+        self._path_length = _path_lengths(poses)
         posed = self._chosen.of(poses)
         self._learn(posed)
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
@@ -244,14 +251,14 @@ class _RevisitLoops(Loops):
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
         by_index = {p.index: p for p in posed}
-        refused = sorted(
+        rejected = sorted(
             (pair for pair, loop in closed.items() if not loop.record.accepted),
             key=lambda pair: -(closed[pair].record.overlap or 0.0),
         )
-        times = max(1, -(-len(posed) // _FOR_SEARCHES))
+        times = max(1, -(-len(posed) // _VIEWS_PER_BUDGET))
         alike, impossible = self._alike(posed, seen, closed, times)
         closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
-        asked = [*refused[: self._options.searches * times], *alike]
+        asked = [*rejected[: self._options.searches * times], *alike]
         closed.update(self._searched(asked, by_index, closed, alike))
         self._closed = {p: c for p, c in closed.items() if c.record.accepted}
         known = {p.index: p for p in self._store.of(poses)}
@@ -261,20 +268,20 @@ class _RevisitLoops(Loops):
             )
         return in_order(closed)
 
-    def _views(self, posed: Sequence[View]) -> list[_Seen]:
-        """What candidates among these views are found by, made once."""
+    def _views(self, posed: Sequence[View]) -> list[_Entry]:
+        """The entries of these views, each computed once."""
         known = self._seen
-        self._seen = {p.index: known.get(p.index) or self._seen_of(p) for p in posed}
+        self._seen = {p.index: known.get(p.index) or self._entry_of(p) for p in posed}
         return list(self._seen.values())
 
-    def _seen_of(self, posed: View) -> _Seen:
+    def _entry_of(self, posed: View) -> _Entry:
         surface = posed.view.without_caches()
         outline = KeptView.of(surface, _POINTS).outline
         kept = Spilled(outline, self._store.outlines)
-        return _Seen(outline.middle, look_of(surface), kept)
+        return _Entry(outline.middle, look_of(surface), kept)
 
     def _learn(self, posed: Sequence[View]) -> None:
-        """Learn how neighbouring views of this camera fit."""
+        """Learn the usual fit of neighbouring views of this camera."""
         for a, b in itertools.pairwise(posed):
             pair = a.index, b.index
             if a.component != b.component or pair in self._learnt or len(self._learnt) >= _LEARN:
@@ -283,12 +290,12 @@ class _RevisitLoops(Loops):
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
             target = [Target(a.view.without_caches(), np.eye(4))]
             scale = self._usual.noise_scale
-            aligned = align(b.view.without_caches(), target, guess, _FREELY, usual_scale=scale)
-            if aligned.overlap >= _LEAST_OVERLAP:
+            aligned = align(b.view.without_caches(), target, guess, _WEAK_PRIOR, usual_scale=scale)
+            if aligned.overlap >= _MIN_OVERLAP:
                 self._usual.learn(aligned, b.view.depth)
 
     def _confirm(self, target: View, source: View) -> ClosedLoop:
-        """Align the later view with the earlier one, and back; once for each pair."""
+        """Register the later view with the earlier one in both directions, once for each pair."""
         pair = target.index, source.index
         if pair not in self._confirmed:
             self._confirmed[pair] = self._decided(
@@ -308,15 +315,15 @@ class _RevisitLoops(Loops):
     def _guessed(
         self, target: View, source: View
     ) -> tuple[PreparedView, PreparedView, Float64, UsualFit]:
-        """What `register_near` takes, from where the trajectory has two views."""
+        """Arguments of `register_near`, with the guess of the trajectory."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
-        # Else all views would keep, until the end, what they are compared with here.
+        # Bare: otherwise the data derived for the comparison would stay in memory.
         return source.view.without_caches(), target.view.without_caches(), guess, self._usual
 
     def _decided(self, pair: tuple[int, int], made: Registration | None) -> ClosedLoop:
-        """What becomes of frames (i, j) that were registered."""
+        """Accept or reject the registration of frames (i, j)."""
         if made is None:
-            return ClosedLoop(LoopRecord(*pair, False, _UNLIKE))
+            return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
         objection = self._objection(made)
         record = LoopRecord(
             *pair,
@@ -333,11 +340,11 @@ class _RevisitLoops(Loops):
     def _alike(
         self,
         posed: Sequence[View],
-        seen: Sequence[_Seen],
+        seen: Sequence[_Entry],
         closed: Mapping[tuple[int, int], ClosedLoop],
         times: int,
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """Frames (i, j) that look alike and are no candidates yet: possible ones, and others."""
+        """Frames (i, j) that look alike and aren't candidates yet: plausible and implausible."""
         place = {p.index: k for k, p in enumerate(posed)}
         known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
         appearance = replace(self._options.appearance, most=self._options.appearance.most * times)
@@ -359,12 +366,12 @@ class _RevisitLoops(Loops):
         closed: Mapping[tuple[int, int], ClosedLoop],
         alike: Sequence[tuple[int, int]],
     ) -> dict[tuple[int, int], ClosedLoop]:
-        """Search views in each other without a guess.
+        """Register views by exhaustive search, without a guess.
 
-        Returns what is found and believed, and of the others why not.
+        Returns accepted loops, and rejected ones with the reason.
         """
         found, margins = {}, {}
-        refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
+        rejected = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
         made_all = executor().map(
             register_anywhere,
             len(pairs),
@@ -377,23 +384,24 @@ class _RevisitLoops(Loops):
         )
         for (i, j), made in zip(pairs, made_all, strict=True):
             if made is None:
-                refused[i, j] += "; there are too few surfaces to search with"
+                rejected[i, j] += "; there are too few surfaces for a search"
                 continue
             margins[i, j] = made.margin
             if not made.is_probable:
-                refused[i, j] += f"; by a search {made.reason}"
+                rejected[i, j] += f"; by a search {made.reason}"
                 continue
             if (i, j) in alike and not self._plausible(posed[i], posed[j], made.T_target_source):
-                refused[i, j] = _TOO_FAR
+                rejected[i, j] = _TOO_FAR
                 continue
             found[i, j] = made
-        said = {pair: loop.T_i_j for pair, loop in closed.items() if loop.T_i_j is not None}
-        said |= {pair: made.T_target_source for pair, made in found.items()}
-        believed = {}
+        measured = {pair: loop.T_i_j for pair, loop in closed.items() if loop.T_i_j is not None}
+        measured |= {pair: made.T_target_source for pair, made in found.items()}
+        accepted = {}
         for (i, j), made in found.items():
-            alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
+            T_i_j = measured[i, j]
+            alone = not any(self._consistent(i, j, T_i_j, *p, T) for p, T in measured.items())
             if alone and not made.stands_alone:
-                refused[i, j] += f"; by a search {made.reason}, and no other loop agrees"
+                rejected[i, j] += f"; by a search {made.reason}, and no other loop agrees"
                 continue
             how = made.how if alone else f"{made.how}; another loop agrees"
             if (i, j) in alike:
@@ -408,26 +416,27 @@ class _RevisitLoops(Loops):
                 free_space_violation=made.violation,
                 margin=made.margin,
             )
-            believed[i, j] = ClosedLoop(record, made.T_target_source, made.information)
-        no = {}
+            accepted[i, j] = ClosedLoop(record, made.T_target_source, made.information)
+        others = {}
         for p in pairs:
             record = LoopRecord(*p, False, "") if p in alike else closed[p].record
-            no[p] = ClosedLoop(replace(record, reason=refused[p], margin=margins.get(p)))
-        return no | believed
+            others[p] = ClosedLoop(replace(record, reason=rejected[p], margin=margins.get(p)))
+        return others | accepted
 
     def _plausible(self, target: View, source: View, T: Float64, unsure: float = 0.0) -> bool:
-        """Whether the trajectory may have drifted so far as T_target_source says."""
+        """Whether the drift implied by T_target_source `T` (4, 4) is plausible."""
         T_target_source = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         off = se3.inverse(T_target_source) @ T
         depth = 0.5 * (target.depth + source.depth)
         C = relative_covariance(
             T_target_source, self._covariances[target.index], self._covariances[source.index]
         )
-        length, turned = (self._way[source.index] - self._way[target.index]).tolist()
+        path = self._path_length[source.index] - self._path_length[target.index]
+        length, turned = path.tolist()
         return self._options.appearance.plausible(off, length, turned, depth, C, unsure)
 
-    def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
-        """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""
+    def _consistent(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
+        """Whether the loop (k, m) implies the same pose of j in i as the loop (i, j)."""
         if (i, j) == (k, m):
             return False
         poses = self._poses
@@ -440,9 +449,9 @@ class _RevisitLoops(Loops):
         )
 
     def _objection(self, made: Registration) -> str:
-        if made.overlap is not None and made.overlap < _LEAST_OVERLAP:
-            return f"only {made.overlap:.0%} of the points land in the other view"
-        if len(made.unobservable) > self._options.weak:
+        if made.overlap is not None and made.overlap < _MIN_OVERLAP:
+            return f"only {made.overlap:.0%} of the points project into the other view"
+        if len(made.unobservable) > self._options.max_degenerate:
             return f"{len(made.unobservable)} directions are degenerate"
         return "" if made.believed else made.reason
 
@@ -450,19 +459,19 @@ class _RevisitLoops(Loops):
 def register_near(
     source: PreparedView, target: PreparedView, guess: Float64, usual: UsualFit
 ) -> Registration | None:
-    """Register two views from T_target_source as the trajectory has it."""
+    """Register two views from the guess (4, 4) T_target_source of the trajectory."""
     return follow(source, target, guess, usual=usual)
 
 
 def register_anywhere(
     source: PreparedView, target: PreparedView, usual: UsualFit, options: SearchOptions
 ) -> Registration | None:
-    """Search two views in each other without a guess."""
+    """Register two views by exhaustive search, without a guess."""
     return register_pair(source, target, usual=usual, options=options)
 
 
-def _ways(poses: Mapping[int, Float64]) -> dict[int, Float64]:
-    """(2,) length of the path from the first frame to each, m, and of the turns on it, rad."""
+def _path_lengths(poses: Mapping[int, Float64]) -> dict[int, Float64]:
+    """(2,) path length, m, and accumulated rotation, rad, from the first frame to each."""
     order = sorted(poses)
     path = np.stack([poses[k] for k in order])
     steps = se3.inverse(path[:-1]) @ path[1:]
