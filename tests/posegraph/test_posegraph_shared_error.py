@@ -67,7 +67,7 @@ def test_patches_cut_the_image_into_rows_of_equal_ones(pair):
         assert x[u == k - 1].max() < x[u == k].min()
     for k in range(1, shared_error.DOWN):
         assert y[v == k - 1].max() < y[v == k].min()
-    alike = shared_error.most_similar(source.surface)
+    alike = shared_error.alike(source.surface)
     np.testing.assert_array_equal(np.diag(alike), 1)
     assert np.linalg.eigvalsh(alike).min() > 0
 
@@ -94,7 +94,7 @@ def test_sums_of_all_patches_are_the_normal_equations(pair):
 def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
     source, target, T = pair
     sums, row = sums_of(source, target, T)
-    alike, variance = shared_error.most_similar(target.surface), 0.004**2
+    alike, variance = shared_error.alike(target.surface), 0.004**2
     H, g = unpack(row.copy())
     # The same by the whole system: pose, then the errors of the patches with their prior.
     D, h, M = sums[:, 0], sums[:, 1], sums[:, 2:]
@@ -127,7 +127,7 @@ def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
             frames.append(replace(frame, depth=(frame.depth + noise).astype(np.float32)))
         source, target = (view(frame) for frame in frames)
         sums, row = sums_of(source, target, T)
-        alike = shared_error.most_similar(target.surface)
+        alike = shared_error.alike(target.surface)
         found = shared_error.disagreement(sums[None], row[None], alike)
         seen.append((found.seen - found.noise) / found.share)
     sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
