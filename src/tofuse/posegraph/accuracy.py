@@ -1,11 +1,11 @@
-"""How far off the poses may be: 95 % bounds, from what the recording itself shows.
+"""95 % bounds on the errors of the poses, from the recording itself.
 
-The joint covariance of the poses says what noise, and the errors that the patches of a view share,
-leave room for. Three things come on top of it. By how much the refinement moved the trajectory is
-by how much the errors of single registrations, which are correlated, had bent it: what is left is
-in proportion. Views far apart in time that see the same surface disagree by more than consecutive
-ones do, if poses are wrong. And a loop that another calibration would close shows that this one
-bends the path. `docs/uncertainty.md` says how the factor for what shows in nothing was found.
+The joint covariance of the poses covers noise and the errors that the patches of a view share.
+Three terms are added. The motion of the trajectory in the refinement measures the correlated errors
+of single registrations, and the remaining error is in proportion to it. If poses are wrong, views
+far apart in time that see the same surface disagree by more than consecutive ones. And a loop that
+another calibration would close shows that this one bends the path. The factor for errors that show
+in none of these is derived in `docs/uncertainty.md`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,19 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 
 _LEVEL = 0.95
-# Poses, evenly spaced, that the rms is taken over, and the least certain ones beside them.
+# Evenly spaced poses that the rms is computed from, and the least certain ones in addition.
 _EVEN, _WORST = 50, 10
-# What a direction that nothing measures is given, as good as unbounded: m and rad.
+# Standard deviations of an unmeasured direction, practically unbounded: m and rad.
 _OPEN = np.array([30.0] * 3 + [10.0] * 3)
-# In a large model what is off by this share of its diagonal is not measured.
+# In a large model, errors of this fraction of its diagonal count as unbounded.
 _UNMEASURED_SHARE = 0.05
-# What shows is the part of the errors in which views differ. Errors of the sensor that all views of
-# a place share show in nothing: in total they are so many times larger.
+# Ratio of the total error to that in which views differ: errors of the sensor that all views of a
+# place share are invisible.
 _HIDDEN = 1.6
-# Directions of two frames are different ones above this share of the strongest.
+# Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
-# Near the final pose. No direction is known worse than by its prior: what is known no better than
-# that is not measured.
+# Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = ProjectiveOptions()
 
 
@@ -53,22 +52,22 @@ class WorstFrame:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How far off the poses may be.
+    """95 % bounds on the errors of the poses.
 
     Attributes
     ----------
     position_m, rotation_rad
-        95 % bounds of the rms error over the frames, after the best rigid alignment. They are inf
-        where some direction is not bounded by any measurement.
+        Of the rms error over the frames, after the best rigid alignment; inf if no measurement
+        bounds some direction.
     relative
-        `position_m` as a share of the model's diagonal.
+        `position_m` as a fraction of the model's diagonal.
     assessed
-        False where nothing was registered, or where registrations don't state their errors; then
-        the bounds are inf.
+        False if nothing was registered, or if registrations don't state their errors; then the
+        bounds are inf.
     worst
-        The least certain frame; None where nothing was assessed.
+        The least certain frame; None if nothing was assessed.
     unbounded
-        Indices of the frames whose pose is not bounded in some direction.
+        Indices of the frames whose pose is unbounded in some direction.
     """
 
     position_m: float = np.inf
@@ -81,7 +80,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Shown:
-    """What the recording shows of errors that the covariance does not know.
+    """Errors that the recording shows and the covariance does not include.
 
     Attributes
     ----------
@@ -90,7 +89,7 @@ class Shown:
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
     gap_m, gap_rad
-        By how much odometry misses a loop that a better calibration would close; 0 without alarm.
+        Closure error of a loop that a better calibration would close; 0 without alarm.
     """
 
     moved_m: float = 0.0
@@ -101,12 +100,12 @@ class Shown:
 
     @property
     def position_m(self) -> float:
-        """Rms of positions that they come to."""
+        """Their combined rms in position, m."""
         return float(np.linalg.norm([self.moved_m, self.excess_m, self.gap_m]))
 
     @property
     def rotation_rad(self) -> float:
-        """Rms of rotations that they come to."""
+        """Their combined rms in rotation, rad."""
         return float(np.hypot(self.moved_rad, self.gap_rad))
 
 
@@ -117,13 +116,15 @@ def degenerate_directions(
     views: Mapping[int, PosedView[PreparedView]],
     stated: Collection[tuple[int, int]] = (),
 ) -> list[Float64]:
-    """For every edge the directions that it does not measure: (k, 6), right perturbations of j.
+    """Return the degenerate directions of every edge: (k, 6), right perturbations of j.
 
-    Of a registration of the tracker they are known. Of a pair of the refinement, what its views see
-    of each other is looked at, if one of them was degenerate in tracking.
+    Those of the tracker's registrations are known. A pair of the refinement is aligned again if one
+    of its views was degenerate in tracking.
 
     Parameters
     ----------
+    graph
+        After refinement.
     unobservable
         (k, 6) degenerate directions of frames, by their index: right perturbations, m and rad.
     own
@@ -131,7 +132,7 @@ def degenerate_directions(
     views
         Prepared views by frame index.
     stated
-        Pairs (i, j) that do not rest on what the two views see: nothing is degenerate there.
+        Pairs (i, j) that do not come from the overlap of the two views: never degenerate.
     """
     out = []
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
@@ -139,7 +140,7 @@ def degenerate_directions(
         if (i, j) in stated:
             out.append(_NONE)
             continue
-        # A motion of i moves j the other way, as seen from j.
+        # A perturbation of i is the opposite one of j, by the adjoint.
         there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
         known = np.concatenate([there, unobservable.get(j, _NONE)])
         found = known
@@ -149,8 +150,8 @@ def degenerate_directions(
             target = [Target(views[i].view.without_caches(), np.eye(4))]
             aligned = align(views[j].view.without_caches(), target, T_i_j, _ALIGNMENT)
             found = aligned.unobservable * UNITS
-        # A direction is known to some degrees only, and what is left of it would still look
-        # measured: where a pair is degenerate, so it is in all that its views were.
+        # Directions are known to a few degrees only, and the remainder would look measured: a
+        # degenerate pair is taken to be degenerate in all directions of its views.
         out.append(np.concatenate([found, known]) if len(found) else _NONE)
     return out
 
@@ -160,17 +161,19 @@ def without_degenerate(
     directions: Sequence[Float64],
     unmeasured: Collection[tuple[int, int]] = (),
 ) -> PoseGraph:
-    """The graph without what its edges claim to know of directions that they do not measure.
+    """Return the graph without information of its edges along their degenerate directions.
 
-    What seems to be said there is noise (`uncertainty`), or the prediction. They are left nearly
-    free.
+    Information there comes from noise (`uncertainty`) or from the prediction. These directions get
+    practically unbounded variances.
 
     Parameters
     ----------
+    graph
+        After refinement.
     directions
         Of every edge, see `degenerate_directions`.
     unmeasured
-        Pairs of frames between which only the motion was extrapolated.
+        Pairs of frames with only extrapolated motion between them.
     """
     information = graph.information.copy()
     open_variance = np.diag((_OPEN / UNITS) ** 2)
@@ -190,14 +193,16 @@ def without_degenerate(
 
 
 def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
-    """How far off the poses of a graph may be.
+    """Return the bounds on the errors of the poses of a graph.
 
     Parameters
     ----------
     graph
         After refinement; its information is that of measurements alone, see `without_degenerate`.
+    shown
+        Further errors that the recording shows.
     diagonal_m
-        Of the model.
+        Of the model, m.
     """
     n = len(graph.ids)
     if n < 2:
@@ -238,8 +243,8 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
 def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
 
-    NaN where nothing joins a pose to the first. A direction that is not bounded has a sigma of tens
-    of metres.
+    NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
+    metres.
     """
     more = np.repeat([shown.position_m**2 / 3, shown.rotation_rad**2 / 3], 3)
     C = pose_covariances(graph)
@@ -250,7 +255,7 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
 def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, Bool]:
     """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
-    Relative to the first one; to another if that is one of the few that are not bounded.
+    Relative to the first one, or to another if the first is one of few unbounded ones.
     """
     covariances = pose_covariances(graph)
     unbounded = _is_unbounded(covariances, limits)
@@ -264,7 +269,7 @@ def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, Bool]:
 
 
 def _is_unbounded(covariances: Float64, limits: Float64) -> Bool:
-    """(N, 2) whether a direction of position or rotation is known no better than the limits."""
+    """(N, 2) whether the largest sigma of position or rotation exceeds the limits."""
     known = np.isfinite(covariances).all((1, 2))
     out = np.ones((len(covariances), 2), np.bool_)
     C = covariances[known]

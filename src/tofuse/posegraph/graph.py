@@ -1,4 +1,4 @@
-"""The pose graph: where the cameras are, and what was measured between them."""
+"""The pose graph: poses of the cameras, and measurements of their relative poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tofuse.geometry import se3
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """Which way is down, as cameras measured it: weighted edges to the world's vertical.
+    """Directions of gravity measured at single poses: weighted edges to the world's vertical.
 
     Attributes
     ----------
@@ -25,10 +25,10 @@ class Gravity:
     sigma
         (g,) standard deviation of each, rad.
     world
-        (3,) the same direction in the world, or None where it is to be found too.
+        (3,) the same direction in the world, or None if it is to be estimated.
     gate
-        Squared error, in units of sigma, beyond which a direction hardly counts (Geman and
-        McClure): an accelerometer that is moved measures more than gravity.
+        Squared error, in units of sigma, beyond which a direction has little weight (Geman and
+        McClure), as a moving accelerometer measures more than gravity.
     """
 
     vertices: Intp
@@ -42,7 +42,7 @@ class Gravity:
 class Anchors:
     """Poses in another frame, such as that of odometry: weighted edges to its origin.
 
-    The pose of that frame in the world is not known; it is found with the others.
+    The pose of that frame in the world is unknown, and is estimated with the others.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class PoseGraph:
     loop
         (M,) True for edges that close a loop, False for odometry.
     gravity, anchors
-        What is known of single poses, or None. g2o files don't hold it.
+        Measurements of single poses, or None. g2o files don't contain them.
     """
 
     ids: Intp

@@ -1,4 +1,4 @@
-"""Loops: what finding them gives, and how two views are confirmed to form one."""
+"""Loop closure: the interface of loop detectors, and the confirmation of a candidate."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tofuse.registration.prepared_view import PreparedView
 # Keeps the draws of loops apart from those of other stages that register the same pair.
 SEED_STAGE = 2
 
-# A measurement given by hand is taken to be good to 1 cm and 0.01 rad (about half a degree).
+# Assumed standard deviation of a given measurement: 1 cm and 0.01 rad (about half a degree).
 GIVEN_INFORMATION = np.diag([1e4] * 6)
 
 
 @dataclass(frozen=True, eq=False)
 class GivenLoop:
-    """A person says that frames i and j (indices, i < j) see the same place.
+    """A loop given by the user: frames i and j (indices, i < j) see the same place.
 
-    `T_i_j` is the (4, 4) motion, or None if it is to be found by registration.
+    `T_i_j` is the (4, 4) relative pose, or None if it is to be registered.
     """
 
     i: int
@@ -38,10 +38,10 @@ class GivenLoop:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """What was decided about a candidate, and what was measured if it was accepted.
+    """The decision on a candidate, and its measurement if it was accepted.
 
-    `T_i_j` is the motion between the frames of the record, `information` (6, 6) that of its
-    right perturbation, in the frame of j; both None where the loop is rejected.
+    `T_i_j` is the relative pose of the frames of the record, `information` (6, 6) that of its
+    right perturbation, in the frame of j; both None if the loop is rejected.
     """
 
     record: LoopRecord
@@ -52,14 +52,16 @@ class ClosedLoop:
 def given_loop(
     loop: GivenLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
 ) -> ClosedLoop:
-    """Decide about a loop that a person gave.
+    """Accept or reject a loop given by the user.
 
     Parameters
     ----------
+    loop
+        The given loop.
     posed
         Indices of the frames that have a pose.
     confirm
-        Measures the loop between frames i and j, where its motion was not given.
+        Registers frames i and j, if their relative pose was not given.
     """
     for frame in (loop.i, loop.j):
         if frame not in posed:
@@ -71,17 +73,17 @@ def given_loop(
 
 
 def in_order(closed: Mapping[tuple[int, int], ClosedLoop]) -> list[ClosedLoop]:
-    """Return loops by frames (i, j) in the order of j, then i."""
+    """Return loops, given by their frames (i, j), in the order of j, then i."""
     return [closed[pair] for pair in sorted(closed, key=lambda ij: ij[::-1])]
 
 
 class Loops(Protocol):
-    """Loop detection at work.
+    """State of a loop detector on one recording.
 
     Attributes
     ----------
     points
-        Whether it looks at the points of frames and keeps them; if not, prepared views are enough.
+        Whether it needs the points of frames, not only prepared views.
     """
 
     points: ClassVar[bool] = True
@@ -92,20 +94,20 @@ class Loops(Protocol):
 
     @property
     def many(self) -> bool:
-        """Whether there are so many views that it is worth while to look for loops again."""
+        """Whether there are so many views that a second detection is worthwhile."""
         return False
 
     def look_again(self, poses: Mapping[int, Float64]) -> bool:
-        """Whether poses are so far from those of the last `finish` that others would be candidates.
+        """Whether `poses` differ so much from those of the last `finish` that candidates change.
 
         Then `finish` may be called again, with these.
         """
         return False
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """Return what finds the loops that the newest frame closes; None if it closes none.
+        """Return a function that detects the loops that the newest frame closes; None without any.
 
-        It may run on another thread while frames are added. What it finds, `finish` returns too.
+        It may run on another thread while frames are added. `finish` returns its loops too.
         """
         ...
 

@@ -27,7 +27,7 @@ from tofuse.registration.prepared_view import PreparedView
 @part("loops", "nearby", label="validated")
 @dataclass(frozen=True)
 class Nearby(LoopDetector):
-    """Takes an earlier camera as a candidate if it is close and has about the same yaw.
+    """Selects earlier frames as candidates if the camera was close and had about the same yaw.
 
     Attributes
     ----------
@@ -36,13 +36,12 @@ class Nearby(LoopDetector):
     max_yaw_rad
         Largest rotation about the camera's y axis between them.
     min_gap
-        An earlier camera must be at least so many frames (with a pose) behind; nearer ones are
-        too recent to form a loop.
+        Smallest number of frames (with a pose) between the two.
     per_frame
-        At most so many candidates for each frame, the nearest in distance and yaw; 0 looks for
-        none, which leaves the loops given by hand (as in chapter 4 of the thesis).
+        Largest number of candidates for each frame, the nearest in distance and yaw; 0 for none, so
+        that only given loops are used (as in chapter 4 of the thesis).
     confirmation
-        Tells a loop from two places that lie near each other.
+        Accepts or rejects candidates.
     """
 
     max_distance_m: float = 0.5

@@ -1,4 +1,4 @@
-"""Views that the global stages work on: where they are kept, and which of them overlap."""
+"""Views that the global stages work on: their storage, and which of them overlap."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ from tofuse.posegraph import shared_error
 from tofuse.registration.prepared_view import PreparedView, Projection
 from tofuse.registration.projective import points_of
 
-# Of every view, to tell which views overlap: so many points, and an image of this width.
+# For estimates of the overlap: points of a view, and width of its image.
 _OVERLAP_POINTS = 150
 _OVERLAP_COLUMNS = 40
-# Points see a surface if they are as near to it, as a share of their z, and face it like this.
+# A point is on a surface of another view within this distance, as a fraction of its z, and above
+# this cosine between the normals.
 _NEAR = 0.1
 _FACING = 0.5
-# Of up to so many views every two are compared; of more, each with so many that look at places near
-# to what it looks at, and with those just before it. So the work grows with the path alone, and not
-# with its square.
+# Up to this many views, all pairs are compared; of more, each view with those that see the nearest
+# places, and with those just before it, so that the work is linear in the length of the path.
 _ALL, _NEAREST, _JUST_BEFORE = 512, 192, 64
-# Share of the memory for views that goes to their outlines: these are small, but all are asked for.
+# Fraction of the memory for views that is reserved for their outlines, which are small but all in
+# use.
 _FOR_OUTLINES = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """What of a view tells what it overlaps with.
+    """A thinned view, for estimates of the overlap.
 
     Attributes
     ----------
@@ -61,7 +62,7 @@ class Outline:
 
 
 class Outlined(Protocol):
-    """What knows its outline."""
+    """A view with an outline."""
 
     @property
     def middle(self) -> Float64:
@@ -83,13 +84,13 @@ class KeptView:
 
     @classmethod
     def of(cls, surface: PreparedView, points: int) -> KeptView:
-        """Take about so many points of a view."""
+        """Sample approximately `points` points of a view."""
         every = max(1, round(np.sqrt(surface.z.size / points)))
         return cls(surface, points_of(surface, every))
 
     @cached_property
     def outline(self) -> Outline:
-        """What tells what it overlaps with."""
+        """The thinned view, for estimates of the overlap."""
         some = self.points[:: max(1, len(self.points) // _OVERLAP_POINTS)]
         coarse = self.surface.subsampled(_OVERLAP_COLUMNS)
         return Outline(some, coarse.target, coarse.projection)
@@ -101,7 +102,7 @@ class KeptView:
 
     @cached_property
     def patches(self) -> Int64:
-        """(N,) the patch of the image that each point is of, see `shared_error`."""
+        """(N,) patch of the image that each point belongs to, see `shared_error`."""
         return shared_error.patches_of(self.points, self.surface)
 
     @cached_property
@@ -113,18 +114,18 @@ class KeptView:
 
 @dataclass(frozen=True)
 class Spacing:
-    """Which views are kept.
+    """Selection of views by the motion of the camera.
 
     Attributes
     ----------
     angle, distance
-        A view is kept when the camera has moved so far since the last that was: rad, and as a
-        share of the median depth.
+        A view is stored when the camera has moved this far since the last one: rad, and fraction of
+        the median depth.
     most
-        When there are more, every other one is dropped, and twice the motion is asked for.
+        When there are more, every other one is dropped, and the required motion is doubled.
     loosest
-        But no more than so many times as much: what is seen of a place does not depend on how much
-        else is seen. From then on views become more as the path goes on.
+        Largest factor on the required motion, so that the views of a place suffice however long the
+        path is. Beyond it, the number of views grows with the path.
     """
 
     angle: float = 0.03
@@ -162,7 +163,7 @@ T = TypeVar("T")
 
 
 class Spilled(Generic[T]):
-    """An item that may be on disk, for as long as anybody knows of it."""
+    """An item that may be on disk, until it is garbage collected."""
 
     def __init__(self, item: T, spill: Spill[T]) -> None:
         self.__setstate__({"_spill": spill, "_number": spill.put(item)})
@@ -208,7 +209,7 @@ class PosedView(Generic[V]):
 
     @property
     def view(self) -> V:
-        """What is kept, read from disk where it is not in memory: better asked for once."""
+        """The stored view; read from disk if it is not in memory, so call it once."""
         return self._kept.get() if isinstance(self._kept, Spilled) else self._kept
 
 
@@ -218,18 +219,18 @@ class ViewStore(Generic[V]):
     Parameters
     ----------
     spacing
-        Which views are kept.
+        Selection by motion.
     always
-        Frames that are kept in any case.
+        Frames that are stored in any case.
     scratch
-        How much of it may be in memory, the outlines of views included; all unless given.
+        Limits the memory, outlines of views included; unlimited by default.
 
     Attributes
     ----------
     views
         In the order of their frames. The first of each component stays.
     outlines
-        Where outlines of these views may be kept.
+        Storage for the outlines of these views.
     """
 
     def __init__(
@@ -247,7 +248,7 @@ class ViewStore(Generic[V]):
     def wants(
         self, index: int, depth: float, T_component_camera: Float64, component: int = 0
     ) -> bool:
-        """Whether the next view is to be kept: the camera has moved enough, or it is asked for."""
+        """Whether the next view is to be stored: the camera has moved enough, or it is required."""
         if not self.views or self.views[-1].component != component or index in self._always:
             return True
         motion = se3.inverse(self.views[-1].T_component_camera) @ T_component_camera
@@ -265,7 +266,7 @@ class ViewStore(Generic[V]):
         return True
 
     def share(self, posed: PosedView[V]) -> bool:
-        """Add the next view, which another store has, if it is wanted; returns whether it is."""
+        """Add the next view of another store, if it is wanted; returns whether it is."""
         if not self.wants(posed.index, posed.depth, posed.T_component_camera, posed.component):
             return False
         self._add(posed)
@@ -298,22 +299,26 @@ class ViewStore(Generic[V]):
 def overlaps(
     views: Sequence[Outlined], poses: Float64, least: float, *, first: int = 0
 ) -> tuple[Intp, Float64]:
-    """Pairs of views that see at least a share `least` of each other, and that share.
+    """Return the pairs of views that overlap, and their overlaps.
 
-    The share is the smaller of both ways. It counts points that lie near a surface of the other
-    view which faces the same way, so it allows for poses that have drifted somewhat. Of many views
-    only those are compared that may overlap, see `nearby`.
+    The overlap is the smaller of both directions: the fraction of points that are near a surface of
+    the other view with a similar normal, so that some drift is tolerated. Of many views only pairs
+    that may overlap are compared, see `nearby`.
 
     Parameters
     ----------
+    views
+        N views.
     poses
         (N, 4, 4) T_world_camera.
+    least
+        Smallest overlap.
     first
         Pairs with j before this view are left out.
 
     Returns
     -------
-    pairs (M, 2), i < j, in the order of j, then i; shares (M,).
+    pairs (M, 2), i < j, in the order of j, then i; overlaps (M,).
     """
     target, source = nearby(looked_at(views, poses), first)
     axes = poses[:, :3, 2]
@@ -329,21 +334,21 @@ def overlaps(
 
 
 def looked_at(views: Sequence[Outlined], poses: Float64) -> Float64:
-    """(N, 3) middles of what views see, in the world of their poses (N, 4, 4)."""
+    """(N, 3) centroids of the points of views, in the world of their poses (N, 4, 4)."""
     middles = np.array([view.middle for view in views]).reshape(-1, 3)
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], middles) + poses[:, :3, 3])
 
 
 def nearby(middles: Float64, first: int = 0) -> tuple[Intp, Intp]:
-    """Pairs of views that are worth comparing, by the middles (N, 3) of what they see.
+    """Return pairs of views that may overlap, by the centroids (N, 3) of their points.
 
-    All, where there are few views. Of many each is paired with those of the nearest middles, and
-    with those just before it. Returns the views i < j of all pairs with j >= first.
+    All pairs, if there are few views; otherwise each view with those of the nearest centroids and
+    with those just before it. Returns the positions i < j of all pairs with j >= first.
     """
     n = len(middles)
     if n <= _ALL:
         i, j = np.triu_indices(n, 1)
-    elif first == n - 1:  # of the newest view alone, a search costs less than a tree
+    elif first == n - 1:  # for the newest view alone, brute force is cheaper than a tree
         away = np.linalg.norm(middles[:-1] - middles[-1], axis=1)
         nearest = np.argpartition(away, _NEAREST)[:_NEAREST]
         i = np.union1d(nearest, np.arange(max(0, n - 1 - _JUST_BEFORE), n - 1))
@@ -368,13 +373,13 @@ def _shares(
     source: Intp,
     least: float,
 ) -> Float64:
-    """Share of each source's points that its target sees; 0 where that is below `least`."""
+    """Fraction of each source's points that its target sees; 0 if that is below `least`."""
     used, row = np.unique(source, return_inverse=True)
     some = [views[k].outline.points for k in used]
     starts = np.concatenate([[0], np.cumsum([len(points) for points in some])])
     points = np.concatenate(some) if some else np.zeros((0, POINT_SIZE), np.float32)
     inverse, at = se3.inverse(poses), np.ascontiguousarray(poses[used])
-    # All sources of a target in turn: then the target need not be fetched again.
+    # All sources of a target in succession, so that it stays in the cache.
     order = np.argsort(target, kind="stable")
     different, begin = np.unique(target[order], return_index=True)
     end = np.append(begin[1:], len(order))

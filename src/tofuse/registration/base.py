@@ -1,4 +1,4 @@
-"""What a registration takes and gives, whatever the method."""
+"""The interface of registration methods, and their result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PROBABLE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How one view lies in the frame of another.
+    """Result of a registration: the pose of one view in the frame of another.
 
     Attributes
     ----------
@@ -26,11 +26,11 @@ class Registration:
     converged
         False if the iterations ran out before the stopping rule was met.
     iterations
-        How many times points were matched.
+        Number of iterations.
     correspondences
-        Pairs of points that were left at the end.
+        Number of pairs in the last iteration.
     points
-        Points of the source that took part (n_p of the thesis).
+        Number of points of the source that were used (n_p of the thesis).
     error
         E of Algorithm 1: sum of the distances of corresponding points / (points * resolution).
     rms_m
@@ -43,28 +43,28 @@ class Registration:
     errors
         E at every iteration.
     margin
-        By how much the pose leads the best other one, as a share of the points, for methods that
-        look at several; None for those that follow one.
+        Score of the pose minus that of its best rival, as a fraction of the points, for methods
+        that search; None for those that follow a guess.
     believed
-        Whether the pose is to be believed; None for methods that can't say. `converged` does not
-        tell: iterations converge at wrong poses too.
+        Whether the pose is verified; None for methods that don't verify. `converged` does not imply
+        it: iterations converge at wrong poses too.
     probability
-        That the pose is right, 0 to 1, see `registration.confidence`; None for methods that can't
-        say.
+        That the pose is right, 0 to 1, see `registration.confidence`; None for methods that don't
+        estimate it.
     reason
         Why the pose is not believed, in words; empty otherwise.
     runner_up
-        (4, 4) the best other T_target_source; None if there is none, or none was looked for.
+        (4, 4) T_target_source of the best rival; None if there is none, or none was searched for.
     overlap, support
-        Share of the points of both views that land on a surface of the other one, and that lie on
-        it, 0 to 1; None for methods that don't compare views both ways.
+        Fraction of the points of both views that project onto a surface of the other one, and that
+        lie on it, 0 to 1; None for methods that don't compare views in both directions.
     contradiction
-        Points that lie in the other view's free space, or reflect otherwise, as a share of those
-        that land on a surface.
+        Points in the other view's free space, or with another reflectance, as a fraction of those
+        that project onto a surface.
     violation
-        Share of the points that lie in the other view's free space.
+        Fraction of the points in the other view's free space.
     confirmed
-        Whether the pose that a search found is also where an alignment from the guess ends.
+        Whether an alignment from the guess converges to the pose of the search.
     """
 
     T_target_source: Float64
@@ -90,7 +90,7 @@ class Registration:
 
     @property
     def share(self) -> float:
-        """Corresponding points as a share of the source's points, 0 to 1."""
+        """Inlier ratio: corresponding points as a fraction of the source's points, 0 to 1."""
         return self.correspondences / self.points if self.points else 0.0
 
     @property
@@ -100,9 +100,9 @@ class Registration:
 
     @property
     def stands_alone(self) -> bool:
-        """Whether no other measurement needs to say the same.
+        """Whether it needs no confirmation by another measurement.
 
-        It is believed, or a search and an alignment agree on a pose that is probable.
+        It is believed, or a search and an alignment agree on a probable pose.
         """
         return bool(self.believed) or (self.is_probable and self.confirmed)
 
@@ -114,7 +114,7 @@ class Registration:
         return f"found by a search, margin {max(self.margin, 0.0):.0%}"
 
     def between(self, T_a_target: Float64, T_source_b: Float64) -> Registration:
-        """The same between other frames (4, 4): of source b in target a.
+        """Return the registration of source b in target a, given two rigid transforms (4, 4).
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Registration:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A registration of two views that nothing else connects.
+    """A registration of two views of different components.
 
     Attributes
     ----------
@@ -147,9 +147,9 @@ class Link:
     registration
         Of source and target.
     certain
-        Whether it is believed by itself. Else it needs other links that say the same.
+        Whether it is accepted by itself. Otherwise it needs other consistent links.
     how
-        How it was found, in words.
+        Origin of the link, in words.
     """
 
     i: int

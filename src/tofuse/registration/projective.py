@@ -1,7 +1,7 @@
 """Projective alignment of prepared views: point to plane, and albedo where it has texture.
 
 The normal equations of several targets add up, because the unknown is always the same right
-perturbation of the source's pose. Directions that the data does not hold keep the prediction.
+perturbation of the source's pose. Degenerate directions keep the prediction.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from tofuse.kernels.median import median
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView
 
-# A direction is held if its sigma is at most 1 cm, or 1 degree.
+# A direction is constrained if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
-# What is nearer than this is looked at as through a magnifying glass: slack shrinks with it.
+# Below this depth, noise inflation is reduced in proportion to the depth.
 _NEAR_M = 1.0
 # Noise scales of one camera's views differ by less than this factor.
 _LARGER = 3.0
@@ -53,29 +53,29 @@ class Level:
 
 @dataclass(frozen=True)
 class ProjectiveOptions:
-    """How two prepared views are aligned.
+    """Options of the alignment of two prepared views.
 
     Attributes
     ----------
     levels
         Coarse to fine.
     robust
-        Residuals beyond so many sigmas count nothing.
+        Residuals beyond this many sigmas have no weight.
     max_angle
         Largest angle between the normals of source and target, rad.
     photometric
-        Whether the albedo takes part.
+        Whether photometric residuals of the albedo are used.
     prior_m, prior_rad
-        Sigma of the prediction. Weak: it only decides what the data leaves open.
+        Sigma of the prediction: a weak prior that matters along degenerate directions only.
     held
-        How well a direction must be held, in units of 1 cm and 1 degree, not to be taken from the
-        prediction.
+        Largest sigma of a constrained direction, in units of 1 cm and 1 degree; others are taken
+        from the prediction.
     common_tilt, common_slope
-        Errors fixed to the camera, which bend both views alike and so fake information: standard
-        deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
+        Errors fixed to the camera, which bend both views alike and so cause spurious information:
+        standard deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
     max_sigma_m
-        What the sigma of a typical distance may become where the views disagree, m. Noise that
-        neighbouring pixels share is not seen by the fits of planes, but by this.
+        Largest sigma of a typical distance where the views disagree, m. It covers noise that
+        neighbouring pixels share, which plane fits do not show.
     tolerance
         A level ends when a step is smaller, in units of 1 cm and 1 degree.
     convergence
