@@ -1,1 +1,1 @@
-"""Several depth cameras that are fixed to each other: where they are, what they see together."""
+"""Rigs of depth cameras that are fixed to each other: calibration, checks, reconstruction."""

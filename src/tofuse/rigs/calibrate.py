@@ -16,7 +16,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.rig import Disagreement, Rig, RigCamera
 from tofuse.rigs.check import Moved, compare
 from tofuse.rigs.inputs import Camera, open_cameras
-from tofuse.rigs.moving import MovingRig, calibrate_moving
+from tofuse.rigs.moving_rig import MovingRig, calibrate_moving
 from tofuse.rigs.still import StillRig, calibrate_still, stands_still
 
 Motion = Literal["auto", "still", "moving"]

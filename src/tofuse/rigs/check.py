@@ -1,9 +1,9 @@
-"""Was a camera of a rig moved? The rig calibrated anew, against what its file says.
+"""Check whether a camera of a rig was moved: a new calibration against that of its file.
 
-Under the hypothesis that nothing moved, the motion xi of a camera from where the file has it to
-where it is found is normal with the sum of both covariances, and xi^T C^-1 xi is chi-square with
-six degrees of freedom. A first camera that was moved would seem to move all others: where most
-seem to have moved, they are compared with another one.
+Under the null hypothesis the motion xi of a camera from its pose in the file to the new one is
+normally distributed with the sum of both covariances, and xi^T C^-1 xi is chi-square with six
+degrees of freedom. If the first camera was moved, all others appear moved: if most do, another
+camera is the reference.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig, RigCamera
 
-# False alarms of a whole rig, and the chance below which a camera's motion is called certain.
+# Significance level: probability of a false alarm for a whole rig.
 LEVEL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """What became of one camera of a rig.
+    """The result for one camera of a rig.
 
     Attributes
     ----------
     name
-        What it is called.
+        Its name.
     T_before_after
-        (4, 4) its motion, in its frame as it was; None where it could not be found.
+        (4, 4) its motion, in its previous frame; None if it could not be placed.
     chance
-        Probability that a camera which has not moved seems to have moved as much.
+        p-value: probability of at least this motion for a camera that was not moved.
     moved
-        Whether it is said to have moved.
+        Whether the motion is significant.
     sigma_m, sigma_rad
         Standard deviation of the motion along the direction where it is largest.
     reason
-        Why nothing can be said; empty otherwise.
+        Why there is no result; empty otherwise.
     """
 
     name: str
@@ -65,20 +65,20 @@ class Moved:
 
 
 def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
-    """Compare a rig with what it is now, camera by camera in the order of `stated`.
+    """Compare a rig with a new calibration, camera by camera in the order of `stated`.
 
     Parameters
     ----------
     stated, found
-        The file's rig and the one calibrated anew; cameras are known by their names.
+        The rig of the file and the new one; cameras are identified by their names.
     level
-        Chance that a rig in which nothing moved is said to have a moved camera.
+        Probability of a false alarm for the whole rig.
     """
     shared = [c for c in stated.cameras if found.camera(c.name) is not None]
     out: list[Moved] = []
     knocked: dict[str, Moved] = {}
     if len(shared) > 1:
-        # Each camera is asked: of how many tests, the level is kept for all together.
+        # Bonferroni correction for one test per camera.
         limit = level / (len(shared) - 1)
         reference = _reference(shared, found, limit)
         knocked = {c.name: _moved(c, reference, found, limit) for c in shared}
@@ -92,10 +92,10 @@ def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
 
 
 def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCamera:
-    """The camera that the others are compared with.
+    """Return the camera that the others are compared with.
 
-    The first, unless more than half of the others seem to have moved from it: then it was the first
-    that was moved, and the one is taken from which the fewest have.
+    The first, unless more than half of the others appear moved relative to it: then the one
+    relative to which the fewest do.
     """
 
     def moved(reference: RigCamera) -> int:
@@ -107,7 +107,7 @@ def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCame
 
 
 def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> Moved:
-    """The motion of a camera as seen from another one."""
+    """Test the motion of a camera relative to a reference."""
     if camera.name == reference.name:
         return Moved(camera.name, np.eye(4), 1.0, False, 0.0, 0.0)
     before, C_before = _relative(reference, camera)
@@ -117,7 +117,7 @@ def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) ->
     after, C_after = _relative(now_reference, now)
     T = np.asarray(se3.inverse(before) @ after, np.float64)
     xi = se3.log(T)
-    # The file's error is in the camera's frame as it was; moved on, it is in that of now.
+    # The covariance of the file, transformed from the previous frame of the camera to the new one.
     A = se3.adjoint(se3.inverse(T))
     C = A @ C_before @ A.T + C_after
     chance = float(chi2.sf(xi @ np.linalg.pinv(C, hermitian=True) @ xi, 6))
@@ -129,10 +129,10 @@ def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) ->
 
 
 def _relative(reference: RigCamera, camera: RigCamera) -> tuple[Float64, Float64]:
-    """T_reference_camera and its covariance.
+    """Return T_reference_camera (4, 4) and its covariance (6, 6).
 
-    The covariances of two cameras are taken to be independent, which is on the safe side: errors
-    that they share, those of the first camera, cancel.
+    The covariances of two cameras are assumed independent, which is conservative: shared errors,
+    those of the first camera, cancel.
     """
     T = np.asarray(se3.inverse(reference.T_rig_camera) @ camera.T_rig_camera, np.float64)
     A = se3.adjoint(se3.inverse(T))

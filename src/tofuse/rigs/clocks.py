@@ -1,7 +1,7 @@
-"""What cameras' clocks differ by, from what all of them see change.
+"""Synchronisation of clocks by cross-correlation.
 
-Two signals over time that mean the same, such as how fast a rig turns or how much of a scene moves,
-are compared at every lag. The best lag counts where no other comes near it.
+Two signals of the same quantity, such as the angular velocity of a rig or the moving fraction of a
+scene, are correlated at every lag. The best lag is certain if no other has a similar correlation.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import numpy as np
 
 from tofuse.arrays import Float64
 
-# Signals must overlap for this share of the shorter one, and at least for so many samples.
-_OVERLAP, _LEAST_SAMPLES = 0.5, 12
-# Samples of the lag for each of the faster signal's.
+# Minimum overlap of the signals, as a fraction of the shorter one, and minimum number of samples.
+_OVERLAP, _MIN_SAMPLES = 0.5, 12
+# Samples of the lag per sample of the faster signal.
 _FINE = 4
-# A peak counts if another one, further away than its width, reaches at most this share of it.
-_RIVAL, _LEAST_CORRELATION = 0.8, 0.7
-_MOST_LAGS = 200_000
+# Largest ratio of another peak, further away than the width, to the best; minimum correlation.
+_RIVAL, _MIN_CORRELATION = 0.8, 0.7
+_MAX_LAGS = 200_000
 
 
 @dataclass(frozen=True)
 class Lag:
-    """By how much a second clock must be put on, s, and how well the signals then agree, up to 1.
+    """The offset to add to a second clock, s, and the correlation of the signals, up to 1.
 
-    `certain` says whether no other lag comes near.
+    `certain` is whether no other lag has a similar correlation.
     """
 
     seconds: float
@@ -36,7 +36,7 @@ class Lag:
 def lag_between(
     times: Float64, values: Float64, other_times: Float64, other_values: Float64
 ) -> Lag | None:
-    """Find what to add to `other_times` so that both signals say the same.
+    """Estimate the offset to add to `other_times` that aligns both signals.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def lag_between(
     Lag or None
         None where a signal is too short or does not change.
     """
-    if min(len(times), len(other_times)) < _LEAST_SAMPLES:
+    if min(len(times), len(other_times)) < _MIN_SAMPLES:
         return None
     interval = min(float(np.median(np.diff(times))), float(np.median(np.diff(other_times))))
     step = interval / _FINE
@@ -57,7 +57,7 @@ def lag_between(
     first = _sampled(times, values, step)
     second = _sampled(other_times, other_values, step)
     least = max(round(_OVERLAP * min(len(first), len(second))), 2)
-    if len(first) + len(second) > _MOST_LAGS:
+    if len(first) + len(second) > _MAX_LAGS:
         return None
     correlation = _correlations(first, second, least)
     if not np.isfinite(correlation).any():
@@ -81,7 +81,7 @@ def lag_between(
     rival = float(elsewhere.max()) if len(elsewhere) else 0.0
     shift = (best + fine - (len(second) - 1)) * step
     seconds = float(times[0] + shift - other_times[0])
-    certain = peak >= _LEAST_CORRELATION and rival <= _RIVAL * peak
+    certain = peak >= _MIN_CORRELATION and rival <= _RIVAL * peak
     return Lag(seconds, peak, certain)
 
 

@@ -1,10 +1,10 @@
-"""How two trajectories of one rig fit together: hand-eye calibration with free-running clocks.
+"""Hand-eye calibration of two trajectories of one rig with free-running clocks.
 
 Camera a moves by A while camera b, fixed to it, moves by B: A X = X B, with X = T_a_b (Tsai and
-Lenz, 1989). Relative motions give a first X; then all poses at once are fitted by X, by the motion
-Y between the two worlds, and by what has to be added to b's timestamps: T_a X = Y T_b. Errors of
-trajectories last for a while: the covariance takes them for a process of first order, whose
-correlation time is that of the residuals.
+Lenz, 1989). Relative motions give an initial X; then all poses are fitted jointly by X, by the
+transformation Y between the two worlds, and by the offset of b's timestamps: T_a X = Y T_b. Errors
+of trajectories are correlated in time: the covariance models them as a first-order process with the
+correlation time of the residuals.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.rigs.clocks import Lag, lag_between
 
-# 1 cm, 1 degree, and 1 ms: so that unknowns can be compared.
+# Units of the unknowns: 1 cm, 1 degree, and 1 ms.
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _TIME_UNIT = 1e-3
-# Poses are interpolated over gaps of so many intervals; fewer than so many common ones say nothing.
-_GAP, _LEAST = 3.5, 12
-# Motions A and B are taken over these shares of the common time.
+# Largest gap over which poses are interpolated, in intervals; and minimum number of common poses.
+_GAP, _MIN_COMMON = 3.5, 12
+# Durations of motions A and B, as fractions of the common time.
 _SPANS = (0.02, 0.05, 0.1, 0.2, 0.35)
 _ITERATIONS, _SETTLED = 30, 1e-4
-# Residuals beyond so many sigmas count nothing (Tukey's biweight); least sigma of a pose.
-_ROBUST, _LEAST_SIGMA = 4.7, 0.02
+# Cut-off of Tukey's biweight in sigmas; minimum sigma of a pose.
+_ROBUST, _MIN_SIGMA = 4.7, 0.02
 _NORMAL_MEDIAN = 0.6745
 # Upper 95 % bound, in standard errors.
 _UPPER = 1.64
-# Sigma beyond which nothing is known, in units.
+# Sigma of an unconstrained direction, in units.
 _LOOSEST = 100.0
 
 
@@ -44,7 +44,7 @@ class Track:
 
     @classmethod
     def of(cls, times: Float64, poses: Float64) -> Track:
-        """Of the frames that have a pose."""
+        """Return the track of the frames with a pose."""
         known = np.isfinite(poses[:, 0, 0])
         return cls(times[known], poses[known])
 
@@ -124,9 +124,9 @@ def hand_eye(a: Track, b: Track, time_offset_s: float, *, one_world: bool = Fals
 
 
 def combined(a: HandEye, b: HandEye) -> HandEye:
-    """The mean of two estimates by their covariances: of how a rig moves, and of what it sees.
+    """Return the weighted mean of two estimates, with a scaled covariance if they disagree.
 
-    Where they differ by more than these allow, it is as much less certain (Birge, 1932).
+    The covariance is scaled by the Birge ratio (Birge, 1932).
     """
     apart = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
     both = a.covariance + b.covariance
@@ -148,7 +148,7 @@ def combined(a: HandEye, b: HandEye) -> HandEye:
 def _common(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:
     """Times of a's poses at which b's are known too, and both poses."""
     T_b, known = b.at(a.times - offset)
-    if known.sum() < _LEAST:
+    if known.sum() < _MIN_COMMON:
         raise RegistrationError(
             f"only {known.sum()} poses of both cameras are of one time",
             remedy="record all cameras at the same time",
@@ -249,28 +249,28 @@ class _Fit:
 
 
 def _sigma(e: Float64) -> Float64:
-    """(6,) robust standard deviation of residuals, alike for the axes of each kind."""
+    """Return the robust standard deviation (6,) of residuals, equal for the axes of each kind."""
     each = np.median(np.abs(e), axis=0) / _NORMAL_MEDIAN
     both = [np.sqrt((each[:3] ** 2).mean())] * 3 + [np.sqrt((each[3:] ** 2).mean())] * 3
-    return np.maximum(both, _LEAST_SIGMA)
+    return np.maximum(both, _MIN_SIGMA)
 
 
 def _weights(e: Float64, sigma: Float64) -> Float64:
-    """(N, 6) Tukey's biweight by the whole residual of a pose."""
+    """Return weights (N, 6): Tukey's biweight of the residual of each pose."""
     share = ((e / sigma) ** 2).mean(1) / _ROBUST**2
     return np.repeat((np.maximum(1 - share, 0) ** 2)[:, None], 6, axis=1)
 
 
 def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:
-    """Covariance of the unknowns, in units, with errors that last for a while."""
+    """Return the covariance of the unknowns, in units, with errors that are correlated in time."""
     w = _weights(e, sigma) / sigma**2
     H = _product(J, w, J)
-    lasting = _lasting(e / sigma, times, H.shape[0] / 6)
+    lasting = _correlation_time(e / sigma, times, H.shape[0] / 6)
     alike = np.exp(-2 * np.abs(times[:, None] - times[None]) / lasting)
-    # The fit has taken up as much of the errors as there are unknowns for what is independent.
+    # Degrees of freedom: independent errors minus unknowns.
     independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
     left = max(independent - H.shape[0], 6.0)
-    # And as many as are left tell how large errors are: the ellipsoids are those of Student's t.
+    # With few degrees of freedom the ellipsoids are those of Student's t.
     more = independent / left * left / (left - 2)
     weighed = J * (w * sigma)[..., None]
     spread = np.tensordot(alike, weighed, 1)
@@ -288,12 +288,12 @@ def _product(J: Float64, w: Float64, K: Float64) -> Float64:
     return np.asarray(out, np.float64)
 
 
-def _lasting(e: Float64, times: Float64, taken: float) -> float:
-    """How long an error lasts, s: integral of the autocorrelation of the residuals.
+def _correlation_time(e: Float64, times: Float64, taken: float) -> float:
+    """Return the correlation time of errors, s: the integral of the residuals' autocorrelation.
 
-    What a fit with so many unknowns for each axis (`taken`) has taken up is missing in it: at all
-    times about `taken` independent errors of those that there are. A time taken too short states
-    errors that are too small, so it is its upper 95 % bound (by Bartlett's standard error).
+    It is corrected for what a fit with `taken` unknowns per axis absorbs: about `taken` independent
+    errors at all lags. As a time that is too short understates errors, the upper 95 % bound is
+    returned (by Bartlett's standard error).
     """
     interval = float(np.median(np.diff(times)))
     power = float((e**2).sum())

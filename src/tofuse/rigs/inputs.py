@@ -1,4 +1,4 @@
-"""The recordings of a rig's cameras: named, checked, and made ready to be compared."""
+"""The recordings of a rig's cameras: named, checked, and prepared for comparison."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
-_MOST_CAMERAS = 64
+_MAX_CAMERAS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera of a rig: what it is called, and what it recorded."""
+    """A camera of a rig: its name and its recording."""
 
     name: str
     recording: Recording
@@ -32,8 +32,7 @@ class Camera:
     def config(self) -> Config:
         """How its images are prepared.
 
-        Corrections that are tried first are left out: the trial asks how neighbouring views of a
-        moving camera fit.
+        Corrections on trial are left out: the trial compares consecutive views of a moving camera.
         """
         config = with_recording_defaults(from_method("default", "range"), self.recording)
         kept = tuple(c for c in config.corrections if not c.needs_trial)
@@ -50,7 +49,7 @@ class Camera:
         frames = [frame for frame in self.recording.images(count) if len(frame)]
         if not frames:
             raise InputError(
-                "has no image that can be read and holds a measurement",
+                "has no readable image with a valid measurement",
                 where=self.recording.path,
                 remedy="check the recording with `tofuse inspect`",
             )
@@ -71,15 +70,15 @@ class Camera:
                 yield item
 
     def corrected(self, frame: RangeFrame) -> RangeFrame:
-        """An image without the errors that can be known of it, and without bad points."""
+        """Return an image after corrections and filters."""
         for correction in self.config.corrections:
-            made = correction.start().apply(frame)
-            frame = made if isinstance(made, RangeFrame) else frame
+            corrected = correction.start().apply(frame)
+            frame = corrected if isinstance(corrected, RangeFrame) else frame
         filtered, _ = apply_filters(self.config.filters, frame, ())
         return filtered if isinstance(filtered, RangeFrame) else frame
 
     def surface(self, frame: RangeFrame) -> PreparedView:
-        """An image as it is compared."""
+        """Return an image prepared for comparison."""
         return prepare_view(self.corrected(frame), SurfaceOptions())
 
 
@@ -93,9 +92,9 @@ def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list
     """
     if len(paths) < 2:
         raise InputError("is one camera", where="a rig", remedy="give two recordings or more")
-    if len(paths) > _MOST_CAMERAS:
+    if len(paths) > _MAX_CAMERAS:
         raise InputError(
-            f"has {len(paths)} cameras", where="a rig", remedy=f"give at most {_MOST_CAMERAS}"
+            f"has {len(paths)} cameras", where="a rig", remedy=f"give at most {_MAX_CAMERAS}"
         )
     resolved = [Path(path).resolve() for path in paths]
     for k, path in enumerate(resolved):
@@ -109,7 +108,7 @@ def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
-    """Short names: the last parts of the paths, as many as tell them apart."""
+    """Return the shortest suffixes of the paths that are unique."""
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = ["/".join(path.parts[-parts:]) for path in paths]
         if len(set(names)) == len(names):
@@ -118,7 +117,7 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def overlap_of_times(cameras: Sequence[Camera]) -> float:
-    """By how much all recordings overlap in time by their own clocks, s; negative: not at all."""
+    """Return the common duration of all recordings by their clocks, s; negative without one."""
     begin = max(float(c.recording.timestamps[0]) for c in cameras)
     end = min(float(c.recording.timestamps[-1]) for c in cameras)
     return float(np.subtract(end, begin))

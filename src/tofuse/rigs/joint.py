@@ -1,10 +1,10 @@
-"""All cameras of a rig at once: their poses, and by how much their depths differ.
+"""Joint calibration of all cameras of a rig: their poses and depth offsets, with covariances.
 
-Views of different cameras that overlap are compared both ways. As the cameras do not move against
+Overlapping views of different cameras are compared in both directions. As the cameras are fixed to
 each other, all instants share the unknowns: a pose and a depth offset for each camera but the
-first. The covariance is that of an M-estimator whose errors are alike where surfaces are near each
-other (Conley, "GMM estimation with cross sectional dependence", 1999): errors of depth by indirect
-light, by the lens and by motion are the same for neighbouring points, in all views of a place.
+first. The covariance is that of an M-estimator with spatially correlated errors (Conley, "GMM
+estimation with cross sectional dependence", 1999): depth errors due to multipath, the lens and
+motion are equal for neighbouring points, in all views of a place.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from tofuse.posegraph.view_store import KeptView
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7
 _UNITS = np.append(UNITS, 0.01)
-_PAIRS_A_CHUNK = 8
-# Chi-square with one degree of freedom: median; and sigmas of a distance that count at most.
+_PAIRS_PER_CHUNK = 8
+# Median of chi-square with one degree of freedom; limits of the noise scale of a pair of cameras.
 _MEDIAN_OF_SQUARES = 0.455
-_LEAST_SCALE, _MOST_SCALE = 0.7, 30.0
-_LEAST_COMPARED = 50
-# What is further off than this share of the depth is another surface.
+_MIN_SCALE, _MAX_SCALE = 0.7, 30.0
+_MIN_COMPARED = 50
+# Points further from a surface than this fraction of the depth are on another one.
 _OTHER_SURFACE = 0.1
-# Sigma beyond which the data is not trusted to hold a direction, and what it is given then, in
-# units of 1 cm and 1 degree.
-_HELD, _LOOSEST = 3.0, 30.0
-# Windows of plane fits overlap: so many pixels share one value of noise (half the smallest window;
-# covariances of simulated boards then cover, see tests).
+# Largest sigma of a constrained direction, and the sigma of an unconstrained one, in units of 1 cm
+# and 1 degree.
+_MAX_SIGMA, _LOOSEST = 3.0, 30.0
+# Windows of plane fits overlap: number of pixels per independent value of noise (half the smallest
+# window; covariances of simulated boards are then consistent, see tests).
 _SHARED_NOISE = 12.0
-# Regions of space in which all errors are alike, as a share of the depth.
+# Size of regions of space with equal errors, as a fraction of the depth.
 _REGION = 0.1
 
 
@@ -52,11 +52,11 @@ class JointOptions:
     robust, max_angle
         As in `ProjectiveOptions`.
     overlap
-        Least share of a view's points that must land on surfaces of another one.
+        Minimum fraction of a view's points that project onto surfaces of another one.
     offset_sigma_m
-        What is known of a camera's depth offset beforehand. Makers promise about a centimetre.
+        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre.
     reach
-        Errors of points this far apart are still alike (by 1/e), as a share of the depth.
+        Correlation length of errors (to 1/e), as a fraction of the depth.
     steepness
         As in `registration.uncertainty`.
     convergence
@@ -115,12 +115,16 @@ class Placed:
 def refine_together(
     views: Sequence[View], poses: Float64, options: JointOptions | None = None
 ) -> Placed:
-    """Move all cameras until what they see agrees.
+    """Optimise the poses and depth offsets of all cameras jointly.
 
     Parameters
     ----------
+    views
+        Views of all cameras.
     poses
-        (K, 4, 4) T_rig_camera to start from; the first stays.
+        (K, 4, 4) initial T_rig_camera; the first is fixed.
+    options
+        How they are refined.
     """
     system = _System(views, poses, options or JointOptions())
     for stage in system.options.rounds:
@@ -175,7 +179,7 @@ def distances_between(target: KeptView, source: KeptView, T_target_source: Float
 
 
 class _System:
-    """The unknowns, and what is compared."""
+    """The unknowns, and the pairs of views that are compared."""
 
     def __init__(self, views: Sequence[View], poses: Float64, options: JointOptions) -> None:
         self.options = options
@@ -220,7 +224,7 @@ class _System:
                 if near.sum() >= self.options.overlap * len(points):
                     rows[k] = out[near]
 
-        run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_A_CHUNK))
+        run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_PER_CHUNK))
         return rows
 
     def rescale(self, rows: Sequence[Float64]) -> None:
@@ -233,9 +237,9 @@ class _System:
         for a in range(count):
             for b in range(count):
                 found = np.concatenate(ratios.get((a, b), [np.zeros(0)]))
-                if len(found) >= _LEAST_COMPARED:
+                if len(found) >= _MIN_COMPARED:
                     scale = np.sqrt(np.median(found) / _MEDIAN_OF_SQUARES)
-                    self.scale[a, b] = np.clip(scale, _LEAST_SCALE, _MOST_SCALE)
+                    self.scale[a, b] = np.clip(scale, _MIN_SCALE, _MAX_SCALE)
 
     def jacobian(self, k: int, row: Float64) -> tuple[Float64, Float64]:
         """(N, 14) derivatives by the source's and the target's unknowns, and half the difference
@@ -281,7 +285,7 @@ class _System:
         self.add_prior(H, g)
         free = np.arange(_SIZE, size)
         H = H[np.ix_(free, free)]
-        # Just enough that a camera which nothing holds stays.
+        # Damping, so that an unconstrained camera stays.
         H[np.diag_indices(len(H))] += 1e-3 + 1e-6 * H.diagonal()
         step = np.zeros(size)
         step[free] = -np.linalg.solve(H, g[free])
@@ -299,14 +303,14 @@ class _System:
         return f * f / variance, f * (1 - 5 * e2) / variance
 
     def add_prior(self, H: Float64, g: Float64) -> None:
-        """Add what is known of the offsets beforehand, in units."""
+        """Add the prior of the offsets, in units."""
         at = _SIZE * np.arange(len(self.poses)) + 6
         known = (0.01 / self.options.offset_sigma_m) ** 2
         H[at, at] += known
         g[at] += known * self.offsets / 0.01
 
     def placed(self) -> Placed:
-        """Say where the cameras are, and how well that is known."""
+        """Return the poses and offsets of the cameras, with covariances."""
         rows = self.compare()
         self.rescale(rows)
         count, size = len(self.poses), _SIZE * len(self.poses)
@@ -347,7 +351,7 @@ class _System:
         return Placed(self.poses, self.offsets, blocks, scaled, rms, self.disagreement(rows))
 
     def _shared(self, k: int) -> float:
-        """How many residuals of a pair share one value of noise.
+        """Return the number of residuals of a pair per independent value of noise.
 
         Windows of neighbouring pixels overlap, and the pair is compared both ways.
         """
@@ -374,11 +378,11 @@ class _System:
         prior = np.zeros(len(free))
         prior[6::_SIZE] = known
         B += np.diag(prior)
-        # What the data holds no better than this it does not hold: there is the noise of normals.
+        # Directions beyond the largest sigma are unconstrained: there is the noise of normals.
         P = plain[np.ix_(free, free)]
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
-        weak, held = vectors[:, values < _HELD**-2], vectors[:, values >= _HELD**-2]
-        bread = held @ np.linalg.inv(held.T @ X @ held) @ held.T
+        weak, strong = vectors[:, values < _MAX_SIGMA**-2], vectors[:, values >= _MAX_SIGMA**-2]
+        bread = strong @ np.linalg.inv(strong.T @ X @ strong) @ strong.T
         C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
         return 0.5 * (C + C.T)
 
@@ -402,10 +406,9 @@ def _by_region(where: Float64, rows: Float64, size: float) -> tuple[Float64, Flo
 
 
 def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
-    """Slope of the gradient, along no direction less than a share of what it is without robust
-    weights."""
+    """Return the slope of the gradient, at least a fraction of that without robust weights."""
     values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
-    root = vectors / np.sqrt(np.maximum(values, _HELD**-2))
+    root = vectors / np.sqrt(np.maximum(values, _MAX_SIGMA**-2))
     values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)
     back = np.linalg.inv(root).T @ turned
     X: Float64 = (back * np.maximum(values, steepness)) @ back.T

@@ -1,10 +1,11 @@
-"""Where the cameras of a rig are when nothing is known: poses of pairs, decided about together.
+"""Placement of the cameras of a rig without a guess: sets of poses from pairs, selected jointly.
 
-Two cameras that look at the same thing from two sides share little, and one pair seldom tells which
-of many poses is right. All cameras do: a pose that is right for one pair agrees with what every
-other camera saw, and through what it saw. So each pair of views only proposes poses, found by an
-exhaustive search; sets of them are put together camera by camera, the best first, and judged by the
-agreement of all pairs at all instants. A camera is placed if no other place for it comes near.
+Two cameras that look at an object from two sides overlap little, and a single pair seldom
+determines which of many poses is right. All cameras do: the right pose of a pair is consistent with
+the surfaces and the free space of every other camera. So each pair of views only proposes poses, by
+an exhaustive search; sets are extended camera by camera by a beam search, and scored by the
+agreement of all pairs at all instants. A camera is placed if no other place for it has a similar
+score.
 """
 
 from __future__ import annotations
@@ -32,21 +33,20 @@ from tofuse.rigs.joint import JointOptions, View, refine_together
 
 V = TypeVar("V")
 
-# Instants that are searched, that judge, and that settle: more of a moving scene say more.
+# Numbers of instants that are searched, scored and refined; more of a moving scene are better.
 _SEARCHED, _JUDGED, _SETTLED = 2, 4, 2
-# Proposals of each pair; sets that are kept, and of those that are settled.
+# Proposals of each pair; width of the beam, and number of sets in it that are refined.
 _PROPOSALS, _BEAM, _POLISHED = 24, 12, 6
-# Rivals that tell how far the best of wrong places leads the next, and how improbable a lead must
-# be among these.
+# Number of rivals from which the distribution of leads is estimated, and its significance level.
 _RIVALS, _CHANCE = 10, 0.01
-# Cameras around a thing are as far from each other as from two sides of it, and face any way; those
-# side by side see much of the same, and may be tilted.
+# Cameras around an object are on opposite sides of it, with any yaw; those side by side overlap
+# much, and may be tilted.
 _AROUND = SearchOptions(mode="planar", yaw=float(np.pi), reach=1.8, planar_candidates=40)
-_BESIDE = SearchOptions(mode="full")
-# Distinct places differ by more than this share of the depth.
+_SIDE_BY_SIDE = SearchOptions(mode="full")
+# Minimum difference of distinct places, as a fraction of the depth.
 _DISTINCT = 0.04
 _POINTS = 1500
-_SETTLING = JointOptions(offset_sigma_m=1e-4)
+_REFINING = JointOptions(offset_sigma_m=1e-4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class _Placer:
         """Poses T_target_source (N, 4, 4) that a pair of views proposes."""
         near = register_pair(source, target)
         poses = [] if near is None else [near.T_target_source]
-        for options in (self._options, _BESIDE):
+        for options in (self._options, _SIDE_BY_SIDE):
             search = Search.of(source, target, options)
             match = None if search is None else search.everywhere()
             if match is not None:
@@ -175,17 +175,17 @@ class _Placer:
         return np.asarray(se3.inverse(self._proposals[b, a]), np.float64)
 
     def _gain(self, poses: Mapping[int, Float64], camera: int, T: Float64) -> float:
-        """By how much a camera at T agrees with the others that have a place."""
+        """Return the score of a camera at T (4, 4) against the placed ones."""
         return sum(
             self._at(c, camera, se3.inverse(at) @ T).score for c, at in poses.items() if c != camera
         )
 
     def _places(self, poses: Mapping[int, Float64], camera: int) -> list[Float64]:
-        """Where a camera may be, by what it shares with each of those that have a place."""
+        """Return candidate poses of a camera, from its proposals with each placed one."""
         return [poses[c] @ T for c in poses if c != camera for T in self._proposed(c, camera)]
 
-    def _grown(self, sets: Sequence[_Set]) -> list[_Set]:
-        """Sets with one camera more, the best first."""
+    def _extended(self, sets: Sequence[_Set]) -> list[_Set]:
+        """Return sets extended by one camera, the best first."""
         jobs = [
             (known, camera, T)
             for known in sets
@@ -194,39 +194,39 @@ class _Placer:
             for T in self._places(known.poses, camera)
         ]
         gains = run_all([partial(self._gain, known.poses, camera, T) for known, camera, T in jobs])
-        grown = [
+        extended = [
             _Set({**known.poses, camera: T}, known.score + gain)
             for (known, camera, T), gain in zip(jobs, gains, strict=True)
             if gain > 0
         ]
-        best = self._distinct(grown, _BEAM)
-        settled = run_all([partial(self._settle, one) for one in best[:_POLISHED]])
-        return self._distinct([*settled, *best[_POLISHED:]], _BEAM)
+        best = self._distinct(extended, _BEAM)
+        refined = run_all([partial(self._refined, one) for one in best[:_POLISHED]])
+        return self._distinct([*refined, *best[_POLISHED:]], _BEAM)
 
-    def _distinct(self, sets: Sequence[_Set], most: int) -> list[_Set]:
+    def _distinct(self, sets: Sequence[_Set], max_sets: int) -> list[_Set]:
         kept: list[_Set] = []
         for one in sorted(sets, key=lambda s: -s.score):
             if all(self._differ(one.poses, other.poses) for other in kept):
                 kept.append(one)
-                if len(kept) == most:
+                if len(kept) == max_sets:
                     break
         return kept
 
     def _differ(self, a: Mapping[int, Float64], b: Mapping[int, Float64]) -> bool:
         return a.keys() != b.keys() or any(self._options.differ(a[c], b[c]) for c in a)
 
-    def _settle(self, one: _Set) -> _Set:
-        """Align all cameras of a set with each other."""
+    def _refined(self, one: _Set) -> _Set:
+        """Refine all cameras of a set jointly, if that improves its score."""
         moved = self._aligned(one.poses)
         score = self._score(moved)
         return _Set(moved, score) if score > one.score else one
 
     def _aligned(self, poses: Mapping[int, Float64]) -> dict[int, Float64]:
-        """The same cameras where their views agree best, nearby."""
+        """Return the jointly refined poses."""
         order = sorted(poses)
         row = {c: k for k, c in enumerate(order)}
         views = [replace(v, camera=row[v.camera]) for v in self._kept if v.camera in row]
-        moved = refine_together(views, np.stack([poses[c] for c in order]), _SETTLING).poses
+        moved = refine_together(views, np.stack([poses[c] for c in order]), _REFINING).poses
         return dict(zip(order, moved, strict=True))
 
     def _score(self, poses: Mapping[int, Float64]) -> float:
@@ -236,13 +236,13 @@ class _Placer:
         )
 
     def placement(self) -> Placement:
-        """Put sets together, and keep of the best one the cameras that have no other place."""
+        """Search sets of poses, and keep the cameras of the best one that have no other place."""
         sets = [_Set({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
         probability: dict[int, float] = {}
         reasons: dict[int, str] = {}
         rivals: list[_Set] = sets
         while sets:
-            rivals, sets = sets, self._grown(sets)
+            rivals, sets = sets, self._extended(sets)
         best = rivals[0] if rivals else _Set({}, 0.0)
         poses = dict(best.poses)
         while len(poses) > 1:
@@ -261,9 +261,9 @@ class _Placer:
     def _rivals(
         self, poses: Mapping[int, Float64], camera: int, found: Sequence[tuple[float, Float64]]
     ) -> list[float]:
-        """Scores of other places for a camera, descending, each with what it leads to.
+        """Return scores of other places for a camera, descending.
 
-        What settles where the camera is already is no other place.
+        A place that converges to the present one is not another place.
         """
         at = poses[camera]
         apart: list[Float64] = [at]
@@ -282,17 +282,17 @@ class _Placer:
     def _belief(
         self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Set]
     ) -> tuple[float, str]:
-        """Probability that the place of a camera is right, and why it is not believed, if so.
+        """Return the probability that a camera's place is right, and why it is not believed, if so.
 
-        What other pairs see is other surface, so that support and lead add up over pairs. Whether
-        a lead is more than chance is told by the rivals: of places that are all wrong the i-th
-        best leads the next by an exponentially distributed gap with mean b / i, whatever the tail
-        of their scores is like (Renyi, 1953; Weissman, 1978).
+        Pairs see different surfaces, so that support and lead add up over pairs. The significance
+        of a lead follows from the rivals: among wrong places the i-th best leads the next by an
+        exponentially distributed gap with mean b / i, for any tail of the scores (Renyi, 1953;
+        Weissman, 1978).
         """
         others = {c: T for c, T in poses.items() if c != camera}
         at = poses[camera]
-        said = [self._at(c, camera, se3.inverse(T) @ at) for c, T in others.items()]
-        score = sum(s.score for s in said)
+        comparisons = [self._at(c, camera, se3.inverse(T) @ at) for c, T in others.items()]
+        score = sum(s.score for s in comparisons)
         elsewhere = self._places(others, camera)
         gains = run_all([partial(self._gain, others, camera, T) for T in elsewhere])
         total = self._score(poses)
@@ -303,10 +303,10 @@ class _Placer:
         ]
         scores = self._rivals({**others, camera: at}, camera, found)
         rival = scores[0] if scores else 0.0
-        overlap = max(sum(s.overlap for s in said), 1e-9)
+        overlap = max(sum(s.overlap for s in comparisons), 1e-9)
         evidence = Evidence(
-            support=min(sum(s.support for s in said), 1.0),
-            contradiction=sum(s.against for s in said) / overlap,
+            support=min(sum(s.support for s in comparisons), 1.0),
+            contradiction=sum(s.against for s in comparisons) / overlap,
             margin=score - rival,
         )
         gaps = -np.diff(scores[: _RIVALS + 1]) * np.arange(2, len(scores[: _RIVALS + 1]) + 1)
@@ -326,7 +326,7 @@ class _Placer:
 
 
 def _evenly(items: Sequence[V], count: int) -> list[V]:
-    """At most so many of the items, evenly spread."""
+    """Return at most `count` of the items, evenly spaced."""
     if len(items) <= count:
         return list(items)
     at = np.linspace(0, len(items) - 1, count).round().astype(int)

@@ -36,7 +36,7 @@ from tofuse.rigs.calibrate import Motion, cameras_of, moves
 from tofuse.rigs.check import Moved, compare
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import View, disagreements, refine_together
-from tofuse.rigs.walked import walked
+from tofuse.rigs.rig_trajectory import track_rig
 
 # No place is looked for again: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
@@ -144,7 +144,7 @@ def reconstruct_rig(
     measured: tuple[Measured, ...] = ()
     tracked: tuple[Measured, ...] = ()
     if moves(cameras, motion):
-        found = walked(cameras, recording, progress)
+        found = track_rig(cameras, recording, progress)
         poses, T_rig_frame, apart = found.poses, found.T_rig_frame, found.disagreement
         measured, tracked = found.measured, found.tracked
     else:

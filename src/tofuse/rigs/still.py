@@ -71,7 +71,7 @@ class StillRig:
 
 
 def stands_still(camera: Camera) -> bool:
-    """Whether a camera does not move: most of its pixels see the same surface time and again."""
+    """Whether a camera does not move: most pixels see the same surface repeatedly."""
     frames = camera.images(_LOOKED_AT)
     if len(frames) < 3:
         model = noise_model_for(camera.recording)
@@ -80,7 +80,7 @@ def stands_still(camera: Camera) -> bool:
 
 
 def _unchanged(frames: Sequence[RangeFrame]) -> float:
-    """Share of the pixels that see the same surface in most of the frames."""
+    """Return the fraction of pixels that see the same surface in most of the frames."""
     far: FarSurface = far_surface(frames)
     seen = np.isfinite(far.z) & (far.z > 0)
     valid = np.mean([f.valid for f in frames], axis=0) > 0.5
@@ -89,7 +89,7 @@ def _unchanged(frames: Sequence[RangeFrame]) -> float:
 
 
 def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
-    """Place and refine cameras that stand still against each other."""
+    """Place and refine static cameras relative to each other."""
     notes: list[str] = []
     progress.stage("instants")
     offsets, instants = _instants(cameras, notes)
@@ -118,7 +118,7 @@ def _with_clock_errors(
     offsets: Float64,
     instants: Sequence[Sequence[PreparedView | None]],
 ) -> Placed:
-    """Add to the covariances what clocks leave open: how far poses move if one is a frame late."""
+    """Add the uncertainty of the clocks to the covariances: how far poses move by one frame."""
     at = _common_times(cameras, offsets)
     blocks = placed.covariance.copy()
     for c in order[1:]:
@@ -133,7 +133,7 @@ def _with_clock_errors(
 
 
 def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]) -> list[View]:
-    """The views of the placed cameras, numbered in their order."""
+    """Return the views of the placed cameras, numbered in their order."""
     count = max((len(row) for row in instants), default=1)
     points = int(np.clip(_ALL_POINTS / count, _LEAST_POINTS, _POINTS))
     return [
@@ -203,7 +203,7 @@ def _kept(surface: PreparedView | None) -> KeptView | None:
 
 
 def _least(lags: Float64, costs: Float64) -> float | None:
-    """Where costs are least, between samples; None where that is at an end, or they don't tell."""
+    """Return the interpolated minimum of costs; None at an end, or if it is not distinct."""
     good = np.isfinite(costs)
     if good.sum() < 5:
         return None
@@ -226,7 +226,7 @@ def _least(lags: Float64, costs: Float64) -> float | None:
 def _instants(
     cameras: Sequence[Camera], notes: list[str]
 ) -> tuple[Float64, list[list[PreparedView | None]]]:
-    """Time offsets (K,), and for each camera its views of all instants."""
+    """Return time offsets (K,), and the views of all instants by camera."""
     offsets = np.zeros(len(cameras))
     sampled = [camera.images(_LOOKED_AT) for camera in cameras]
     if all(len(frames) == 1 for frames in sampled) or not any(map(_something_moves, cameras)):
@@ -238,7 +238,7 @@ def _instants(
 
 
 def _at_times(camera: Camera, offset: float, at: Float64) -> list[PreparedView | None]:
-    """Views of a camera at the rig's times; None where it has none."""
+    """Return the views of a camera at the rig's times; None where it has none."""
     times = camera.recording.timestamps + offset
     near = np.abs(times[None] - at[:, None]).argmin(1)
     apart = np.abs(times[near] - at)
@@ -251,7 +251,7 @@ def _at_times(camera: Camera, offset: float, at: Float64) -> list[PreparedView |
 
 
 def _something_moves(camera: Camera) -> bool:
-    """Whether what a camera sees changes by more than noise."""
+    """Whether the scene changes by more than noise."""
     frames = camera.images(_LOOKED_AT)
     model = noise_model_for(camera.recording)
     return any(not change_between(frames[0], f, model).still for f in frames[1:])
@@ -265,7 +265,7 @@ def _average(camera: Camera) -> RangeFrame:
 
 
 def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
-    """Times of the instants: frames of the first camera that all others see too."""
+    """Return the times of the instants: frames of the first camera that all others have too."""
     begin = max(c.recording.timestamps[0] + o for c, o in zip(cameras, offsets, strict=True))
     end = min(c.recording.timestamps[-1] + o for c, o in zip(cameras, offsets, strict=True))
     times = cameras[0].recording.timestamps
@@ -314,7 +314,7 @@ def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
 
 
 def _activity(camera: Camera) -> tuple[Float64, Float64]:
-    """Times (N,) and share of the pixels that changed since the frame before."""
+    """Return times (N,) and the fraction of pixels that changed since the frame before."""
     times, shares = [], []
     before: RangeFrame | None = None
     for frame in camera.every_image():

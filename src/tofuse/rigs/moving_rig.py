@@ -1,7 +1,7 @@
-"""A rig that moves: each camera is tracked by itself, and the rig is what fits their trajectories.
+"""Calibration of a moving rig: cameras are tracked separately, and their trajectories aligned.
 
-No two cameras need to see the same at the same time. What they see of the same place at different
-times counts in one refinement of all views, once the trajectories are in one world.
+No two cameras need to overlap at any instant. Views of the same place at different times are used
+in a joint refinement of all views, once the trajectories are in one world.
 """
 
 from __future__ import annotations
@@ -24,35 +24,34 @@ from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
-# Views of each camera that are refined together, and their points.
+# Views of each camera that are refined jointly, and their points.
 _VIEWS, _POINTS = 70, 1500
-# Clocks that differ by more are not of one rig, s, unless the cameras turned alike.
+# Largest difference of clocks of one rig, s, unless the rotations of the cameras correlate.
 _SAME_CLOCK_S = 0.5
-# A place that is known worse than this share of the depth, or so many rad, is none.
-_LOOSE_SHARE, _LOOSE_RAD = 0.05, float(np.radians(4.0))
+# Largest sigma of a placed camera: fraction of the depth, and rad.
+_MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
 _OPTIONS = RefineOptions(neighbours=16)
 
 
 @dataclass(frozen=True, eq=False)
 class MovingRig:
-    """What a walk with a rig tells of its cameras.
+    """The calibration of a moving rig.
 
     Attributes
     ----------
     results
-        What each camera made of the walk by itself.
+        The reconstruction of each camera by itself.
     tracks
-        Trajectories of the cameras in one world, by camera; of those that are not placed, in their
-        own.
+        Trajectories of the cameras in one world, by camera; of those not placed, in their own.
     fits
-        How each camera but the first is fixed to the first, by camera.
+        Calibration of each camera but the first relative to the first, by camera.
     reasons
-        By camera that is not placed: why not.
+        Why a camera is not placed, by camera.
     disagreement
-        By pair of cameras (a, b), a < b: median distance between what they saw of the same places,
-        at any time, in m, and how many pixels were compared.
+        By pair of cameras (a, b), a < b: median distance between their surfaces, at any time, in
+        m, and the number of compared pixels.
     notes
-        What a person should know.
+        Messages for the user.
     """
 
     results: tuple[Reconstruction, ...]
@@ -159,7 +158,7 @@ def _too_loose(fit: HandEye, depth: float) -> str:
         float(np.sqrt(max(np.linalg.eigvalsh(fit.covariance[part, part])[-1], 0)))
         for part in (slice(3), slice(3, 6))
     )
-    if position <= _LOOSE_SHARE * depth and rotation <= _LOOSE_RAD:
+    if position <= _MAX_SIGMA_FRACTION * depth and rotation <= _MAX_SIGMA_RAD:
         return ""
     return (
         f"the motion leaves its place open ({1000 * position:.0f} mm, "

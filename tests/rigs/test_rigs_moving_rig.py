@@ -14,8 +14,8 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig_source import RigSource
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.inputs import Camera
+from tofuse.rigs.rig_trajectory import refined
 from tofuse.rigs.run import reconstruct_rig
-from tofuse.rigs.walked import refined
 
 CLOCK = 0.012
 COUNT = 50

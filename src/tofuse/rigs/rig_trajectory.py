@@ -1,7 +1,7 @@
-"""One pose for each instant of a rig that moves.
+"""The trajectory of a moving rig: one pose for each instant.
 
-Each camera is tracked by itself. The mean of what they say of the rig, by their covariances, is
-refined: views of all cameras are compared with each other, and those of one instant move together.
+Each camera is tracked separately. The mean of their poses of the rig, weighted by covariances, is
+refined: views of all cameras are compared, and those of one instant move as one body.
 """
 
 from __future__ import annotations
@@ -30,37 +30,36 @@ from tofuse.rigs.hand_eye import Track
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
-# Median distance between what two cameras saw, m, and the pixels compared, by pair a < b.
+# Median distance between the surfaces of two cameras, m, and compared pixels, by pair a < b.
 Apart = dict[tuple[int, int], tuple[float, int]]
 
-# Views are spaced as those of one camera are, and so many are refined together at most.
+# Spacing of views, as for a single camera, and their points.
 _SPACING = Spacing()
 _POINTS = 1500
-# Variances, m and rad, of a pose of which none is stated; and the share of it that each pose gets,
-# as even the first one of a track is not known without error.
+# Variances, m and rad, of a pose without a covariance; and the fraction of them that is added to
+# each pose, as even the first one of a track has an error.
 _UNKNOWN, _AT_LEAST = np.array([0.1**2] * 6), 1e-4
 # Each camera sees the places of all others.
 _OPTIONS = RefineOptions(neighbours=16)
 
 
 @dataclass(frozen=True, eq=False)
-class Walked:
-    """How a rig moved.
+class RigTrajectory:
+    """The trajectory of a rig.
 
     Attributes
     ----------
     poses
         (N, 4, 4) T_world_rig of the instants; NaN where no camera has a pose.
     T_rig_frame
-        (F, 4, 4) of each frame: where it was taken from, in the rig's frame at its instant. Its
-        camera's place, and the motion since: cameras that run freely see an instant at times of
-        their own.
+        (F, 4, 4) pose of each frame in the rig's frame at its instant: that of its camera, and the
+        motion since, as free-running cameras take images at different times.
     disagreement
         See `MovingRig`.
     measured
-        How sure that is: what pairs of views measured, by the index of their frames.
+        Measurements of pairs of views, by the index of their frames.
     tracked
-        Of instants that took no part in that: what the cameras' own trajectories are sure of.
+        Measurements of the cameras' own trajectories, for instants that were not refined.
     """
 
     poses: Float64
@@ -70,7 +69,7 @@ class Walked:
     tracked: tuple[Measured, ...] = ()
 
 
-def walked(cameras: Sequence[Camera], recording: Recording, progress: Progress) -> Walked:
+def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progress) -> RigTrajectory:
     """Track each camera of a `RigSource`, and refine the poses of the rig.
 
     Raises
@@ -211,7 +210,7 @@ def refined(
     poses: Float64,
     T_rig_frame: Float64,
     instant: Intp,
-) -> Walked:
+) -> RigTrajectory:
     """Refine poses (N, 4, 4) of the instants with views of all cameras.
 
     Only if the views then support each other at least as well. `instant` is that of each frame.
@@ -228,7 +227,7 @@ def refined(
             frames.append(int(frame))
     used, of = np.unique(instant[frames], return_inverse=True)
     if len(used) < 2:
-        return Walked(poses, T_rig_frame, {}, ())
+        return RigTrajectory(poses, T_rig_frame, {}, ())
     bodies = Bodies(of, T_rig_frame[frames])
     start = bodies.views(poses[used])
     done = refine(views, np.asarray(se3.inverse(start[0]) @ start), _OPTIONS, bodies=bodies)
@@ -236,7 +235,7 @@ def refined(
     of_view = source.camera[recording.indices[frames]]
     if not len(done.pairs) or fell(done.after.of_views(count) - done.before.of_views(count)):
         apart = disagreements_of(views, of_view, start, done.pairs)
-        return Walked(poses, T_rig_frame, apart, ())
+        return RigTrajectory(poses, T_rig_frame, apart, ())
     after = bodies.poses(start[0] @ done.poses)
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     out = poses.copy()
@@ -244,7 +243,7 @@ def refined(
     apart = disagreements_of(views, of_view, done.poses, done.pairs)
     measured = pairwise_measurements([int(recording.indices[k]) for k in frames], done)
     out = np.asarray(se3.inverse(out[known[0]]) @ out, np.float64)
-    return Walked(out, T_rig_frame, apart, measured)
+    return RigTrajectory(out, T_rig_frame, apart, measured)
 
 
 def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp) -> Intp:
