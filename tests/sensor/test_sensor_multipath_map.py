@@ -75,7 +75,7 @@ def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
         known.add(surfaces, everywhere(surfaces), T)
     around = OffscreenCells.of(CAMERA.rays(), 1.3)
     assert not around.albedo.any()
-    around.recall(known, np.eye(4))
+    around.add_known(known, np.eye(4))
     found = around.albedo > 0
     sides = np.abs(around.rays[:, 0]) > 0.6
     assert found[sides & (np.abs(around.rays[:, 1]) < 0.3)].all()
@@ -104,7 +104,7 @@ def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -
     cut = ToFImage(
         np.ascontiguousarray(image.z[part]),
         np.ascontiguousarray(image.rays[part]),
-        np.ascontiguousarray(image.light[part]),
+        np.ascontiguousarray(image.amplitude[part]),
         PERIOD_M,
     )
     reflections = MultipathModel(columns=26, lamp=1.0)
