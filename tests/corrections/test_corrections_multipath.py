@@ -97,7 +97,7 @@ def test_light_from_beyond_the_image_takes_out_more(corner: Seen) -> None:
 
 
 def test_only_the_ratio_of_amplitude_and_gain_counts(corner: Seen) -> None:
-    brighter = replace(corner.image, light=corner.image.light * np.float32(8))
+    brighter = replace(corner.image, amplitude=corner.image.amplitude * np.float32(8))
     found = REFLECTIONS.solve(brighter, 8 * GAIN)
     assert found is not None
     np.testing.assert_allclose(found.z, solved(corner).z, atol=1e-5)
@@ -155,7 +155,7 @@ def test_the_gain_settles(corner: Seen) -> None:
 
 
 def test_nothing_to_compute_from_gives_nothing() -> None:
-    dark = replace(Seen(WALL).image, light=np.zeros((48, 60), np.float32))
+    dark = replace(Seen(WALL).image, amplitude=np.zeros((48, 60), np.float32))
     empty = replace(dark, z=np.zeros((48, 60), np.float32))
     for image in (dark, empty):
         assert REFLECTIONS.solve(image, GAIN) is None

@@ -83,7 +83,7 @@ class Seen:
 
     def frame(self, **changes: object) -> RangeFrame:
         image = self.image
-        frame = RangeFrame(3, 0.1, self.camera, image.z, "z", image.light, ambiguity_m=PERIOD_M)
+        frame = RangeFrame(3, 0.1, self.camera, image.z, "z", image.amplitude, ambiguity_m=PERIOD_M)
         return replace(frame, **changes)  # type: ignore[arg-type]
 
     def errors(self, z: np.ndarray) -> np.ndarray:
