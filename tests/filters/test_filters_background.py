@@ -113,7 +113,9 @@ def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
     assert filter_.needs_fit
     assert not found.needs_fit
     assert (
-        to_dict(found) == to_dict(filter_) == {"part": "background", "sigmas": 5.0, "fraction": 0.02}
+        to_dict(found)
+        == to_dict(filter_)
+        == {"part": "background", "sigmas": 5.0, "fraction": 0.02}
     )
     small = case.frames[0]
     small = replace(
