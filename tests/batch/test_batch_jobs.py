@@ -35,7 +35,7 @@ def test_lines_are_paths_and_globs_from_the_folder_of_the_list(recordings: Path)
         f"{recordings}/c#1/recording",
     ]
     assert [job.name for job in found] == ["frames9", "frames10", "b-frames9", "y_z.bag", "c_1"]
-    assert all(job.words == () for job in found)
+    assert all(job.arguments == () for job in found)
 
 
 def test_a_recording_of_two_patterns_is_taken_once(recordings: Path) -> None:
@@ -72,7 +72,7 @@ def test_names_are_told_apart_in_any_case(tmp_path: Path) -> None:
 )
 def test_tables_have_options(name: str, text: str, recordings: Path) -> None:
     one, other = jobs_of(recordings, text, name)
-    assert set(one.words) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
+    assert set(one.arguments) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
     assert (one.name, one.memory) == ("frames9", None)
     assert other == Job("far", one.recording, ("--max-depth=4.5",), 2_000_000_000)
 
@@ -80,33 +80,33 @@ def test_tables_have_options(name: str, text: str, recordings: Path) -> None:
 def test_all_jobs_of_a_toml_can_share_options(recordings: Path) -> None:
     text = '[all]\nevery = 2\nseed = 1\n[[job]]\nrecording = "a/*"\nseed = 3\n'
     found = jobs_of(recordings, text, "list.toml")
-    assert [job.words for job in found] == [("--every=2", "--seed=3")] * 2
+    assert [job.arguments for job in found] == [("--every=2", "--seed=3")] * 2
 
 
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("list.txt", "# nothing\n", "names no recording"),
+        ("list.txt", "# nothing\n", "lists no recording"),
         ("list.txt", "a/nothing*\n", "line 1: nothing matches a/nothing*"),
-        ("list.txt", "a\0b\n", "line 1: holds a NUL"),
-        ("list.csv", "", "names no recording"),
+        ("list.txt", "a\0b\n", "line 1: contains a NUL"),
+        ("list.csv", "", "lists no recording"),
         ("list.csv", "path\na\n", "row 1: names no recording"),
-        ("list.csv", "recording,recording\na,b\n", "name each once"),
-        ("list.csv", "recording,every\na\n", "row 1: has 1 cells, and there are 2 columns"),
-        ("list.csv", 'recording\n"a\n', "is no table"),
+        ("list.csv", "recording,recording\na,b\n", "name each column once"),
+        ("list.csv", "recording,every\na\n", "row 1: has 1 cells, but there are 2 columns"),
+        ("list.csv", 'recording\n"a\n', "is not a table"),
         ("list.csv", "recording,evry\na,2\n", "for a table; did you mean every?"),
         ("list.csv", "recording,out\na,b\n", "row 1: out is not an option"),
         ("list.csv", "recording,threads\na,1\n", "row 1: threads is not an option"),
         ("list.csv", "recording,every\na,none\n", "row 1: argument --every: 'none' is not"),
         ("list.csv", "recording,object\na,perhaps\n", "row 1: object is 'perhaps'; use yes or no"),
-        ("list.csv", "recording,memory\na,much\n", "row 1: memory: 'much' is no amount of memory"),
-        ("list.csv", "recording,name\na,../b\n", "row 1: '../b' can't be the name"),
-        ("list.csv", "recording,name\na,jobs\n", "row 1: 'jobs' can't be the name"),
-        ("list.csv", "recording,name\na,x\nb,X\n", "row 2: the name X comes twice"),
-        ("list.csv", "recording,name\na/*,x\n", "row 1: a/* gives 2 recordings the one name x"),
-        ("list.toml", "recording = 1\n", "has recording where only [all] and [[job]] may be"),
+        ("list.csv", "recording,memory\na,much\n", "'much' is not an amount of memory"),
+        ("list.csv", "recording,name\na,../b\n", "row 1: '../b' can't be used as the name"),
+        ("list.csv", "recording,name\na,jobs\n", "row 1: 'jobs' can't be used as the name"),
+        ("list.csv", "recording,name\na,x\nb,X\n", "row 2: the name X is used twice"),
+        ("list.csv", "recording,name\na/*,x\n", "a/* matches 2 recordings, but there is one name"),
+        ("list.toml", "recording = 1\n", "has recording where only [all] and [[job]] are allowed"),
         ("list.toml", "[[job]]\nrecording = [1]\n", "job 1: recording is [1]"),
-        ("list.toml", "job = [1]\n", "job 1: is no table"),
+        ("list.toml", "job = [1]\n", "job 1: is not a table"),
         ("list.toml", "[[job\n", "is not TOML"),
     ],
 )  # fmt: skip
@@ -165,5 +165,5 @@ def test_amounts_of_memory(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "0", "-1GB", "4 PB", "nan", "1e3", "9" * 400 + "GB"])
 def test_no_amounts_of_memory(text: str) -> None:
-    with pytest.raises(ValueError, match="no amount of memory"):
+    with pytest.raises(ValueError, match="not an amount of memory"):
         parse_bytes(text)

@@ -72,7 +72,7 @@ def test_a_run_on_a_cluster_gives_the_same_bytes(
     there: list[int] = []
     leave = DaskExecutor.close
     monkeypatch.setattr(
-        DaskExecutor, "close", lambda self: (there.append(self.done_there), leave(self))
+        DaskExecutor, "close", lambda self: (there.append(self.n_remote), leave(self))
     )
     words = ["run", str(recording), "--config", str(config), "--threads", "2"]
     assert main([*words, "--out", str(tmp_path / "here")]) == 0
@@ -92,7 +92,7 @@ def test_submaps_on_a_cluster_are_refined_to_the_same_bits(cluster: str) -> None
         found = refined(Joint(submap=10), views, start)
     there.close()
     assert isinstance(executor(), LocalExecutor)
-    assert there.done_there == 3
+    assert there.n_remote == 3
     assert not told
     np.testing.assert_array_equal(found.poses, here.poses)
     assert found.support == here.support
@@ -108,7 +108,7 @@ def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> No
     with using_executor(there):
         found = pushed(options, frames, start)
     there.close()
-    assert there.done_there >= len(here) > 1
+    assert there.n_remote >= len(here) > 1
     for a, b in zip(found, here, strict=True):
         assert a.record == b.record
         np.testing.assert_array_equal(a.T_i_j, b.T_i_j)
@@ -155,7 +155,7 @@ def test_a_scheduler_that_goes_away_is_told_once_and_the_rest_done_here(measured
     assert [square for square, _ in rest] == [0, 1, 4, 9, 16]
     there.map(slowly_squared, 2, lambda k: (k,))
     there.close()
-    gone = f"{address}: the scheduler went away; the rest of the run is done on this machine"
+    gone = f"{address}: the scheduler disappeared; the rest of the run is done on this machine"
     assert told == [gone]
 
 
@@ -184,10 +184,10 @@ def _checked_against(mine):
 def test_a_scheduler_that_is_not_there_is_told(
     room_recording: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr(client, "ANSWERS_S", 1.0)
+    monkeypatch.setattr(client, "TIMEOUT_S", 1.0)
     words = ["run", str(room_recording), "--out", str(tmp_path / "out")]
     assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("tofuse: tcp://127.0.0.1:1: no Dask scheduler answers there; start one")
+    assert said.startswith("tofuse: tcp://127.0.0.1:1: no Dask scheduler answers; start one")
     assert said.count("\n") == 1
     assert not (tmp_path / "out").exists()

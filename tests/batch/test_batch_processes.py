@@ -187,8 +187,8 @@ def test_a_scheduler_that_goes_away_loses_nothing(
     _, said = batch.communicate(timeout=60)
     assert batch.returncode == 3
     assert said == (
-        f"tofuse: {address}: the scheduler went away; start it again, and give the same command: "
-        "it goes on\n"
+        f"tofuse: {address}: the scheduler disappeared; restart it, and run the same command again "
+        "to resume\n"
     )
     with measured.own_processes(2, tmp_path / "dask") as (address, _):
         # More memory than any worker declares: told before anything is begun.
@@ -205,16 +205,16 @@ def test_a_scheduler_that_is_not_there_is_told(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
-    monkeypatch.setattr(client, "ANSWERS_S", 1.0)
+    monkeypatch.setattr(client, "TIMEOUT_S", 1.0)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
         words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
         assert main(words) == 2
         said = capsys.readouterr().err
-        assert said.startswith(f"tofuse: {address}: no Dask scheduler answers there; start one")
+        assert said.startswith(f"tofuse: {address}: no Dask scheduler answers; start one")
         assert said.count("\n") == 1
     words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
     assert main(words) == 2
-    assert "is no file that a Dask scheduler wrote" in capsys.readouterr().err
+    assert "is not a file of a Dask scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -112,7 +112,7 @@ def test_what_was_killed_is_begun_again(folder: BatchFolder) -> None:
     notes = run(folder, workers)
     assert sorted(workers.started) == ["a", "a", "a", "b", "c"]
     assert [row["state"] for row in table(folder)] == ["done"] * 3
-    assert notes == ["a: its process was killed (SIGKILL); it is begun again"] * 2
+    assert notes == ["a: its process was killed (SIGKILL); restarting it"] * 2
     assert status_of(JOBS, folder) == 0
 
 
@@ -184,8 +184,8 @@ def test_the_page_is_made_anew_while_jobs_are_to_come(folder: BatchFolder) -> No
 
 
 def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> None:
-    monkeypatch.setattr(loop, "_PATIENCE_S", 0.0)
-    monkeypatch.setattr(loop, "_LOOK_S", 0.001)
+    monkeypatch.setattr(loop, "_NO_WORKER_S", 0.0)
+    monkeypatch.setattr(loop, "_POLL_S", 0.001)
     workers = Scripted()
     asked: list[Task] = []
 
@@ -194,12 +194,12 @@ def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> N
         return len(asked) > 20
 
     monkeypatch.setattr(workers, "accepts", late)
-    assert run(folder, workers) == ["no worker can take a yet: waiting for one"]
+    assert run(folder, workers) == ["no worker is available for a: waiting for one"]
 
 
 def test_other_options_need_overwrite(folder: BatchFolder) -> None:
     run(folder, Scripted())
-    changed = (replace(JOBS[0], words=("--every=2",)), *JOBS[1:])
+    changed = (replace(JOBS[0], arguments=("--every=2",)), *JOBS[1:])
     with pytest.raises(OutputError, match="of another recording, or of other options"):
         run(folder, Scripted(), changed)
     workers = Scripted()
@@ -213,7 +213,7 @@ def test_a_result_of_somebody_else_is_not_replaced(folder: BatchFolder) -> None:
     (strange / ".tofuse-unfinished").mkdir()  # of a run that was killed
     assert pending(JOBS, folder, overwrite=False) == list(JOBS)
     (strange / "run.json").write_text("{}")
-    with pytest.raises(OutputError, match="give --overwrite"):
+    with pytest.raises(OutputError, match="pass --overwrite"):
         pending(JOBS, folder, overwrite=False)
 
 
@@ -236,7 +236,7 @@ def test_a_result_that_was_changed_is_made_anew(folder: BatchFolder) -> None:
 
 def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(OutputError, match="holds no earlier batch"):
+    with pytest.raises(OutputError, match="contains no earlier batch"):
         BatchFolder(tmp_path).prepare()
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(OutputError, match="is a file"):
@@ -269,7 +269,7 @@ def test_memory_limits_how_many_go_on(monkeypatch) -> None:
     monkeypatch.setattr("tofuse.batch.workers.machine_memory", lambda: 100)
     workers = LocalWorkers(4)
     try:
-        with pytest.raises(InputError, match="asks for 101 bytes, and this machine has 100"):
+        with pytest.raises(InputError, match="needs 101 bytes, but this machine has 100"):
             workers.check(replace(JOBS[0], memory=101))
         tasks = [Task(replace(job, memory=50), "/out", 1) for job in JOBS]
         for held in (0, 50, 100):
@@ -339,7 +339,7 @@ def test_what_dask_says_is_understood() -> None:
     ):
         error = handed("error", unknown).exception()
         assert isinstance(error, InputError)
-        assert str(error).startswith("tcp://there: does not know the jobs of this tofuse (")
+        assert str(error).startswith("tcp://there: can't load the jobs of this version (")
         assert "\n" not in str(error)
     bug = ZeroDivisionError()
     assert handed("error", bug).exception() is bug
@@ -364,7 +364,7 @@ def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys
     [
         (["--workers", "0"], "0 is less than 1"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
-        (["--memory", "much"], "no amount of memory"),
+        (["--memory", "much"], "not an amount of memory"),
         (["--only", "b"], "has no job b"),
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],

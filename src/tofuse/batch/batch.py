@@ -1,4 +1,4 @@
-"""The whole job of ``tofuse batch``: begin jobs, again where one was killed, and keep a table."""
+"""The loop of ``tofuse batch``: start jobs, retry those that were killed, update the tables."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from tofuse.batch.table import write_table
 from tofuse.batch.work import Task
 from tofuse.batch.workers import Workers
 
-_LOOK_S = 0.5  # how often it is looked for workers that came or went
-_PATIENCE_S = 10.0  # without any worker, until that is said
+_POLL_S = 0.5  # interval at which workers are checked
+_NO_WORKER_S = 10.0  # time without any worker before a note
 
-Heard = Callable[[Job, Record], None]
+OnEnded = Callable[[Job, Record], None]
 
 
 def pending(jobs: Sequence[Job], folder: BatchFolder, *, overwrite: bool) -> list[Job]:
-    """Return the jobs that are not done, in order; the folder may not be there yet.
+    """Return the jobs without an up-to-date result, in order; the folder need not exist.
 
     Raises
     ------
     OutputError
-        If one of them would replace something else; see `BatchFolder.check`.
+        If one of them would replace other files; see `BatchFolder.check`.
     """
     left = [job for job in jobs if not folder.finished(job)]
     for job in left:
@@ -36,7 +36,7 @@ def pending(jobs: Sequence[Job], folder: BatchFolder, *, overwrite: bool) -> lis
 
 
 def status_of(jobs: Sequence[Job], folder: BatchFolder) -> int:
-    """Return 0 if all have a result and all their frames a pose, 2 without any result, else 3."""
+    """Return 0 if all jobs have a result and all frames a pose, 2 without any result, else 3."""
     records = [folder.record(job) for job in jobs]
     done = [r.status for r in records if r is not None and r.state == "done"]
     if not done:
@@ -52,32 +52,38 @@ def run_batch(
     *,
     threads: int,
     retries: int,
-    ended: Heard,
+    ended: OnEnded,
     note: Callable[[str], None],
 ) -> None:
-    """Do the jobs that are left, and keep the table of all `jobs`.
+    """Run the jobs that are `left`, and update the table of all `jobs`.
 
     Parameters
     ----------
+    jobs, left
+        All jobs of the batch, and those to be run.
+    folder
+        The output folder.
+    workers
+        Run the jobs.
     threads
-        For each job.
+        Number of threads of each job.
     retries
-        How often a job is begun again whose process or worker was killed.
+        How often a job is restarted whose process or worker was killed.
     ended
-        Hears of each job that ended.
+        Called with each job that has ended.
     note
-        Hears what a person should know.
+        Called with messages for the user.
 
     Raises
     ------
     InputError
-        If the workers are lost or can't do the jobs; what is done stays, and is in the table.
+        If the workers are lost or can't run the jobs; finished jobs are in the table.
     OutputError
         If a record or the table can't be written.
     """
     for job in left:
         workers.check(job)
-    for job in left:  # what became of them before counts no more
+    for job in left:  # earlier outcomes no longer count
         record = folder.record(job)
         if record is not None and record.ended:
             folder.write(job, replace(record, state="waiting"))
@@ -92,23 +98,23 @@ def run_batch(
             running[workers.start(task)] = task
         if running:
             idle_since = monotonic()
-            done, _ = wait(running, _LOOK_S, FIRST_COMPLETED)
+            done, _ = wait(running, _POLL_S, FIRST_COMPLETED)
         else:
-            if monotonic() - idle_since > _PATIENCE_S:
-                note(f"no worker can take {waiting[0].job.name} yet: waiting for one")
+            if monotonic() - idle_since > _NO_WORKER_S:
+                note(f"no worker is available for {waiting[0].job.name}: waiting for one")
                 idle_since = inf
-            sleep(_LOOK_S)
+            sleep(_POLL_S)
             done = set()
         for future in done:
             task = running.pop(future)
             if future.cancelled():
                 waiting.append(task)
                 continue
-            record = _known(future.result(), task.job, folder)
+            record = _completed(future.result(), task.job, folder)
             if record.state == "killed":
                 killed[task.job.name] += 1
                 if killed[task.job.name] <= retries:
-                    note(f"{task.job.name}: {record.reason}; it is begun again")
+                    note(f"{task.job.name}: {record.reason}; restarting it")
                     waiting.append(task)
                     continue
                 record = _given_up(record, killed[task.job.name])
@@ -117,12 +123,12 @@ def run_batch(
             write_table(jobs, folder)
             ended(task.job, record)
         if (gone := workers.lost()) is not None:
-            write_table(jobs, folder)  # workers may have ended some in between
+            write_table(jobs, folder)  # workers may have finished some meanwhile
             raise gone
 
 
-def _known(record: Record, job: Job, folder: BatchFolder) -> Record:
-    """Add to the record of a worker that could not write it what is known here."""
+def _completed(record: Record, job: Job, folder: BatchFolder) -> Record:
+    """Complete the record of a worker that could not write it."""
     if record.key:
         return record
     before = folder.record(job)

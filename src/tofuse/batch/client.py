@@ -1,4 +1,4 @@
-"""Finding a Dask cluster by its scheduler."""
+"""Connecting to a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Any
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 
-ANSWERS_S = 10.0  # what a scheduler may take for its answer
+TIMEOUT_S = 10.0  # of requests to a scheduler
 
 
-def connected(address: str, remedy: str) -> Any:
+def connect(address: str, remedy: str) -> Any:
     """Return a client of the scheduler at an address, or of the one that wrote a file.
 
     Parameters
     ----------
+    address
+        The address or the file.
     remedy
-        What to do instead of installing Dask.
+        The alternative to installing Dask, for the error message.
 
     Raises
     ------
@@ -29,7 +31,7 @@ def connected(address: str, remedy: str) -> Any:
         import dask
     except ImportError as error:
         raise _not_installed(remedy) from error
-    # It would log what is told here in one line. Read when distributed is imported.
+    # It would log errors that are reported here. Read when distributed is imported.
     levels = {"distributed": "critical", "distributed.client": "critical"}
     with dask.config.set({"logging": levels}):
         try:
@@ -39,22 +41,22 @@ def connected(address: str, remedy: str) -> Any:
     client: Any = distributed.Client
     wanted = _from_file(address) if os.path.isfile(address) else address
     try:
-        return client(wanted, timeout=ANSWERS_S, set_as_default=False, name="tofuse")
+        return client(wanted, timeout=TIMEOUT_S, set_as_default=False, name="tofuse")
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            "no Dask scheduler answers there",
+            "no Dask scheduler answers",
             where=address,
-            remedy="start one by `dask scheduler`, and give the address that it prints",
+            remedy="start one with `dask scheduler`, and pass the address that it prints",
         ) from error
 
 
-def unknown_there(error: BaseException) -> bool:
+def cannot_deserialize(error: BaseException) -> bool:
     """Whether a scheduler or worker could not load what a task is made of."""
     return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says, in short."""
+    """Return the first line of an error's message, or its type."""
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
@@ -64,9 +66,9 @@ def _from_file(path: str) -> str:
         return str(json.loads(read_text(path))["address"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            "is no file that a Dask scheduler wrote",
+            "is not a file of a Dask scheduler",
             where=path,
-            remedy="give the address that it prints",
+            remedy="pass the address that it prints",
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster, by its scheduler."""
+"""The workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from time import monotonic
 from typing import Any
 from uuid import uuid4
 
-from tofuse.batch.client import ANSWERS_S, connected, first_line, unknown_there
+from tofuse.batch.client import TIMEOUT_S, cannot_deserialize, connect, first_line
 from tofuse.batch.folder import Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.work import Task, work
 from tofuse.batch.workers import Workers
 from tofuse.errors import InputError
 
-_LOOK_S = 1.0  # how often the workers are counted
+_POLL_S = 1.0  # interval at which the workers are counted
 
 
 class DaskWorkers(Workers):
     """Workers of a cluster: each of their threads does one job at a time.
 
-    All of them see the recordings and the output folder at the same paths, and have this version.
+    All of them must access the recordings and the output folder at the same paths, and have this
+    version of tofuse.
     """
 
     def __init__(self, address: str) -> None:
-        """Find the scheduler by its address, or by the file that it wrote.
+        """Connect to the scheduler at an address, or to the one that wrote a file.
 
         Raises
         ------
@@ -32,31 +33,31 @@ class DaskWorkers(Workers):
             If Dask is not installed, or no scheduler answers.
         """
         self._address = address
-        self._client: Any = connected(address, "give --workers to stay on this machine")
+        self._client: Any = connect(address, "use --workers to stay on this machine")
         self._running: set[Future[Record]] = set()
         self._seen: list[dict[str, Any]] = []
-        self._looked = -_LOOK_S
+        self._looked = -_POLL_S
 
     def check(self, job: Job) -> None:
-        """See `Workers`. A cluster without workers may yet get some."""
+        """See `Workers`. A cluster without workers may get some later."""
         if job.memory is None:
             return
         declared = [w["resources"].get("memory", 0) for w in self._workers()]
         if declared and max(declared) < job.memory:
             raise InputError(
-                f"{job.name} asks for {job.memory} bytes, and of the {len(declared)} workers none "
+                f"{job.name} needs {job.memory} bytes, but none of the {len(declared)} workers "
                 f"declares more than {max(declared):.0f}",
                 where=self._address,
                 remedy=f'start them with --resources "memory={job.memory}"',
             )
 
     def accepts(self, task: Task) -> bool:
-        """See `Workers`. No more tasks are handed over than workers can do at a time.
+        """See `Workers`. No more tasks are submitted than workers can do at a time.
 
-        What lies at a worker counts as lost with it each time, though it had not begun.
+        Dask counts a queued task as failed whenever its worker dies, even if it had not started.
         """
         self._running = {f for f in self._running if not f.done()}
-        if monotonic() - self._looked >= _LOOK_S:
+        if monotonic() - self._looked >= _POLL_S:
             self._seen, self._looked = self._workers(), monotonic()
         return len(self._running) < sum(_slots(worker, task.job) for worker in self._seen)
 
@@ -80,26 +81,26 @@ class DaskWorkers(Workers):
         if self._client.status == "running":
             return None
         return InputError(
-            "the scheduler went away",
+            "the scheduler disappeared",
             where=self._address,
-            remedy="start it again, and give the same command: it goes on",
+            remedy="restart it, and run the same command again to resume",
         )
 
     def close(self) -> None:
-        """See `Workers`. Jobs that workers have begun they end, and their records stay."""
-        self._client.close(timeout=ANSWERS_S)
+        """See `Workers`. Workers finish jobs that they have started, and write their records."""
+        self._client.close(timeout=TIMEOUT_S)
 
     def _workers(self) -> list[dict[str, Any]]:
         try:
             return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
-        except OSError:  # `lost` tells
+        except OSError:  # `lost` reports it
             return []
 
     def _hand_over(self, remote: Any, future: Future[Record]) -> None:
-        """Give what a remote future holds to a local one."""
+        """Copy the outcome of a remote future to a local one."""
         try:
             self._outcome(remote, future)
-        except Exception:  # the scheduler went away between two questions
+        except Exception:  # the scheduler disappeared between two requests
             future.cancel()
             future.set_running_or_notify_cancel()
 
@@ -112,12 +113,12 @@ class DaskWorkers(Workers):
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))
-            elif unknown_there(error):
+            elif cannot_deserialize(error):
                 future.set_exception(
                     InputError(
-                        f"does not know the jobs of this tofuse ({first_line(error)})",
+                        f"can't load the jobs of this version ({first_line(error)})",
                         where=self._address,
-                        remedy="install this version of tofuse for its scheduler and its workers",
+                        remedy="install this version of tofuse on its scheduler and its workers",
                     )
                 )
             else:
@@ -128,7 +129,7 @@ class DaskWorkers(Workers):
 
 
 def _slots(worker: dict[str, Any], job: Job) -> int:
-    """How many jobs like this a worker can do at a time."""
+    """The number of jobs like this that a worker can run at a time."""
     threads = int(worker["nthreads"])
     if job.memory is None:
         return threads

@@ -1,4 +1,4 @@
-"""The output folder of a batch: a folder for each result, and in `jobs` what became of each job."""
+"""The output folder of a batch: a folder for each result, and in `jobs` the record of each job."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.batch.jobs import Job
 from tofuse.errors import OutputError
 from tofuse.files.atomic import make_folder, write_text
 
-_UNFINISHED = ".tofuse-"  # what a run that goes on or was killed leaves; see `results.output`
+_UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folder`
 
 _TEXTS = ("key", "state", "host", "run", "verdict", "reason")
 
@@ -21,33 +21,33 @@ State = Literal["waiting", "running", "done", "failed", "killed"]
 
 @dataclass(frozen=True)
 class Record:
-    """What became of a job.
+    """The outcome of a job.
 
     Attributes
     ----------
     key
-        Of the job, as it was when it began: `Job.key`.
+        `Job.key` when it started.
     state
-        `done`, with a result; `failed`, for a `reason` that trying again does not change;
-        `killed`, as its process ended in the middle; `running`; or `waiting`, to be done anew.
+        `done`, with a result; `failed`, for a `reason` that a retry does not change; `killed`, if
+        its process was terminated; `running`; or `waiting`.
     starts
-        How often it was begun, until it ended.
+        Number of times it was started until it ended.
     host
-        Where it ran last.
+        The machine on which it ran last.
     status
         Exit status of its run, negative for a signal.
     run
         Digest of its `run.json`.
     verdict, reason
-        The verdict, and the gravest reason of it, or why there is no result.
+        The verdict and its most severe reason, or why there is no result.
     position_m, relative
-        The 95 % bound of the poses, in m and over the model's diagonal; None if not bounded.
+        95 % bound of the pose errors, in m and over the model's diagonal; None if not bounded.
     frames, posed
-        Readable frames, and those with a pose.
+        Number of readable frames, and of those with a pose.
     seconds
-        What the run took, with what it went on from after a kill.
+        Time of the run, including that before it was resumed.
     peak_bytes
-        Most memory that its process held.
+        Peak memory of its process.
     """
 
     key: str
@@ -67,40 +67,46 @@ class Record:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will become of it."""
+        """Whether the job is done or has failed."""
         return self.state in ("done", "failed")
 
 
 @dataclass(frozen=True)
 class BatchFolder:
-    """Where everything of a batch is; `path` is absolute."""
+    """The files of a batch.
+
+    Attributes
+    ----------
+    path
+        The folder, absolute.
+    """
 
     path: Path
 
     def prepare(self) -> None:
-        """Create it.
+        """Create the folder.
 
         Raises
         ------
         OutputError
-            If it holds something other than a batch, or can't be made.
+            If it contains anything but a batch, or can't be created.
         """
         if self.path.exists() and not self.path.is_dir():
-            raise OutputError("is a file", where=self.path, remedy="give --out a folder")
+            raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
         make_folder(self.path)
-        # Hidden files may be of another that prepares it just now.
+        # Hidden files may be of another process that prepares it at the same time.
         there = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
         if there - {self.jobs.name} and not {self.jobs.name, self.csv.name} <= there:
             raise OutputError(
-                "is not empty and holds no earlier batch",
+                "is not empty and contains no earlier batch",
                 where=self.path,
-                remedy="give --out a new or empty folder",
+                remedy="pass a new or empty folder as --out",
             )
         make_folder(self.jobs)
 
     @property
     def jobs(self) -> Path:
-        """Folder of records, logs and pictures."""
+        """Folder of records, logs and thumbnails."""
         return self.path / "jobs"
 
     @property
@@ -114,23 +120,23 @@ class BatchFolder:
         return self.path / "batch.html"
 
     def result(self, job: Job) -> Path:
-        """Where its run writes."""
+        """Output folder of the job's run."""
         return self.path / job.name
 
     def log(self, job: Job) -> Path:
-        """What its process said."""
+        """Log of the job's process."""
         return self.jobs / f"{job.name}.log"
 
     def picture(self, job: Job) -> Path:
-        """Its model, small."""
+        """Thumbnail of the job's model."""
         return self.jobs / f"{job.name}.jpg"
 
     def lock(self, name: str) -> Path:
-        """A file for `locked`, by the name of a job."""
+        """Lock file of a job, by its name."""
         return self.jobs / f".{name}.lock"
 
     def record(self, job: Job) -> Record | None:
-        """What became of a job; None where nothing is known, or what is there is damaged."""
+        """Return the record of a job; None if there is none, or it is damaged."""
         try:
             data = json.loads(self._record(job).read_text(encoding="utf-8"))
             return _record_of(data)
@@ -138,12 +144,12 @@ class BatchFolder:
             return None
 
     def write(self, job: Job, record: Record) -> None:
-        """Write what became of a job."""
+        """Write the record of a job."""
         text = json.dumps(asdict(record), indent=1, allow_nan=False)
         write_text(self._record(job), text + "\n")
 
     def finished(self, job: Job) -> bool:
-        """Whether the result of just this recording, with these options, is there."""
+        """Whether there is an up-to-date result of the job."""
         record = self.record(job)
         return (
             record is not None
@@ -153,19 +159,19 @@ class BatchFolder:
         )
 
     def digest(self, job: Job) -> str:
-        """Of its `run.json`; empty where there is none."""
+        """Return the digest of the job's `run.json`; empty without one."""
         try:
             return hashlib.sha256((self.result(job) / "run.json").read_bytes()).hexdigest()
         except OSError:
             return ""
 
     def check(self, job: Job, *, overwrite: bool) -> None:
-        """Refuse to replace what is of another job, or of nobody's.
+        """Refuse to replace files that are not of this job.
 
         Raises
         ------
         OutputError
-            If its folder holds another result and `overwrite` is not given.
+            If its folder contains another result, and `overwrite` is not set.
         """
         folder, record = self.result(job), self.record(job)
         if overwrite or not folder.is_dir():
@@ -174,9 +180,9 @@ class BatchFolder:
             return
         if record is None or record.key != job.key(self.path):
             raise OutputError(
-                "holds the result of another recording, or of other options",
+                "contains the result of another recording, or of other options",
                 where=folder,
-                remedy="give --overwrite to replace it, or another --out",
+                remedy="pass --overwrite to replace it, or another --out",
             )
 
     def _record(self, job: Job) -> Path:

@@ -1,4 +1,4 @@
-"""`batch.csv` and `batch.html`: what became of the jobs that ended, made anew when one ends."""
+"""`batch.csv` and `batch.html`: the outcome of the jobs that have ended, updated after each."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ COLUMNS = (
     "status",
     "reason",
 )
-_REFRESH_S = 5  # how often the page looks for new rows
+_REFRESH_S = 5  # interval at which the page reloads
 
 
 @dataclass(frozen=True)
 class Row:
-    """A job that ended, in words.
+    """A job that has ended, as text.
 
     Attributes
     ----------
     report, picture
-        Addresses of files, from the folder of the page; empty where there are none.
+        Relative addresses of files; empty where there are none.
     tone
-        How it is to be coloured: good, degraded or failed.
+        Its colour: good, degraded or failed.
     """
 
     name: str
@@ -63,12 +63,19 @@ class Row:
 
 
 def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
-    """Write both tables from the records in the folder, one process after the other.
+    """Write both tables from the records in the folder, under a lock.
+
+    Parameters
+    ----------
+    jobs
+        All jobs of the batch.
+    folder
+        Its folder.
 
     Raises
     ------
     OutputError
-        If they can't be written; earlier ones stay.
+        If they can't be written; earlier ones are unchanged then.
     """
     with locked(folder.lock("-table")):
         known = [(job, folder.record(job)) for job in jobs]
@@ -84,7 +91,7 @@ def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
     out.writerow(COLUMNS)
     for job, record in ended:
         facts = {**vars(record), "name": job.name, "recording": job.recording}
-        facts["options"] = " ".join(job.words)
+        facts["options"] = " ".join(job.arguments)
         out.writerow(["" if facts[c] is None else facts[c] for c in COLUMNS])
     return text.getvalue()
 
@@ -106,9 +113,9 @@ def _html(
         ("no result", f"{failed}"),
     ]
     if len(ended) < total:
-        facts.append(("to come", f"{total - len(ended)}"))
+        facts.append(("pending", f"{total - len(ended)}"))
     seconds = sum(record.seconds or 0 for _, record in ended)
-    facts.append(("time of all runs", duration(seconds)))
+    facts.append(("total time", duration(seconds)))
     page = template("batch.html.j2").render(
         title=folder.path.name,
         version=__version__,
@@ -135,7 +142,7 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
     return Row(
         job.name,
         job.recording,
-        " ".join(job.words),
+        " ".join(job.arguments),
         f"{quote(job.name)}/report.html" if done else "",
         quote(f"{picture.parent.name}/{picture.name}") if done and picture.is_file() else "",
         record.verdict if done else "no result",
@@ -150,7 +157,7 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
 
 
 def duration(seconds: float) -> str:
-    """Say a time: "4.2 s", "3 min 20 s", "2 h 5 min"."""
+    """Return a duration as text: "4.2 s", "3 min 20 s", "2 h 5 min"."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

@@ -1,6 +1,6 @@
-"""One job, where it is to be done: `tofuse run` in a process of its own.
+"""Running one job: `tofuse run` in its own process.
 
-Imports nothing heavy, as workers of a cluster and their scheduler load it.
+Imports nothing heavy, as the workers and the scheduler of a cluster load it.
 """
 
 from __future__ import annotations
@@ -21,22 +21,24 @@ from tofuse.batch.jobs import Job
 from tofuse.files.atomic import output_error
 from tofuse.files.locking import locked
 
-# It runs the command and ends when its parent does.
-_PROGRAM = "tofuse.cli.job"
+# Runs the command, and ends when its parent does.
+_MODULE = "tofuse.cli.job"
 
 
 @dataclass(frozen=True)
 class Task:
-    """A job, and how it is to be done.
+    """A job, and how to run it.
 
     Attributes
     ----------
+    job
+        The job.
     out
         Absolute path of the batch's folder.
     threads
-        That its run may use.
+        Number of threads of its run.
     version
-        Of the program that asks for it.
+        Version of tofuse that requests it.
     """
 
     job: Job
@@ -45,10 +47,17 @@ class Task:
     version: str = __version__
 
 
-def work(task: Task, began: Callable[[subprocess.Popen[bytes]], None] | None = None) -> Record:
-    """Do a job, and leave its record; `began` hears of its process.
+def work(task: Task, on_start: Callable[[subprocess.Popen[bytes]], None] | None = None) -> Record:
+    """Run a job and write its record.
 
-    Two that are asked for the same job do it one after the other, and the second finds it done.
+    If two workers get the same job, the second one waits and finds it done.
+
+    Parameters
+    ----------
+    task
+        The job.
+    on_start
+        Called with its process.
 
     Raises
     ------
@@ -57,42 +66,42 @@ def work(task: Task, began: Callable[[subprocess.Popen[bytes]], None] | None = N
     """
     job, folder = task.job, BatchFolder(Path(task.out))
     if not folder.csv.is_file():
-        return _refused(f"{platform.node()} does not see {task.out}: let all share one file system")
+        return _refused(f"{platform.node()} can't access {task.out}: use a shared file system")
     if task.version != __version__:
         return _refused(
-            f"{platform.node()} has tofuse {__version__}, not {task.version}: install that there"
+            f"{platform.node()} has tofuse {__version__}, not {task.version}: install that version"
         )
     with locked(folder.lock(job.name)) as handle:
         before = folder.record(job)
         if before is not None and folder.finished(job):
             return before
-        record = Record(job.key(folder.path), "running", _starts(before), platform.node())
+        record = Record(job.key(folder.path), "running", _count_starts(before), platform.node())
         folder.write(job, record)
-        process = _begun(task, folder, handle)
+        process = _start_process(task, folder, handle)
         with process:
-            if began is not None:
-                began(process)
+            if on_start is not None:
+                on_start(process)
             assert process.stdout is not None
-            told = process.stdout.read()
+            output = process.stdout.read()
             status = process.wait()
-        record = _ended(record, status, told, folder, job)
+        record = _outcome(record, status, output, folder, job)
         folder.write(job, record)
         return record
 
 
-def _begun(task: Task, folder: BatchFolder, lock: int) -> subprocess.Popen[bytes]:
-    """Begin the process of a job, which holds the lock as well."""
+def _start_process(task: Task, folder: BatchFolder, lock: int) -> subprocess.Popen[bytes]:
+    """Start the process of a job, which holds the lock as well."""
     job = task.job
-    words = [job.recording, f"--out={folder.result(job)}", "--overwrite", *job.words]
-    words.append(f"--threads={task.threads}")
+    arguments = [job.recording, f"--out={folder.result(job)}", "--overwrite", *job.arguments]
+    arguments.append(f"--threads={task.threads}")
     try:
         with folder.log(job).open("wb") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", _PROGRAM, str(folder.picture(job)), *words],
+                [sys.executable, "-m", _MODULE, str(folder.picture(job)), *arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                start_new_session=True,  # Ctrl-C is for us: what it has so far stays
+                start_new_session=True,  # Ctrl-C reaches only this process: checkpoints stay
                 pass_fds=() if sys.platform == "win32" else (lock,),
             )
     except OSError as error:
@@ -103,16 +112,16 @@ def _refused(reason: str) -> Record:
     return Record("", "failed", host=platform.node(), reason=reason)
 
 
-def _starts(before: Record | None) -> int:
-    """How often a job was begun since it ended last."""
+def _count_starts(before: Record | None) -> int:
+    """Number of starts of a job since it ended last, including this one."""
     on_its_way = before is not None and before.state in ("running", "killed")
     return before.starts + 1 if before is not None and on_its_way else 1
 
 
-def _ended(record: Record, status: int, told: bytes, folder: BatchFolder, job: Job) -> Record:
-    """Tell what became of it by what its process said and how it ended."""
+def _outcome(record: Record, status: int, output: bytes, folder: BatchFolder, job: Job) -> Record:
+    """The record of a job whose process has ended."""
     result: dict[str, Any] = {}
-    for line in told.splitlines():
+    for line in output.splitlines():
         try:
             result |= json.loads(line)
         except ValueError:  # cut off
@@ -146,9 +155,9 @@ def _done(record: Record, result: dict[str, Any], run: str) -> Record:
 
 
 def _last_line(log: Path) -> str:
-    """What a process said last, without the program's name."""
+    """The last line of a process's log, without the program's name."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    last = next((line for line in reversed(lines) if line.strip()), "nothing was said")
+    last = next((line for line in reversed(lines) if line.strip()), "no message")
     return last.strip().removeprefix("tofuse: ")
 
 

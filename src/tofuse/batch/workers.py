@@ -1,4 +1,4 @@
-"""Who does the jobs: one small protocol, and processes of this machine."""
+"""What runs the jobs: a protocol, and the processes of this machine."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from tofuse.errors import InputError
 
 
 class Workers(Protocol):
-    """Do tasks, several at a time."""
+    """Runs tasks, several at a time."""
 
     def check(self, job: Job) -> None:
-        """Raise an `InputError` if no worker could ever do this job."""
+        """Raise an `InputError` if no worker could ever run this job."""
         ...
 
     def accepts(self, task: Task) -> bool:
-        """Whether the task would be begun at once."""
+        """Whether the task would be started at once."""
         ...
 
     def start(self, task: Task) -> Future[Record]:
-        """Begin a task.
+        """Start a task.
 
-        The future is cancelled where the workers are lost, and else gives what became of the job:
-        `killed` where its worker was.
+        The future is cancelled if the workers are lost; else it returns the record of the job,
+        `killed` if its worker was.
         """
         ...
 
     def lost(self) -> InputError | None:
-        """Why no worker can be reached any more; None as long as they can."""
+        """Return the error if no worker can be reached any more; else None."""
         ...
 
     def close(self) -> None:
-        """Begin nothing more, and stop what would otherwise go on without anybody to ask for it."""
+        """Start nothing more, and stop jobs that would otherwise continue unattended."""
         ...
 
 
@@ -47,7 +47,7 @@ class LocalWorkers(Workers):
     """Processes of this machine."""
 
     def __init__(self, count: int) -> None:
-        """Let `count` jobs go on at a time, as long as the memory that they ask for is there."""
+        """Run up to `count` jobs at a time, as long as the memory that they need is available."""
         self._count = count
         self._memory = machine_memory()
         self._pool = ThreadPoolExecutor(count, thread_name_prefix="tofuse-batch")
@@ -59,21 +59,21 @@ class LocalWorkers(Workers):
         """See `Workers`."""
         if self._memory is not None and (job.memory or 0) > self._memory:
             raise InputError(
-                f"{job.name} asks for {job.memory} bytes, and this machine has {self._memory}",
+                f"{job.name} needs {job.memory} bytes, but this machine has {self._memory}",
                 where="--memory",
-                remedy="ask for less, or use a larger machine",
+                remedy="state less, or use a larger machine",
             )
 
     def accepts(self, task: Task) -> bool:
         """See `Workers`."""
         self._running = {f: m for f, m in self._running.items() if not f.done()}
-        held = sum(self._running.values()) + (task.job.memory or 0)
-        room = self._memory is None or held <= self._memory
-        return len(self._running) < self._count and room
+        needed = sum(self._running.values()) + (task.job.memory or 0)
+        fits = self._memory is None or needed <= self._memory
+        return len(self._running) < self._count and fits
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
-        future = self._pool.submit(work, task, self._began)
+        future = self._pool.submit(work, task, self._register_process)
         self._running[future] = task.job.memory or 0
         return future
 
@@ -82,13 +82,13 @@ class LocalWorkers(Workers):
         return
 
     def close(self) -> None:
-        """See `Workers`. What killed processes have so far stays for the next time."""
+        """See `Workers`. Checkpoints of killed processes stay for the next time."""
         self._closed = True
         for process in self._processes:
             process.kill()
         self._pool.shutdown(cancel_futures=True)
 
-    def _began(self, process: subprocess.Popen[bytes]) -> None:
+    def _register_process(self, process: subprocess.Popen[bytes]) -> None:
         self._processes = [p for p in self._processes if p.returncode is None]
         self._processes.append(process)
         if self._closed:
@@ -96,7 +96,7 @@ class LocalWorkers(Workers):
 
 
 def machine_memory() -> int | None:
-    """Bytes of memory that this process may use at most; None where that is not known."""
+    """Return the memory limit of this process in bytes; None where not known."""
     if sys.platform == "win32":
         return None
     found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
