@@ -27,7 +27,7 @@ from tofuse.report import images, plots
 from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
-from tofuse.report.packing import squeezed, unsqueezed
+from tofuse.report.packing import pack, unpack
 from tofuse.report.pictures import draw
 from tofuse.report.scene import (
     MAX_FACES,
@@ -335,7 +335,7 @@ def test_arrays_come_back_as_they_were():
         rng.normal(0, 1e3, (20, 12)).astype(np.float32),
         np.arange(1).astype(np.uint8)[:, None],
     ):
-        back = unsqueezed(squeezed(array), array.dtype.str, array.shape[1])
+        back = unpack(pack(array), array.dtype.str, array.shape[1])
         np.testing.assert_array_equal(back, array)
 
 
@@ -360,12 +360,12 @@ def test_viewer_holds_a_surface_with_not_too_many_faces():
     assert len(scene.mesh.faces) > MAX_FACES / 4
     data = packed(scene)
     model = data["model"]
-    shown = unsqueezed(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]
+    shown = unpack(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]
     off = shown[:, 2] - (2 + 0.05 * np.sin(6 * shown[:, 0]))
     assert np.abs(off).max() < 0.003
-    triangles = unsqueezed(model["faces"], "<u4", 3)
+    triangles = unpack(model["faces"], "<u4", 3)
     assert triangles.max() == len(shown) - 1
-    assert len(unsqueezed(model["colors"], "u1", 3)) == len(shown) == data["count"]
+    assert len(unpack(model["colors"], "u1", 3)) == len(shown) == data["count"]
     assert packed(make_scene(result, rows))["model"]["faces"] is None
 
 
@@ -373,7 +373,7 @@ def test_view_opens_on_the_side_that_shows_most():
     scene = make_scene(room()[0], {})
     for k in (0, 2, 5):
         yaw = YAW + k * np.pi / 4
-        facing = -images.turned(yaw, PITCH)[2]
+        facing = -images.view_rotation(yaw, PITCH)[2]
         normals = np.tile(facing, (len(scene.points), 1))
         found = opening_yaw(replace(scene, normals=normals))
         assert np.cos(found - yaw) == pytest.approx(1)
@@ -396,21 +396,19 @@ def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
     R = subject.straight
     scene = json.loads(shown.scripts[0])
     model = scene["model"]
-    points = (
-        np.array(scene["low"]) + unsqueezed(model["points"], "<u2", 3) / 65535 * scene["extent"]
-    )
+    points = np.array(scene["low"]) + unpack(model["points"], "<u2", 3) / 65535 * scene["extent"]
     np.testing.assert_allclose(points, result.cloud.points @ R.T, atol=1e-4)
-    colors = unsqueezed(model["colors"], "u1", 3)
+    colors = unpack(model["colors"], "u1", 3)
     np.testing.assert_array_equal(colors, seen_colors(result.cloud.color))
-    normals = unsqueezed(model["normals"], "i1", 3) / 127
+    normals = unpack(model["normals"], "i1", 3) / 127
     np.testing.assert_allclose(normals, result.cloud.normals @ R.T, atol=0.01)
-    loops = unsqueezed(scene["lines"]["loops"], "<f4", 3)
+    loops = unpack(scene["lines"]["loops"], "<f4", 3)
     np.testing.assert_allclose(loops, result.trajectory[[0, 23], :3, 3] @ R.T, atol=1e-6)
     frames = scene["frames"]
-    assert unsqueezed(frames["index"], "<u4", 1)[:, 0].tolist() == list(range(24))
+    assert unpack(frames["index"], "<u4", 1)[:, 0].tolist() == list(range(24))
     assert frames["status"] == "000001000220000300000000"
     for name, poses in (("before", result.diagnostics.sequential), ("after", result.trajectory)):
-        found = unsqueezed(frames[name], "<f4", 12).reshape(-1, 3, 4)
+        found = unpack(frames[name], "<f4", 12).reshape(-1, 3, 4)
         known = np.isfinite(poses[:, 0, 0])
         np.testing.assert_allclose(found[known], R @ poses[known, :3], atol=1e-6)
         assert not found[~known].any()
@@ -429,8 +427,7 @@ def test_model_can_be_coloured_by_what_its_points_know():
     found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
     assert list(found) == ["accuracy", "height", "views"]
     of = {
-        name: unsqueezed(f.packed()["values"], "u1", 1)[:, 0].astype(int)
-        for name, f in found.items()
+        name: unpack(f.packed()["values"], "u1", 1)[:, 0].astype(int) for name, f in found.items()
     }
     assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
     assert (np.diff(of["views"]) > 0).all()
@@ -454,7 +451,7 @@ def test_viewer_thins_a_large_model(tmp_path):
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))
     got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
     scene = json.loads(got.scripts[0])
-    assert scene["count"] == len(unsqueezed(scene["model"]["points"], "<u2", 3)) == 150_000
+    assert scene["count"] == len(unpack(scene["model"]["points"], "<u2", 3)) == 150_000
     assert scene["model"]["normals"] is None
     assert scene["center"][0] == pytest.approx(100, abs=0.1)  # the offset counts
     assert "150,000 of 200,000 points are shown" in got.sections["model"]

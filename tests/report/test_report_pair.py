@@ -10,14 +10,14 @@ from tofuse.geometry import se3
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.report import images
-from tofuse.report.packing import unsqueezed
+from tofuse.report.packing import unpack
 from tofuse.report.pair_scene import (
     MAX_POINTS,
     distance_colors,
     distances,
     packed,
     pair_scene,
-    stills,
+    render_modes,
 )
 from tofuse.results.pair import LocalView, PairResult
 
@@ -62,7 +62,7 @@ def test_colors_run_to_the_end_of_the_bar_and_then_to_grey() -> None:
 
 def decoded(data: dict, mode: str, which: str) -> np.ndarray:
     (layer,) = (x for x in data["layers"] if (x["mode"], x["view"]) == (mode, which))
-    steps = unsqueezed(data["arrays"][layer["points"]], "<u2", 3)
+    steps = unpack(data["arrays"][layer["points"]], "<u2", 3)
     assert len(steps) == layer["count"]
     return layer["low"] + steps / 65535 * np.array(layer["extent"])
 
@@ -92,7 +92,7 @@ def test_a_pose_that_is_wrong_shows() -> None:
     right = pair_scene(pair(points, others))
     wrong = pair_scene(pair(points, others, pose=se3.exp([0, 0, 0.03, 0, 0, 0]) @ T))
     assert wrong.median_m > 4 * right.median_m
-    drawn = stills(right)
+    drawn = render_modes(right)
     assert set(drawn) == {"before", "after", "distance"}
     for image in drawn.values():
         filled = (image != images.BACKGROUND).any(-1)

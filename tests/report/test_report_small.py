@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.report.images import BACKGROUND
-from tofuse.report.scene import Scene, small
+from tofuse.report.scene import Scene, render_thumbnail
 
 SIZE = (160, 100)
 
@@ -25,7 +25,7 @@ def test_the_model_fills_the_picture_wherever_it_is(scale: float) -> None:
     rng = np.random.default_rng(3)
     shape = np.array([1.0, 0.6, 0.4])
     points = scale * (rng.uniform(-1, 1, (20_000, 3)) * shape + [40.0, -7.0, 3.0])
-    image = small(scene_of(points), SIZE)
+    image = render_thumbnail(scene_of(points), SIZE)
     assert image.shape == (100, 160, 3)
     rows, columns = np.nonzero((image != BACKGROUND).any(2))
     reach = np.array([np.ptp(columns) / SIZE[0], np.ptp(rows) / SIZE[1]])
@@ -35,5 +35,5 @@ def test_the_model_fills_the_picture_wherever_it_is(scale: float) -> None:
 
 
 def test_there_may_be_nothing_to_see() -> None:
-    assert small(scene_of(np.zeros((0, 3))), SIZE).shape == (100, 160, 3)
-    assert small(scene_of(np.ones((1, 3))), SIZE).shape == (100, 160, 3)
+    assert render_thumbnail(scene_of(np.zeros((0, 3))), SIZE).shape == (100, 160, 3)
+    assert render_thumbnail(scene_of(np.ones((1, 3))), SIZE).shape == (100, 160, 3)

@@ -49,14 +49,14 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.cli.progress import QuietProgress, emit
     from tofuse.files.atomic import write_bytes
     from tofuse.pipeline.run import exit_status, run
-    from tofuse.report.images import encoded
-    from tofuse.report.scene import make_scene, small
+    from tofuse.report.images import encode
+    from tofuse.report.scene import make_scene, render_thumbnail
 
     arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    write_bytes(picture, encoded(small(make_scene(result, rows), _PICTURE), jpeg=True))
+    write_bytes(picture, encode(render_thumbnail(make_scene(result, rows), _PICTURE), jpeg=True))
     print_result(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})
     return exit_status(result)

@@ -1,4 +1,4 @@
-"""The cameras of the 3D view: their poses, what became of their frames, and their accuracy."""
+"""The cameras of the 3D view: poses, status of the frames, and accuracy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report.fields import OF_95_PERCENT, accuracy_shares
-from tofuse.report.packing import squeezed
+from tofuse.report.packing import pack
 from tofuse.report.scene import RigCameras
 from tofuse.report.subject import Subject
 from tofuse.report.words import STATUSES
@@ -19,8 +19,8 @@ from tofuse.results.types import FrameRecord
 def packed(s: Subject) -> dict[str, Any]:
     """Return every frame for the viewer: its index, status, error and poses.
 
-    Poses (3, 4) follow each other row by row in the axes that the model is shown in, zeros where
-    there is none; errors are bytes on the scale of the accuracy's field.
+    Poses (3, 4) are in the axes of the displayed model, row by row, zeros where there is none;
+    errors are bytes on the scale of the accuracy field.
     """
     index = s.index.astype(int)
     records = {r.index: r for r in s.result.diagnostics.frames}
@@ -30,28 +30,28 @@ def packed(s: Subject) -> dict[str, Any]:
     before = s.result.diagnostics.sequential
     if before.shape != s.result.trajectory.shape:
         before = np.full_like(s.result.trajectory, np.nan)
-    rig = rig_of(s)
+    rig = rig_cameras(s)
     return {
         "rig": None
         if rig is None
-        else {"colors": rig.colors, "of": squeezed(rig.of_frames.astype("u1"))},
-        "index": squeezed(index.astype("<u4")),
+        else {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
+        "index": pack(index.astype("<u4")),
         "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in known),
-        "errors": squeezed(shares) if np.isfinite(errors).any() else None,
+        "errors": pack(shares) if np.isfinite(errors).any() else None,
         "after": _poses(s.result.trajectory, s.straight),
         "before": _poses(before, s.straight),
     }
 
 
-def rig_of(s: Subject) -> RigCameras | None:
-    """Return the cameras of a rig; None where there is one camera."""
+def rig_cameras(s: Subject) -> RigCameras | None:
+    """Return the cameras of a rig; None for a single camera."""
     return RigCameras.of(s.result.recording.get("rig"), len(s.index))
 
 
 def position_errors(s: Subject) -> Float64:
     """Return (N,) 95 % bounds in m of the camera centres, in the worst direction.
 
-    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or nothing was assessed.
+    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed.
     """
     records = {r.index: r for r in s.result.diagnostics.frames}
     out = np.full(len(s.index), np.nan)
@@ -76,4 +76,4 @@ def _bound(record: FrameRecord) -> float:
 
 def _poses(poses: Float64, axes: Float64) -> str:
     shown = np.nan_to_num(axes @ poses[:, :3, :]).reshape(len(poses), 12)
-    return squeezed(shown.astype("<f4"))
+    return pack(shown.astype("<f4"))

@@ -1,4 +1,4 @@
-"""What a report shows beyond the result itself."""
+"""Content of a report beyond the result itself."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tofuse.report.pictures import Pictures
 
 @dataclass(frozen=True, eq=False)
 class ReportExtras:
-    """Samples of the recording, and the truth where it is known.
+    """Samples of the recording, and the ground truth where known.
 
     Attributes
     ----------
     title
-        For example the name of the input.
+        Title of the report, for example the name of the input.
     filter_steps
         ("raw", frame), then (name, frame) after each filter in order, for one sample frame.
     reference
@@ -26,13 +26,13 @@ class ReportExtras:
     truth_points
         (K, 3) points in m on the true surfaces, in the world frame; None if not known.
     pictures
-        Of the result's samples of frames, in their order.
+        Images of the result's samples of frames, in their order.
     clouds
-        About a dozen evenly spaced, unfiltered views, where views are clouds.
+        About a dozen evenly spaced, unfiltered views, if views are clouds.
     headline
-        Said above everything else; may be empty.
+        Text above everything else; may be empty.
     rig
-        The rig that recorded, with how far its cameras' surfaces are apart in this recording.
+        The rig, with the distances between overlapping surfaces of its cameras in this recording.
     """
 
     title: str

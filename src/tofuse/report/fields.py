@@ -1,4 +1,4 @@
-"""What the 3D view can colour the model by, beside its own colours."""
+"""Values that the 3D view can colour the model by, in addition to its own colours."""
 
 from __future__ import annotations
 
@@ -10,29 +10,33 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report import words
-from tofuse.report.packing import squeezed
+from tofuse.report.packing import pack
 from tofuse.report.scene import Scene, height_range
 
-# Of normally distributed errors, one in twenty exceeds so many standard deviations.
+# One in twenty normally distributed errors exceeds this many standard deviations.
 OF_95_PERCENT = 1.96
-# Accuracies are kept as bytes from a tenth of a millimetre on, each 4.9 % more than the one before.
+# Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _FINEST_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A value (K,) of everything that is shown: every point, or every vertex of the surface.
+    """A value of every point shown, or of every vertex of the surface.
 
     Attributes
     ----------
+    name, label
+        Identifier, and title of the colour bar.
+    values
+        (K,).
     low, high
-        Values at the two ends of the colour bar; what is beyond has the colour of that end.
+        Values at the ends of the colour bar, at which colours are clamped.
     said
-        What is written at these ends, and in the middle.
+        Tick labels at the lower end, in the middle and at the upper end.
     span
-        Values that the bytes 0 and 255 stand for.
+        Values that the bytes 0 and 255 represent.
     logarithmic
-        Whether equal steps are equal ratios.
+        Whether the scale is logarithmic.
     """
 
     name: str
@@ -45,17 +49,17 @@ class Field:
     logarithmic: bool = False
 
     def packed(self) -> dict[str, Any]:
-        """Return the field for the viewer: values as bytes, and where the bar begins and ends."""
+        """Return the field for the viewer: values as bytes, and the ends of the colour bar."""
         return {
             "label": self.label,
             "said": self.said,
             "ends": [float(self.shares(np.array(end))) for end in (self.low, self.high)],
             "span": self.span,
-            "values": squeezed(np.round(255 * self.shares(self.values)).astype(np.uint8)),
+            "values": pack(np.round(255 * self.shares(self.values)).astype(np.uint8)),
         }
 
     def shares(self, values: Float64) -> Float64:
-        """Return values as shares of the span, 0 to 1; what is not known is worst."""
+        """Return values as fractions of the span, 0 to 1; 1 where unknown."""
         low, high = self.span
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
@@ -64,12 +68,14 @@ class Field:
 
 
 def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
-    """Return what the scene can be coloured by: height always, and what its points know.
+    """Return the fields of a scene: height, and those that its points have values for.
 
     Parameters
     ----------
+    scene
+        The scene.
     errors
-        (N,) 95 % bounds in m of camera centres, which share the colours of the accuracies.
+        (N,) 95 % bounds in m of camera centres, which have the same colour scale as accuracies.
     """
     mesh = scene.mesh
     points = scene.points if mesh is None else mesh.vertices.astype(float)
@@ -86,7 +92,7 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
 
 
 def accuracy_shares(metres: Float64) -> Float64:
-    """Return 95 % bounds in m as shares of the span of every field of accuracies."""
+    """Return 95 % bounds in m as fractions of the span of a field of accuracies."""
     return _accuracy(metres).shares(metres)
 
 
@@ -98,7 +104,7 @@ def _height(heights: Float64, ends: tuple[float, float]) -> Field:
 
 def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
     unknown = OF_95_PERCENT * UNKNOWN_M
-    low, high = _ends(values[values < UNKNOWN_M])  # what these differ by is to be seen
+    low, high = _ends(values[values < UNKNOWN_M])  # so that these can be distinguished
     if errors is not None and (errors < UNKNOWN_M).any():
         others = _ends(errors[errors < UNKNOWN_M])
         low, high = min(low, others[0]), max(high, others[1])

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
-    """Write the report to `path`, beside it first and then renamed.
+    """Write the report to `path`, atomically.
 
     Raises
     ------
     OutputError
-        If the file can't be written; an earlier one is left as it was.
+        If the file can't be written; an earlier one is unchanged then.
     """
     write_text(path, secured(readable(render(result, extras))))
 

@@ -33,7 +33,7 @@ _VIRIDIS = np.array(
 
 
 def viridis(value: Float64) -> UInt8:
-    """Colours (..., 3) of values from 0 to 1."""
+    """Return viridis colours (..., 3) of values from 0 to 1."""
     place = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
     return _TABLE[np.round(place).astype(np.intp)]
 
@@ -47,7 +47,7 @@ def _between(place: Float64) -> UInt8:
 _TABLE = _between(np.linspace(0, len(_VIRIDIS) - 1, 1025))
 
 
-def encoded(image: UInt8, *, jpeg: bool = False) -> bytes:
+def encode(image: UInt8, *, jpeg: bool = False) -> bytes:
     """Encode an (H, W, 3) RGB or (H, W, 4) RGBA image as PNG (or JPEG, for photographs)."""
     import cv2
 
@@ -61,12 +61,12 @@ def encoded(image: UInt8, *, jpeg: bool = False) -> bytes:
 
 
 def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
-    """Encode an image as `encoded` does, for a page."""
+    """Encode an image as `encode` does, for a page."""
     kind = "jpeg" if jpeg else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(encoded(image, jpeg=jpeg)).decode()}"
+    return f"data:image/{kind};base64,{base64.b64encode(encode(image, jpeg=jpeg)).decode()}"
 
 
-def shrink(image: UInt8, width: int) -> UInt8:
+def subsample(image: UInt8, width: int) -> UInt8:
     """Take every n-th pixel until the image is at most `width` wide.
 
     Averaging would invent depths between an edge and what is behind it.
@@ -76,7 +76,7 @@ def shrink(image: UInt8, width: int) -> UInt8:
 
 
 def depth_limits(frame: Frame) -> tuple[float, float]:
-    """Return the depths in m between which colours are spread: the middle 96 % of the points."""
+    """Return the depths in m at the ends of the colour map: the 2nd and 98th percentile."""
     if isinstance(frame, RangeFrame):
         values = frame.z[frame.valid].astype(float)
     else:
@@ -90,9 +90,18 @@ def depth_limits(frame: Frame) -> tuple[float, float]:
 def depth_image(
     frame: RangeFrame, limits: tuple[float, float], removed: Bool | None, width: int | None = None
 ) -> UInt8:
-    """Colour the z depth; pixels without a measurement are grey, those in `removed` marked.
+    """Return the z depth in colours (H, W, 3); pixels without a measurement are grey.
 
-    With a `width`, as `shrink` would leave it.
+    Parameters
+    ----------
+    frame
+        The frame.
+    limits
+        Depths at the ends of the colour map, m.
+    removed
+        (H, W) pixels to be marked; or None.
+    width
+        Maximum width; wider images are subsampled.
     """
     low, high = limits
     step = 1 if width is None else -(-frame.z.shape[1] // width)
@@ -126,7 +135,7 @@ def splat(
     distance: float | None = None,
     radius: int = 1,
 ) -> UInt8:
-    """Draw points as squares, the nearest in front.
+    """Render points as squares, with occlusion.
 
     Parameters
     ----------
@@ -160,7 +169,7 @@ def nearest(
     distance: float | None = None,
     radius: int = 1,
 ) -> Int32:
-    """Which point (N, 3) is seen at each pixel, (H, W), as `splat` draws them; -1 for none."""
+    """Return the index of the visible point at each pixel (H, W), as `splat` draws them; or -1."""
     found = np.full(size[::-1], -1, np.int32)
     depth = np.full(found.shape, np.inf)
     nearest_points(
@@ -177,8 +186,8 @@ def _colored(found: Int32, colors: UInt8) -> UInt8:
     return image
 
 
-def turned(yaw: float, pitch: float) -> Float64:
-    """Rotation (3, 3) into a view turned by `yaw` and looking down by `pitch` (rad)."""
+def view_rotation(yaw: float, pitch: float) -> Float64:
+    """Return the rotation (3, 3) into a view rotated by `yaw` and tilted down by `pitch` (rad)."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
@@ -208,7 +217,7 @@ class Framing:
         cls, points: Float64, size: tuple[int, int], *, yaw: float = 0.7, pitch: float = 0.45
     ) -> Framing:
         """Frame (N, 3) points, seen from above and to the side."""
-        R = turned(yaw, pitch)
+        R = view_rotation(yaw, pitch)
         T = np.eye(4)
         T[:3, :3] = R
         if len(points) == 0:
@@ -221,7 +230,7 @@ class Framing:
 
 
 def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
-    """Draw a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
+    """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
     points = frame.points.astype(float)
     radius = 1 if len(points) > 60_000 else 2
     found = nearest(points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius)

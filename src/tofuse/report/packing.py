@@ -1,4 +1,4 @@
-"""Arrays as text for the pages' scripts: small, and decoded there by `bytes.js`."""
+"""Compressed arrays as text for the scripts of pages, where `bytes.js` decodes them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float64, Int8, UInt16
 
-_LEVEL = 6  # of zlib: higher ones take three times as long, for 3 %
+_LEVEL = 6  # of zlib: higher ones take three times as long and save 3 %
 
 
-def squeezed(array: NDArray[Any]) -> str:
-    """Return an array (N,) or (N, C), compressed without loss.
+def pack(array: NDArray[Any]) -> str:
+    """Return an array (N,) or (N, C), losslessly compressed.
 
-    Rows that follow each other are alike, as are vertices and faces of one place: of each column
-    the differences are kept, their lowest bytes first, all together, and then deflated.
+    Consecutive rows are similar, as neighbouring vertices and faces are: the differences of each
+    column are stored as byte planes, lowest bytes first, and deflated.
     """
     if not array.size:
         return base64.b64encode(zlib.compress(b"")).decode()
@@ -32,8 +32,8 @@ def squeezed(array: NDArray[Any]) -> str:
     return base64.b64encode(packed).decode()
 
 
-def unsqueezed(text: str, dtype: str, columns: int) -> NDArray[Any]:
-    """Return the array (N, C) that `squeezed` packed, as the page's script does."""
+def unpack(text: str, dtype: str, columns: int) -> NDArray[Any]:
+    """Return the array (N, C) that `pack` packed, as the page's script does."""
     kind = np.dtype(dtype)
     raw = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
     planes = raw.reshape(columns, kind.itemsize, -1).transpose(2, 0, 1)
@@ -43,7 +43,7 @@ def unsqueezed(text: str, dtype: str, columns: int) -> NDArray[Any]:
 
 
 def steps_of(points: Float64, low: Float64, extent: Float64) -> UInt16:
-    """Return points (N, 3) as steps of a 65535th of a box."""
+    """Quantise points (N, 3) to 16 bits in a box with corner `low` (3,) and size `extent` (3,)."""
     return np.round((points - low) / extent * 65535).astype("<u2")
 
 

@@ -1,4 +1,4 @@
-"""`report.html` of one registered pair, in one file without outside resources."""
+"""`report.html` of one registered pair, a single file without external resources."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tofuse.report.pair_scene import (
     color_bar,
     packed,
     pair_scene,
-    stills,
+    render_modes,
 )
 from tofuse.report.policy import secured
 from tofuse.results.pair import LocalView, PairResult
@@ -34,7 +34,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
     Raises
     ------
     OutputError
-        If the file can't be written; an earlier one is left as it was.
+        If the file can't be written; an earlier one is unchanged then.
     """
     write_text(path, secured(readable(render_pair(result))))
 
@@ -43,7 +43,7 @@ def render_pair(result: PairResult) -> str:
     """Return the page as HTML."""
     scene = pair_scene(result)
     head, tail = pair_words.belief(result)
-    drawn = stills(scene)
+    drawn = render_modes(scene)
     pictures = {mode: images.data_uri(image) for mode, image in drawn.items()}
     return template("pair.html.j2").render(
         title=f"{_short(result.source)} registered to {_short(result.target)}",
@@ -78,7 +78,7 @@ def render_pair(result: PairResult) -> str:
 
 def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
     found = result.found
-    name = "Motion of the middle" if result.source.center.any() else "Translation"
+    name = "Displacement of the centre" if result.source.center.any() else "Translation"
     facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
     facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))
     if found.overlap is not None:
@@ -92,7 +92,7 @@ def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
 
 
 def _notes(result: PairResult) -> list[tuple[str, str]]:
-    """What is to be known beside the figures: a heading and a sentence each."""
+    """The details: a heading and a sentence each."""
     translation = pair_words.translation(result)
     if moved := pair_words.moved_center(result):
         translation += f"; {moved}"
@@ -128,7 +128,7 @@ def _thinned(scene: PairScene) -> str:
 
 
 def _distance(scene: PairScene) -> str:
-    """Say how far the views are apart where both have a surface."""
+    """The median distance between the views where both have a surface, as text."""
     if scene.share == 0:
         return f"No point is within {words.length(scene.none_m)} of the other view."
     return (

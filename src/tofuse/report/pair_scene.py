@@ -12,28 +12,28 @@ from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.shape import normals_at
 from tofuse.report import images
-from tofuse.report.packing import normal_bytes, squeezed, steps_of
-from tofuse.report.scene import Scene, choose, outline, spacing_of, still
+from tofuse.report.packing import normal_bytes, pack, steps_of
+from tofuse.report.scene import Scene, extreme_points, random_subset, render, spacing_of
 from tofuse.results.pair import LocalView, PairResult
 
 SOURCE, TARGET = (240, 160, 60), (90, 176, 245)
 MODES = ("before", "after", "distance")
 MAX_POINTS = 45_000  # of each view; about 2 MB for both
-_MAX_SEARCHED = 400_000  # of each view, in which the nearest points are looked for
+_MAX_SEARCHED = 400_000  # of each view, for the search of nearest points
 _NEIGHBOURS = 30  # that a surface is fitted to
-_FROM_BASE = 0.2  # of viridis: its darkest colours are lost on a dark ground
-# The colour bar ends at so many median distances, of points that are not further than so many rms.
+_FROM_BASE = 0.2  # of viridis: its darkest colours are invisible on a dark background
+# The colour bar ends at this multiple of the median distance of points within a number of rms.
 _CAP_MEDIANS, _MAX_RMS = 4.0, 10.0
-_NONE_CAPS = 4.0  # beyond so many ends of the colour bar a point has no counterpart
-_FAR = 2.5  # times the size of the registered scene: then the start is framed by itself
+_NONE_CAPS = 4.0  # a point beyond this multiple of the colour bar's end has no counterpart
+_FAR = 2.5  # the initial pose is framed separately if it enlarges the scene by more
 _Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
-_BEHIND = 0.1  # share of the points, from which on they are not those of a camera
+_BEHIND = 0.1  # minimum fraction of points behind the origin that excludes a camera
 _LEAST_PIXELS = 2  # side of a point
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A thinned view in its own local frame, and its distances in m to the other one."""
+    """A subsampled view in its own local frame, and its distances in m to the other one."""
 
     points: Float64
     normals: Float64 | None
@@ -43,20 +43,22 @@ class _Shown:
 
 @dataclass(frozen=True, eq=False)
 class PairScene:
-    """What the page shows.
+    """The content of the page's 3D view.
 
     Attributes
     ----------
     cap_m
         Distance at the end of the colour bar.
     none_m
-        Beyond it a point counts as having no counterpart.
+        Distance beyond which a point has no counterpart.
     median_m, share
-        Median distance of the points that have one, and how many those are, 0 to 1.
+        Median distance of the points with a counterpart, and their fraction, 0 to 1.
     layers
-        Points in the target's local frame, for each of `MODES` those of source and target.
+        Source and target in the target's local frame, for each of `MODES`.
+    yaw, pitch
+        Initial viewing direction, rad.
     shown, total
-        How many points are shown, and how many there are.
+        Number of points shown, and of all points.
     """
 
     cap_m: float
@@ -71,9 +73,9 @@ class PairScene:
 
 
 def pair_scene(result: PairResult) -> PairScene:
-    """Thin both views and measure how far they are from each other."""
+    """Subsample both views and compute the distances between them."""
     T = result.found.T_target_source
-    source, target = _searched(result.source.frame), _searched(result.target.frame)
+    source, target = _search_points(result.source.frame), _search_points(result.target.frame)
     theirs = target.points.astype(float)
     ours = se3.transform(T, source.points.astype(float))
     a = _shown(source, ours, theirs, len(result.source.frame))
@@ -83,7 +85,7 @@ def pair_scene(result: PairResult) -> PairScene:
     near = both[both <= usual] if (both <= usual).any() else both[np.isfinite(both)]
     cap = _round_up(max(_CAP_MEDIANS * float(np.median(near)) if len(near) else 0.0, 1e-3))
     near = both[both <= _NONE_CAPS * cap]
-    z_up = any(_stands_up(view) for view in (result.source, result.target))
+    z_up = any(_is_z_up(view) for view in (result.source, result.target))
     axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if z_up else np.eye(3)
 
     def scene(view: _Shown, pose: Float64, colors: UInt8) -> Scene:
@@ -97,10 +99,10 @@ def pair_scene(result: PairResult) -> PairScene:
         )  # fmt: skip
 
     here = np.eye(4)
-    blue = scene(b, here, _flat(TARGET, len(b.points)))
+    blue = scene(b, here, _uniform(TARGET, len(b.points)))
     layers = {
-        "before": (scene(a, result.start, _flat(SOURCE, len(a.points))), blue),
-        "after": (scene(a, T, _flat(SOURCE, len(a.points))), blue),
+        "before": (scene(a, result.start, _uniform(SOURCE, len(a.points))), blue),
+        "after": (scene(a, T, _uniform(SOURCE, len(a.points))), blue),
         "distance": (
             scene(a, T, distance_colors(a.distance, cap)),
             scene(b, here, distance_colors(b.distance, cap)),
@@ -119,7 +121,7 @@ def pair_scene(result: PairResult) -> PairScene:
 
 
 def distance_colors(distance: Float64, cap_m: float) -> UInt8:
-    """Colours (N, 3) of distances in m; grey where there is no counterpart."""
+    """Return colours (N, 3) of distances in m; grey for points without a counterpart."""
     share = np.clip(distance / cap_m, 0, 1)
     colors = images.viridis(_FROM_BASE + (1 - _FROM_BASE) * share)
     colors[distance > _NONE_CAPS * cap_m] = images.GONE
@@ -133,11 +135,17 @@ def color_bar() -> str:
 
 
 def distances(points: Float64, others: Float64, chosen: Intp) -> Float64:
-    """Return (n,) distances in m of the chosen ones of points (N, 3) from the surface of others.
+    """Return distances (n,) in m of points from the surface of others.
 
-    Between means of the nearest points of both views, along the normal of the other one (as M3C2,
-    Lague et al. 2013), so that noise does not hide where the views are apart. Infinite where a
-    point does not lie over a surface of the others (M, 3).
+    The distance between local means of both views along the normal of the other one, like M3C2
+    (Lague et al. 2013), which reduces noise. Infinite where the other view has no surface.
+
+    Parameters
+    ----------
+    points, others
+        (N, 3) and (M, 3), m, in the same frame.
+    chosen
+        (n,) rows of `points`.
     """
     from scipy.spatial import cKDTree
 
@@ -145,7 +153,7 @@ def distances(points: Float64, others: Float64, chosen: Intp) -> Float64:
         return np.full(len(chosen), np.inf)
     _, own = cKDTree(points).query(points[chosen], k=_NEIGHBOURS)
     means = points[own].mean(1)
-    # What lies about the nearest point is a patch even at an edge; what is nearest may be a line.
+    # The neighbours of the nearest point form a patch even at an edge, those of the query may not.
     tree = cKDTree(others)
     _, nearest = tree.query(means)
     _, near = tree.query(others[nearest], k=_NEIGHBOURS)
@@ -161,23 +169,23 @@ def distances(points: Float64, others: Float64, chosen: Intp) -> Float64:
 
 
 def packed(scene: PairScene) -> dict[str, Any]:
-    """Return the scene for the viewer: plain data, arrays as `squeezed` packs them."""
+    """Return the scene for the viewer: plain data, arrays as `pack` packs them."""
     arrays: dict[str, str] = {}
     layers = []
     for mode in MODES:
         for view, layer in zip(("source", "target"), scene.layers[mode], strict=True):
             low = layer.points.min(0)
             extent = np.maximum(np.ptp(layer.points, axis=0), 1e-6)
-            # What "after" and "distance" have in common is stored once.
+            # "after" and "distance" share their arrays.
             place = view if view == "target" or mode != "before" else "start"
             if place not in arrays:
-                arrays[place] = squeezed(steps_of(layer.points, low, extent))
+                arrays[place] = pack(steps_of(layer.points, low, extent))
                 if layer.normals is not None:
-                    arrays[f"{place} normals"] = squeezed(normal_bytes(layer.normals))
+                    arrays[f"{place} normals"] = pack(normal_bytes(layer.normals))
             colors = None
             if mode == "distance":
                 colors = f"{view} colors"
-                arrays[colors] = squeezed(layer.colors)
+                arrays[colors] = pack(layer.colors)
             layers.append(
                 {
                     "mode": mode,
@@ -212,17 +220,17 @@ def packed(scene: PairScene) -> dict[str, Any]:
 
 
 def framing(scene: PairScene) -> dict[str, Float64]:
-    """Return the outline (K, 3) of what each mode shows: the same one, unless the start is far."""
-    after = np.concatenate([outline(layer.points) for layer in scene.layers["after"]])
-    before = np.concatenate([outline(layer.points) for layer in scene.layers["before"]])
+    """Return the extreme points (K, 3) of each mode: common ones, unless the start is far away."""
+    after = np.concatenate([extreme_points(layer.points) for layer in scene.layers["after"]])
+    before = np.concatenate([extreme_points(layer.points) for layer in scene.layers["before"]])
     both = np.concatenate([after, before])
     if np.linalg.norm(np.ptp(both, axis=0)) <= _FAR * np.linalg.norm(np.ptp(after, axis=0)):
         return dict.fromkeys(MODES, both)
     return {"before": before, "after": after, "distance": after}
 
 
-def stills(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UInt8]:
-    """Draw each mode as the viewer opens with it."""
+def render_modes(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UInt8]:
+    """Render the initial view of each mode."""
     seen = framing(scene)
     out = {}
     for mode, (source, target) in scene.layers.items():
@@ -234,8 +242,8 @@ def stills(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UI
             normals=np.concatenate([source.normals, target.normals]) if have else None,
             spacing=max(source.spacing, target.spacing),
         )
-        eye = _eye(seen[mode], images.turned(scene.yaw, scene.pitch), size)
-        out[mode] = still(
+        eye = _fit_eye(seen[mode], images.view_rotation(scene.yaw, scene.pitch), size)
+        out[mode] = render(
             both,
             size,
             yaw=scene.yaw,
@@ -247,24 +255,24 @@ def stills(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UI
     return out
 
 
-def _searched(frame: Frame) -> CloudFrame:
-    """The points of a view, so many as are searched in."""
-    keep = choose(len(frame), _MAX_SEARCHED)
+def _search_points(frame: Frame) -> CloudFrame:
+    """The points of a view, at most `_MAX_SEARCHED`."""
+    keep = random_subset(len(frame), _MAX_SEARCHED)
     normals = None if frame.normals is None else frame.normals[keep]
     return CloudFrame(0, 0.0, frame.points[keep], normals, origin=frame.origin)
 
 
 def _shown(frame: CloudFrame, here: Float64, others: Float64, total: int) -> _Shown:
-    """Thin a view and measure it; `here` (N, 3) are its points in the frame of `others`."""
-    keep = choose(len(frame), MAX_POINTS)
+    """Subsample a view; `here` (N, 3) are its points in the frame of `others` (M, 3)."""
+    keep = random_subset(len(frame), MAX_POINTS)
     normals = None
     if len(frame) > _NEIGHBOURS:
         normals = normals_at(frame, keep.astype(np.int64))
     return _Shown(frame.points[keep].astype(float), normals, distances(here, others, keep), total)
 
 
-def _stands_up(local: LocalView) -> bool:
-    """Whether z is up: in maps, and with scanners, which see before them and behind."""
+def _is_z_up(local: LocalView) -> bool:
+    """Whether z is up: in maps, and with scanners, which see in all directions."""
     if not isinstance(local.view.frame, CloudFrame):
         return False
     if local.view.format in _Z_UP or local.center.any():
@@ -272,12 +280,12 @@ def _stands_up(local: LocalView) -> bool:
     return _BEHIND <= float((local.view.frame.points[:, 2] < 0).mean()) <= 1 - _BEHIND
 
 
-def _flat(color: tuple[int, int, int], count: int) -> UInt8:
+def _uniform(color: tuple[int, int, int], count: int) -> UInt8:
     return np.tile(np.array(color, np.uint8), (count, 1))
 
 
-def _eye(outline: Float64, R: Float64, size: tuple[int, int]) -> tuple[Float64, float]:
-    """What to look at, and from how far (m), so that an outline fills the picture."""
+def _fit_eye(outline: Float64, R: Float64, size: tuple[int, int]) -> tuple[Float64, float]:
+    """The point (3,) to look at, and the distance (m), so that an outline fills the image."""
     center = outline.mean(0)
     extent = max(float(np.linalg.norm(np.ptp(outline, axis=0))), 1e-3)
     distance = 1.2 * extent

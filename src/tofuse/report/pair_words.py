@@ -1,4 +1,4 @@
-"""A registration in words, for the page and the terminal alike."""
+"""A registration as text, for the report and the terminal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.results.pair import PairResult
 
-_ALONG = 0.985  # cosine from which on a direction is called by the name of an axis
+_ALONG = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
 
 
 def belief(result: PairResult) -> tuple[str, str]:
-    """Return what is believed, in two words or so, and the rest of the sentence."""
+    """Return whether the pose is believed, and the rest of the sentence."""
     found = result.found
     chance = "" if found.probability is None else f"probability {_chance(found.probability)}"
     if found.believed:
@@ -27,23 +27,21 @@ def belief(result: PairResult) -> tuple[str, str]:
 
 
 def translation(result: PairResult) -> str:
-    """Say how the origin moves."""
+    """Return the translation as text."""
     t = result.T_target_source[:3, 3]
     return f"{vector(t, 4)} m, length {np.linalg.norm(t):.4f} m"
 
 
 def moved_center(result: PairResult) -> str:
-    """Say how the middle of a source moves that lies far from its origin; empty if it doesn't."""
+    """Return the displacement of a source's centre as text; empty if that is the origin."""
     center = result.source.center
     if not center.any():
         return ""
-    return (
-        f"moves by {vector(result.moved_m, 4)} m at {vector(center, 0)}, the middle of the source"
-    )
+    return f"displacement {vector(result.moved_m, 4)} m at {vector(center, 0)}, the source's centre"
 
 
 def rotation(result: PairResult) -> str:
-    """Say by what angle about what axis the source turns."""
+    """Return the rotation as text: angle and axis."""
     w = se3.so3_log(result.T_target_source[:3, :3])
     angle = float(np.linalg.norm(w))
     if angle < _SMALL_RAD:
@@ -52,14 +50,14 @@ def rotation(result: PairResult) -> str:
 
 
 def matrix(result: PairResult) -> list[str]:
-    """Return the rows of T_target_source."""
+    """Return the rows of T_target_source as text."""
     T = result.T_target_source
     wide = max(len(f"{value:.6f}") for value in T[:3, 3])
     return [" ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{wide}.6f}" for row in T]
 
 
 def overlap(result: PairResult) -> str:
-    """Say how much of the views lies on the other; what a method doesn't know is left out."""
+    """Return overlap, support and contradiction as text, as far as the method provides them."""
     found = result.found
     parts = []
     if found.overlap is not None:
@@ -69,18 +67,18 @@ def overlap(result: PairResult) -> str:
     if found.contradiction is not None:
         parts.append(f"{percent(found.contradiction)} contradict it")
     if not parts:
-        return f"{percent(found.share)} of the source's points have a partner"
+        return f"{percent(found.share)} of the source's points have a correspondence"
     return ", ".join(parts)
 
 
 def rms(result: PairResult) -> str:
-    """Say how far apart corresponding points are."""
+    """Return the rms distance of corresponding points as text."""
     value = result.found.rms_m
     return f"{1000 * value:.2f} mm" if np.isfinite(value) else "unknown"
 
 
 def sigma(result: PairResult) -> str:
-    """Say how well the pose is known, one standard deviation in the worst observable direction."""
+    """Return one standard deviation in the worst observable direction as text."""
     metres, radians = result.sigma
     parts = []
     if metres is not None:
@@ -91,15 +89,15 @@ def sigma(result: PairResult) -> str:
 
 
 def sigma_note(result: PairResult) -> str:
-    """Say what kind of figure `sigma` is."""
+    """Return an explanation of `sigma`."""
     note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
     if result.found.believed is None:
-        note += "; by the noise of the points alone, usually too small"
+        note += "; from point noise only, usually too small"
     return note
 
 
 def unobservable(result: PairResult) -> str:
-    """Say which motions the data doesn't constrain, in the axes of the source; empty if none."""
+    """Return the unobservable motions as text, in the axes of the source; empty if none."""
     slides, turns = result.free_motions
     parts = []
     if len(slides):
@@ -110,7 +108,7 @@ def unobservable(result: PairResult) -> str:
 
 
 def runner_up(result: PairResult) -> str:
-    """Say how the best other pose compares, and where it is; empty if none was looked for."""
+    """Return the distance and the margin of the best rival pose as text; empty without one."""
     parts = []
     away = result.runner_up_distance
     if away is None and result.found.margin is not None:
@@ -124,26 +122,26 @@ def runner_up(result: PairResult) -> str:
 
 
 def percent(value: float) -> str:
-    """Write a share of 1 in percent, with a decimal where it is small."""
+    """Return a fraction in percent as text, with a decimal if it is small."""
     shown = 100 * value
     return f"{shown:.1f} %" if 0.05 <= abs(shown) < 9.95 else f"{shown:.0f} %"
 
 
 def _chance(value: float) -> str:
-    """Write a probability, which is never certain."""
+    """A probability as text, never 0 or 1."""
     if value > 0.99:
         return "above 99 %"
     return "below 1 %" if value < 0.01 else f"{100 * value:.0f} %"
 
 
 def vector(values: ArrayLike, digits: int) -> str:
-    """Write three numbers in brackets."""
+    """Return three numbers in brackets as text."""
     rounded = np.round(np.asarray(values, float), digits) + 0.0
     return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
 def _directions(axes: Float64, one: str, all_of_them: str) -> str:
-    """Say which directions (k, 3) span."""
+    """The span of axes (k, 3) as text."""
     if len(axes) >= 3:
         return all_of_them
     if len(axes) == 2:
@@ -152,7 +150,7 @@ def _directions(axes: Float64, one: str, all_of_them: str) -> str:
 
 
 def _named(axis: Float64) -> str:
-    """Name an axis of the source that a direction is near to, else give its components."""
+    """The name of the source's axis that a direction is close to, else its components."""
     axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
     k = int(np.abs(axis).argmax())
     if abs(axis[k]) > _ALONG:

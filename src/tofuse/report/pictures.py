@@ -1,4 +1,4 @@
-"""The frames' samples as files of images: range, amplitude, colour, and what became of pixels."""
+"""The samples of frames as image files: range, amplitude, colour, and use of pixels."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 
 from tofuse.kernels.threads import run_all
-from tofuse.report.images import GONE, REMOVED, encoded, grey, viridis
+from tofuse.report.images import GONE, REMOVED, encode, grey, viridis
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
 
-# What a picture shows, in the order in which they are shown.
+# Kinds of images, in the order in which they are shown.
 KINDS = ("color", "range", "amplitude", "fate")
 
-# Colours and words of what became of a pixel.
+# Colour and label of each use of a pixel.
 FATES = {
     samples.KEPT: ((38, 150, 140), "in the model"),
     samples.TRACKED: ((236, 170, 60), "tracking only"),
@@ -27,14 +27,14 @@ FATES = {
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Images of one frame by kind (`KINDS`), as JPEG, that of fates as PNG."""
+    """Images of one frame by kind (`KINDS`): JPEG, and PNG for the use of pixels."""
 
     index: int
     images: dict[str, bytes]
 
 
 def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
-    """Return the depths in m between which colours are spread, the same for all frames."""
+    """Return the depths in m at the ends of the colour map, the same for all frames."""
     seen = [f.depth[::3, ::3] for f in frames]
     values = np.concatenate([d[d > 0] for d in seen]) if seen else np.zeros(0, np.float16)
     if len(values) == 0:
@@ -44,7 +44,7 @@ def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
 
 
 def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
-    """Draw the samples."""
+    """Render the samples of frames."""
     low, high = depth_range(frames)
     table = np.zeros((4, 3), np.uint8)
     for fate, (color, _) in FATES.items():
@@ -54,11 +54,11 @@ def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
         depth = frame.depth.astype(float)
         picture = viridis((depth - low) / (high - low))
         picture[depth == 0] = GONE
-        images = {} if frame.color is None else {"color": encoded(frame.color, jpeg=True)}
-        images["range"] = encoded(picture, jpeg=True)
+        images = {} if frame.color is None else {"color": encode(frame.color, jpeg=True)}
+        images["range"] = encode(picture, jpeg=True)
         if frame.amplitude is not None:
-            images["amplitude"] = encoded(grey(frame.amplitude), jpeg=True)
-        images["fate"] = encoded(table[frame.fate])
+            images["amplitude"] = encode(grey(frame.amplitude), jpeg=True)
+        images["fate"] = encode(table[frame.fate])
         return Pictures(frame.index, images)
 
     return tuple(run_all([partial(drawn, frame) for frame in frames]))

@@ -1,4 +1,4 @@
-"""Plots as inline SVG whose colours are the page's, so that they follow its light or dark look."""
+"""Plots as inline SVG that uses the page's colours, so that it follows its light or dark theme."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _STYLE: Any = {
 
 
 def _figure_class() -> type[Figure]:
-    """Import matplotlib without its words about building or missing a font cache."""
+    """Import matplotlib without its log messages about the font cache."""
     log = logging.getLogger("matplotlib")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -56,10 +56,18 @@ def _figure_class() -> type[Figure]:
     return Figure
 
 
-def framed(
+def make_figure(
     width: float, height: float, margins: tuple[float, float, float, float]
 ) -> tuple[Figure, Axes]:
-    """Make a figure of that many pixels, and axes; margins are left, bottom, right, top."""
+    """Make a figure with axes.
+
+    Parameters
+    ----------
+    width, height
+        Size in pixels.
+    margins
+        Left, bottom, right and top, pixels.
+    """
     figure = _figure_class()(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
     axes = figure.add_axes(
@@ -97,7 +105,7 @@ def svg(figure: Figure, label: str) -> str:
     text = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", text, count=1, flags=re.DOTALL)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     view = re.search(r'viewBox="[^"]*"', text)
-    # Namespaces are implied in HTML, and so no address is left in the page.
+    # HTML implies the namespaces, whose addresses would be in the page.
     head = f'<svg class="plot" role="img" aria-label="{label}" {view.group() if view else ""}>'
     text = head + text[text.index(">") + 1 :]
     text = text.replace("xlink:href", "href")
@@ -135,7 +143,7 @@ def lines(
     bad
         x of frames without a value, marked by crosses on the axis.
     """
-    figure, axes = framed(*size, (52, 36, 10, 20))
+    figure, axes = make_figure(*size, (52, 36, 10, 20))
     one = len(x) == 1
     for y, color, style in series:
         few = int(np.isfinite(y).sum()) <= 30
@@ -212,19 +220,19 @@ def limits(
 
 
 def _plan(box: Float64, view: str, width: int) -> Any:
-    """Make axes with equal scales for a (2, 2) box, as high as it needs."""
+    """Make axes with equal scales for a (2, 2) box."""
     left, bottom, right, top = 46, 36, 12, 8
     extent = box[1] - box[0]
     inner = width - left - right
     height = float(np.clip(inner * extent[1] / extent[0], 130, 1.1 * inner))
-    figure, axes = framed(width, height + bottom + top, (left, bottom, right, top))
-    # Grow the box to the shape of the axes, about its middle.
+    figure, axes = make_figure(width, height + bottom + top, (left, bottom, right, top))
+    # Enlarge the box to the shape of the axes, about its centre.
     scale = max(extent[0] / inner, extent[1] / height)
     middle = box.mean(0)
     axes.set_xlim(middle[0] - scale * inner / 2, middle[0] + scale * inner / 2)
     axes.set_ylim(middle[1] - scale * height / 2, middle[1] + scale * height / 2)
     (a, sa), (b, sb) = VIEWS[view]
-    # In metres, the places of a camera that hardly moves would take three digits each.
+    # In metres, the ticks of a camera that hardly moves would need three digits.
     unit, per_m = ("mm", 1000) if max(extent) < _SMALL_M else ("m", 1)
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
         axis.set_major_locator(_locator(inner / 60 if axis is axes.xaxis else height / 40))
@@ -383,14 +391,22 @@ def rig(
     pairs: Sequence[tuple[int, int, str]] = (),
     width: int = 440,
 ) -> str:
-    """Draw the cameras of a rig as pyramids of what they see, with their names.
+    """Draw the cameras of a rig as labelled frusta.
 
     Parameters
     ----------
     poses
-        (n, 4, 4) T_rig_camera; the first is drawn stronger.
+        (n, 4, 4) T_rig_camera; the first camera is emphasised.
+    names
+        Names of the cameras.
+    view
+        Key of `VIEWS`.
+    label
+        Text for screen readers.
     pairs
-        Cameras a and b that are joined by a line, and what is said of them.
+        Cameras a and b that are joined by a line, and its label.
+    width
+        Pixels.
     """
     middles = poses[:, :3, 3]
     apart = float(np.linalg.norm(middles - middles.mean(0), axis=1).max())

@@ -1,7 +1,7 @@
-"""What a page of ours may do in a browser: run its own scripts, show what it holds, and no more.
+"""Content security policy of the pages: they run their own scripts and load nothing else.
 
-Whatever a recording's names hold is text. Should a template ever let some of it through as markup,
-the browser still runs no script of which it was not told the hash, and asks for nothing outside.
+Names in recordings are text. Should a template ever let them through as markup, the browser runs
+no script whose hash is not in the policy, and requests nothing from outside.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import base64
 import hashlib
 import re
 
-# Values of attributes may hold what ends a tag elsewhere.
+# Values of attributes may contain characters that end a tag elsewhere.
 _SCRIPT = re.compile(
     r"""<script(?P<attributes>(?:[^"'>]|"[^"]*"|'[^']*')*)>(?P<body>.*?)</script[\s/>]""",
     re.S | re.I,
@@ -20,23 +20,22 @@ _HEAD = re.compile(r"<meta\s+charset=[^>]*>", re.I)
 
 
 def script_hashes(html: str) -> list[str]:
-    """Return what a policy calls the inline scripts of a page, in order, each once."""
+    """Return the hashes of a page's inline scripts as in a policy, in order, each once."""
     bodies = [
         found["body"]
         for found in _SCRIPT.finditer(html)
         if not _DATA.search(found["attributes"]) and "src=" not in found["attributes"].lower()
     ]
-    # A browser hashes what it reads, in which there is no carriage return.
+    # Browsers hash scripts with normalised line ends.
     texts = [body.replace("\r\n", "\n").replace("\r", "\n").encode() for body in bodies]
     sums = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in texts]
     return list(dict.fromkeys(f"'sha256-{each}'" for each in sums))
 
 
 def secured(html: str) -> str:
-    """Return a page of ours, made by a template, with its policy in the head.
+    """Return a page with its policy in the head.
 
-    To be given templates with nothing filled in that is not escaped: a script that is in it counts
-    as ours.
+    Everything filled into its template must be escaped: any script in the page is allowed.
     """
     scripts = " ".join(script_hashes(html)) or "'none'"
     policy = (

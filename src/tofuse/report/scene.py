@@ -14,7 +14,7 @@ from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import images
-from tofuse.report.packing import normal_bytes, squeezed, steps_of
+from tofuse.report.packing import normal_bytes, pack, steps_of
 from tofuse.results.types import Reconstruction
 
 MAX_POINTS = 150_000
@@ -33,7 +33,7 @@ YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the 3D view shows, in the world frame.
+    """The content of the 3D view, in the world frame.
 
     Attributes
     ----------
@@ -44,14 +44,15 @@ class Scene:
     spacing
         Typical distance between neighbouring points shown, m.
     before, after, reference
-        (n, 4, 4) poses, finite ones only; `reference` may be empty.
+        (n, 4, 4) finite poses T_world_camera before and after loop closure, and of the reference;
+        may be empty.
     loops
-        (L, 2, 3) ends of the accepted loops.
+        (L, 2, 3) camera centres of the accepted loop closures.
     surface
-        All of it; None without one.
+        The whole surface; None without one.
     sigma, views
-        (K,) float, standard deviation of the points in m, and (K,) int, how many views saw them;
-        None where it is not known.
+        (K,) standard deviation of the points, m, and (K,) number of views that saw them; None where
+        not known.
     """
 
     points: Float64
@@ -69,16 +70,16 @@ class Scene:
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The surface, with so few faces that a browser on a phone shows it; None without any."""
+        """The surface, simplified for a browser on a phone; None without one."""
         if self.surface is None or len(self.surface.faces) == 0:
             return None
         return self.surface.decimated(MAX_FACES)
 
     @property
     def box(self) -> Float64:
-        """(2, 3) corners of the box around what is worth showing, without the outermost points.
+        """(2, 3) corners of the box to be shown, without the outermost points.
 
-        Cameras count where they are near; those that go around an object would make it small.
+        It includes the cameras unless they would enlarge it much, as those around an object do.
         """
         points, cameras = self.points, self.after[:, :3, 3]
         boxes = [np.percentile(p, [3, 97], axis=0) for p in (points, cameras) if len(p)]
@@ -90,27 +91,29 @@ class Scene:
 
     @property
     def framed(self) -> Float64:
-        """(K, 3) outermost of what is in the box: what the view is to show all of."""
+        """(K, 3) extreme points of the content of the box, which the view must contain."""
         low, high = self.box
         cameras = self.after[:, :3, 3]
         near = cameras[((cameras >= low) & (cameras <= high)).all(1)]
         shown = [
-            outline(part, outer) for part, outer in ((self.points, 0.5), (near, 0.0)) if len(part)
+            extreme_points(part, outer)
+            for part, outer in ((self.points, 0.5), (near, 0.0))
+            if len(part)
         ]
         return np.concatenate(shown) if shown else np.stack([low, high])
 
     @property
     def center(self) -> Float64:
-        """(3,) what the view turns about."""
+        """(3,) centre of rotation of the view."""
         return self.box.mean(0)
 
     @property
     def size(self) -> float:
-        """Diagonal of the box in m; never 0."""
+        """Diagonal of the box, m; positive."""
         return max(float(np.linalg.norm(np.ptp(self.box, axis=0))), 1e-3)
 
-    def turned(self, R: Float64) -> Scene:
-        """Return the scene in axes that are the rows of R (3, 3)."""
+    def view_rotation(self, R: Float64) -> Scene:
+        """Return the scene in the axes given by the rows of R (3, 3)."""
         T = np.eye(4)
         T[:3, :3] = R
         return replace(
@@ -132,16 +135,16 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class RigCameras:
-    """Which camera of a rig took each frame.
+    """The camera of each frame of a rig's recording.
 
     Attributes
     ----------
     names
-        Of the cameras.
+        Names of the cameras.
     colors
-        RGB of each.
+        RGB colour of each.
     of_frames
-        (N,) number of the camera of each frame, in the order of the frames.
+        (N,) number of the camera of each frame.
     """
 
     names: tuple[str, ...]
@@ -149,13 +152,13 @@ class RigCameras:
     of_frames: Intp
 
     @classmethod
-    def of(cls, told: Any, frames: int) -> RigCameras | None:
-        """Take what `run.json` says of a rig; None where it says nothing that fits the frames."""
-        if not isinstance(told, dict):
+    def of(cls, rig: Any, frames: int) -> RigCameras | None:
+        """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
+        if not isinstance(rig, dict):
             return None
-        names = tuple(str(name) for name in told.get("cameras", ()))
+        names = tuple(str(name) for name in rig.get("cameras", ()))
         try:
-            of_frames = np.array(told.get("of_frames", ()), np.intp)
+            of_frames = np.array(rig.get("of_frames", ()), np.intp)
         except (TypeError, ValueError, OverflowError):
             return None
         if of_frames.shape != (frames,) or not frames or not names:
@@ -166,8 +169,8 @@ class RigCameras:
         return cls(names, colors, of_frames)
 
 
-def finite(poses: Float64 | None) -> Float64:
-    """Return the poses that are there, (n, 4, 4)."""
+def finite_poses(poses: Float64 | None) -> Float64:
+    """Return the finite ones of poses, (n, 4, 4)."""
     if poses is None or len(poses) == 0:
         return np.zeros((0, 4, 4))
     return poses[np.isfinite(poses).all((1, 2))]
@@ -176,9 +179,19 @@ def finite(poses: Float64 | None) -> Float64:
 def make_scene(
     result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
 ) -> Scene:
-    """Gather and thin what is to be shown; `rows` gives the row of each frame index."""
+    """Collect and subsample the content of the 3D view.
+
+    Parameters
+    ----------
+    result
+        The result.
+    rows
+        Row of the trajectory, by frame index.
+    reference
+        (N, 4, 4) reference poses, NaN where there is none; or None.
+    """
     cloud = result.cloud
-    chosen = choose(len(cloud), MAX_POINTS)
+    chosen = random_subset(len(cloud), MAX_POINTS)
     points = cloud.points[chosen].astype(float) + cloud.offset
     good = np.isfinite(points).all(1)
     points, chosen = points[good], chosen[good]
@@ -194,18 +207,18 @@ def make_scene(
         None if cloud.normals is None else cloud.normals[chosen],
         len(cloud),
         spacing_of(points),
-        finite(result.diagnostics.sequential),
-        finite(result.trajectory),
-        finite(reference),
+        finite_poses(result.diagnostics.sequential),
+        finite_poses(result.trajectory),
+        finite_poses(reference),
         loops[np.isfinite(loops).all((1, 2))],
-        _seen(result.mesh),
+        _display_colors(result.mesh),
         None if cloud.sigma is None else cloud.sigma[chosen],
         None if cloud.views is None else cloud.views[chosen],
     )
 
 
 def packed(scene: Scene) -> dict[str, Any]:
-    """Return the scene for the viewer: plain data, arrays as `squeezed` packs them.
+    """Return the scene for the viewer: plain data, arrays as `pack` packs them.
 
     Where there is a surface its vertices are the points that are shown.
     """
@@ -225,8 +238,8 @@ def packed(scene: Scene) -> dict[str, Any]:
         "pitch": PITCH,
         "model": _packed_model(scene, steps_of(points, low, extent)) if len(points) else None,
         "lines": {
-            "reference": squeezed(path_lines(scene.reference).astype("<f4")),
-            "loops": squeezed(scene.loops.reshape(-1, 3).astype("<f4")),
+            "reference": pack(path_lines(scene.reference).astype("<f4")),
+            "loops": pack(scene.loops.reshape(-1, 3).astype("<f4")),
         },
     }
 
@@ -236,43 +249,50 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
     if mesh is None:
         normals, colors, faces = scene.normals, scene.colors, None
     else:
-        normals, faces = mesh.normals, squeezed(mesh.faces.astype("<u4"))
+        normals, faces = mesh.normals, pack(mesh.faces.astype("<u4"))
         own = mesh.color
         colors = height_colors(mesh.vertices.astype(float)) if own is None else own
     return {
-        "points": squeezed(steps),
-        "colors": squeezed(colors),
-        "normals": None if normals is None else squeezed(normal_bytes(normals)),
+        "points": pack(steps),
+        "colors": pack(colors),
+        "normals": None if normals is None else pack(normal_bytes(normals)),
         "faces": faces,
     }
 
 
-def _seen(mesh: Mesh | None) -> Mesh | None:
+def _display_colors(mesh: Mesh | None) -> Mesh | None:
     if mesh is None or mesh.color is None:
         return mesh
     return replace(mesh, color=seen_colors(mesh.color))
 
 
 def opening_yaw(scene: Scene) -> float:
-    """Return the yaw in rad from which most of the model is seen from its front.
+    """Return the yaw in rad that shows the largest front-facing area of the model.
 
-    Of eight around it, and `YAW` unless another one shows clearly more.
+    The best of eight directions, but `YAW` unless another one shows clearly more.
     """
     normals = scene.normals if scene.mesh is None else scene.mesh.normals
     if normals is None or not len(normals):
         return YAW
     sample = np.nan_to_num(normals[:: -(-len(normals) // _SAMPLED)].astype(float))
     yaws = YAW + np.arange(8) * np.pi / 4
-    towards = np.array([-images.turned(yaw, PITCH)[2] for yaw in yaws])
+    towards = np.array([-images.view_rotation(yaw, PITCH)[2] for yaw in yaws])
     seen = np.maximum(sample @ towards.T, 0).sum(0)
     best = int(seen.argmax())
     return float(yaws[best]) if seen[best] > _CLEARLY * seen[0] else YAW
 
 
 def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
-    """Return ends of lines (2 n, 3): every step-th camera as a pyramid, the path through all.
+    """Return ends of lines (2 n, 3): cameras as pyramids, and the trajectory.
 
-    The first camera is larger, as in the thesis.
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first camera is drawn larger, as in the thesis.
+    edge
+        Width of a pyramid, m.
+    step
+        Every n-th camera is drawn.
     """
     if len(poses) == 0:
         return np.zeros((0, 3))
@@ -292,7 +312,7 @@ def path_lines(poses: Float64) -> Float64:
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
 
-def still(
+def render(
     scene: Scene,
     size: tuple[int, int] = (960, 600),
     *,
@@ -302,13 +322,25 @@ def still(
     peel: bool = True,
     least: int = 1,
 ) -> UInt8:
-    """Draw the view that the report opens with, for where there is no WebGL: (H, W, 3).
+    """Render the initial 3D view as an image (H, W, 3), for browsers without WebGL.
 
-    `eye_at` is the place (3,) that is looked at, and from how far (m). To `peel` is to leave out
-    surfaces that are seen from behind. Points are at least `least` pixels wide.
+    Parameters
+    ----------
+    scene
+        The scene.
+    size
+        Width and height, pixels.
+    yaw, pitch
+        Viewing direction, rad.
+    eye_at
+        Point (3,) to look at, and the distance from it, m; by default the whole scene.
+    peel
+        Whether to leave out back faces.
+    least
+        Minimum size of a point, pixels.
     """
     center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
-    R = images.turned(yaw, pitch)
+    R = images.view_rotation(yaw, pitch)
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -R @ center
@@ -344,16 +376,16 @@ def still(
     return out
 
 
-def small(scene: Scene, size: tuple[int, int]) -> UInt8:
-    """Draw the view of `still` so that the model fills a small picture: (H, W, 3)."""
+def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
+    """Render the model so that it fills a small image (H, W, 3)."""
     if len(scene.points) == 0:
-        return still(scene, size)
+        return render(scene, size)
     framing = images.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
     R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
-    # From so far that what is nearest, and looks largest, fits as well.
+    # Far enough for the nearest points, which appear largest.
     depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
     distance = size[1] / (2 * np.tan(0.35) * framing.scale) + 0.5 * float(depth)
-    return still(scene, size, eye_at=(-R.T @ t, distance), least=2)
+    return render(scene, size, eye_at=(-R.T @ t, distance), least=2)
 
 
 def _sampled(lines: Float64, number: int = 24) -> Float64:
@@ -362,10 +394,15 @@ def _sampled(lines: Float64, number: int = 24) -> Float64:
     return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
 
 
-def outline(points: Float64, outer: float = 2.0) -> Float64:
-    """Return the outermost ones (K, 3) of points in many directions, but for outliers.
+def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
+    """Return the extreme points (K, 3) in many directions, without outliers.
 
-    Those are the `outer` percent at each end of each axis.
+    Parameters
+    ----------
+    points
+        (N, 3).
+    outer
+        Percentage of points at each end of each axis that count as outliers.
     """
     low, high = np.percentile(points, [outer, 100 - outer], axis=0)
     inside = points[((points >= low) & (points <= high)).all(1)]
@@ -377,8 +414,8 @@ def outline(points: Float64, outer: float = 2.0) -> Float64:
     return points[np.unique((points @ directions).argmax(0))]
 
 
-def choose(number: int, most: int) -> Intp:
-    """Choose `most` of the points at random, so that no even pattern of their order is left."""
+def random_subset(number: int, most: int) -> Intp:
+    """Return the indices of at most `most` points, chosen at random to avoid regular patterns."""
     if number <= most:
         return np.arange(number)
     return np.sort(np.random.default_rng([0, number]).permutation(number)[:most])
@@ -391,13 +428,13 @@ def _colors(cloud: Cloud, chosen: Intp, points: Float64) -> UInt8:
 
 
 def height_colors(points: Float64) -> UInt8:
-    """Colours (N, 3) by height, which is -y."""
+    """Return colours (N, 3) of points by height, which is -y."""
     low, high = height_range(points)
     return images.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
 
 
 def height_range(points: Float64) -> tuple[float, float]:
-    """Return the heights (-y) in m that bound the middle 96 % of the points."""
+    """Return the 2nd and 98th percentile of the heights (-y) of points, m."""
     if len(points) == 0:
         return 0.0, 1.0
     low, high = np.percentile(-points[:, 1], [2, 98])

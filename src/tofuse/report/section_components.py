@@ -1,4 +1,4 @@
-"""The components: stretches of the recording, and how they are connected."""
+"""The components of the recording, and how they are connected."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tofuse.results.folder import component_name
 from tofuse.results.ranges import numbers
 from tofuse.results.types import Component
 
-_COLORS = 6  # of the style sheet; further components begin again
+_COLORS = 6  # in the style sheet; further components reuse them
 
 _JOINED = {"links": "links between views", "motion": "extrapolated motion only"}
 
@@ -19,7 +19,7 @@ def color(component: int) -> int:
 
 
 def components(s: Subject) -> Values:
-    """Return the table of components; empty where there is no more than one."""
+    """Return the table of components; empty if there is only one."""
     found = s.result.components
     apart = sum(not c.connected for c in found)
     if len(found) < 2:

@@ -1,4 +1,4 @@
-"""What became of each frame, and of each candidate for a loop."""
+"""The outcome of each frame, and of each candidate for a loop closure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STRIP = 600  # cells in the strip of frames
 
 
 def frames(s: Subject) -> Values:
-    """Return the strip of frames, the plots of their health and the table of problems."""
+    """Return the strip of frames, the plots of registration quality and the table of problems."""
     records = s.result.diagnostics.frames
     out: Values = {
         "lanes": list(words.STATUSES),
@@ -30,7 +30,7 @@ def frames(s: Subject) -> Values:
     components = s.result.components
     if len(components) > 1:
         out["lanes"].append("component")
-    # With more frames than cells, a cell stands for several and shows the worst of them.
+    # With more frames than cells, a cell represents several and shows the worst of them.
     size = -(-len(records) // _STRIP)
     for start in range(0, len(records), size):
         group = records[start : start + size]
@@ -40,7 +40,7 @@ def frames(s: Subject) -> Values:
             {
                 "status": worst.status,
                 "lane": lane,
-                "title": told(worst, components),
+                "title": frame_text(worst, components),
                 "index": worst.index,
                 "color": None
                 if worst.component is None or len(components) < 2
@@ -84,8 +84,8 @@ def frames(s: Subject) -> Values:
     return out
 
 
-def told(record: FrameRecord, components: Sequence[Component] = ()) -> str:
-    """Say what became of a frame; of components only where there are several."""
+def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str:
+    """Return the outcome of a frame as text, with its component if there are several."""
     parts = [f"Frame {record.index}: {record.status}"]
     if record.reason:
         parts[0] += f" – {record.reason}"
@@ -102,7 +102,7 @@ def told(record: FrameRecord, components: Sequence[Component] = ()) -> str:
 
 
 def loops(s: Subject) -> Values:
-    """Return the table of loops."""
+    """Return the table of candidates for loop closures."""
     loops = sorted(s.result.diagnostics.loops, key=lambda p: (not p.accepted, p.i, p.j))
     accepted = sum(p.accepted for p in loops)
     rows = [

@@ -8,12 +8,12 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.report import cameras, images, plots, words
 from tofuse.report.fields import fields
-from tofuse.report.scene import Scene, opening_yaw, packed, still
+from tofuse.report.scene import Scene, opening_yaw, packed, render
 from tofuse.report.subject import OUTER, Figure, Subject, Values
 
 
 def model(s: Subject) -> Values:
-    """Return the data of the 3D view and its still."""
+    """Return the data of the 3D view, and a rendered image of it."""
     scene = s.scene
     if len(scene.points) == 0 and len(scene.after) == 0:
         return {
@@ -24,7 +24,7 @@ def model(s: Subject) -> Values:
             "rig": [],
             "thinned": "",
         }
-    laid = scene.turned(s.straight)
+    laid = scene.view_rotation(s.straight)
     by = (
         {field.name: field for field in fields(laid, cameras.position_errors(s))}
         if len(scene.points)
@@ -37,7 +37,7 @@ def model(s: Subject) -> Values:
     }
     return {
         "scene": data,
-        "still": images.data_uri(still(laid, yaw=opening_yaw(laid))),
+        "still": images.data_uri(render(laid, yaw=opening_yaw(laid))),
         "toggles": _toggles(scene),
         "rig": _rig(s),
         "colorings": ([("", own)] if own else [])
@@ -47,7 +47,7 @@ def model(s: Subject) -> Values:
 
 
 def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
-    """Name, text, colour and state of the switches below the view."""
+    """Name, label, colour and initial state of the switches below the view."""
     out = []
     if scene.mesh is not None:
         out.append(("mesh", "Surface", "", True))
@@ -67,7 +67,7 @@ def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
 
 def _rig(s: Subject) -> list[tuple[str, str]]:
     """Name and colour of each camera of a rig."""
-    rig = cameras.rig_of(s)
+    rig = cameras.rig_cameras(s)
     if rig is None:
         return []
     return [
@@ -77,7 +77,7 @@ def _rig(s: Subject) -> list[tuple[str, str]]:
 
 
 def _own_colors(s: Subject) -> str:
-    """What the model's own colours are: of images, or of the amplitude; empty without any."""
+    """The origin of the model's own colours: colour images or amplitude; empty without any."""
     mesh = s.scene.mesh
     color = s.result.cloud.color if mesh is None else mesh.color
     if color is None or not len(color):
@@ -151,4 +151,4 @@ def _turn_note(R: Float64) -> str:
     text = "Axes: right, down and forward of the first camera"
     if angle < 0.5:
         return text + "."
-    return f"{text}, rotated by {angle:.0f}° so that the model is upright and lies straight."
+    return f"{text}, rotated by {angle:.0f}° so that the model is upright and axis-aligned."

@@ -1,4 +1,4 @@
-"""The rig that recorded: where its cameras are, and how far their surfaces are apart."""
+"""The rig: poses of its cameras, and distances between their overlapping surfaces."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tofuse.recordings.rig import RigCamera
 from tofuse.report import plots, words
 from tofuse.report.subject import ROWS, Subject, Values
 
-_SAID = 10  # pairs of cameras in the picture
+_MAX_PAIRS = 10  # in the picture
 
 
 def rig(s: Subject) -> Values:
-    """Return the picture and the tables of the rig; empty where one camera recorded."""
+    """Return the picture and the tables of the rig; empty for a single camera."""
     found = s.extras.rig
     if found is None:
         return {"rig_views": [], "rig_cameras": [], "rig_pairs": [], "rig_unplaced": []}
@@ -24,13 +24,13 @@ def rig(s: Subject) -> Values:
         (names.index(d.a), names.index(d.b), f"{1000 * d.median_m:.1f} mm")
         for d in found.disagreement
     ]
-    # Of many cameras the table is easier to read.
-    said = apart if len(apart) <= _SAID else []
+    # For many cameras the table is easier to read.
+    labelled = apart if len(apart) <= _MAX_PAIRS else []
     views = [
         {
-            "svg": plots.rig(poses, names, "above", label="The rig from above", pairs=said),
+            "svg": plots.rig(poses, names, "above", label="The rig from above", pairs=labelled),
             "caption": "From above, the first camera looks up."
-            + (" Broken lines: how far surfaces that two cameras see are apart." if said else ""),
+            + (" Dashed lines: distance between overlapping surfaces." if labelled else ""),
         },
         {
             "svg": plots.rig(poses, names, "side", label="The rig from the side"),
@@ -49,9 +49,9 @@ def rig(s: Subject) -> Values:
 
 
 def upright(T_rig_camera: Float64) -> Float64:
-    """Poses (K, 4, 4) turned so that what is down for all cameras together is down.
+    """Return poses (K, 4, 4) rotated so that the mean down direction of all cameras is down.
 
-    The cameras of a ring look down from all sides: the first one alone would show it slanted.
+    The cameras of a ring look down from all sides: relative to one of them it would be slanted.
     """
     down = T_rig_camera[:, :3, 1].sum(0)
     length = float(np.linalg.norm(down))

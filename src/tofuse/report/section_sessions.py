@@ -10,7 +10,7 @@ from tofuse.results.types import SessionChange, SessionPair
 
 
 def sessions(s: Subject) -> Values:
-    """Return the tables of sessions and of pairs of them; empty where there is one recording."""
+    """Return the tables of sessions and of pairs of them; empty for a single recording."""
     records, pairs = s.result.sessions, s.result.session_pairs
     if not records:
         return {
@@ -38,10 +38,10 @@ def sessions(s: Subject) -> Values:
     if apart:
         text += (
             f"For {apart:,} of them no overlap with the first one could be confirmed: "
-            f"{'it stays' if apart == 1 else 'they stay'} apart."
+            f"{'it is' if apart == 1 else 'they are'} not joined."
         )
     else:
-        text += "All of them are in this map, in the world of the first."
+        text += "All of them are in this map, in the world frame of the first."
     names = [session.name for session in records]
     told = [_pair(pair, names) for pair in pairs]
     changes = [_change(change, names) for change in s.result.changes[:ROWS]]
@@ -70,7 +70,7 @@ def _pair(pair: SessionPair, names: list[str]) -> Values:
     joined = "no"
     if pair.joined:
         joined = "before" if pair.before else "yes"
-        joined += "" if pair.links or pair.overlap else ", by way of others"
+        joined += "" if pair.links or pair.overlap else ", through others"
     return {
         "names": f"{names[pair.a]}, {names[pair.b]}",
         "joined": joined,

@@ -1,4 +1,4 @@
-"""The recording's views: what filters removed from one, and samples of all."""
+"""The views of the recording: the effect of the filters on one, and samples of all."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import base64
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import images, words
 from tofuse.report.pictures import FATES, KINDS, depth_range
-from tofuse.report.section_frames import told
+from tofuse.report.section_frames import frame_text
 from tofuse.report.subject import Subject, Values
 
 _THUMBNAIL, _FILTER = 220, 320  # px
 
 
 def filters(s: Subject) -> Values:
-    """Return one frame after each filter (figure 3.2), and the shares removed."""
+    """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    here: dict[str, tuple[int, int]] = {}  # points removed and seen; a name may come twice
+    here: dict[str, tuple[int, int]] = {}  # points removed and seen; a filter may be used twice
     shown = []
     if steps:
         raw = steps[0][1]
@@ -48,15 +48,15 @@ def filters(s: Subject) -> Values:
     if steps:
         low, high = images.depth_limits(steps[0][1])
         note = (
-            f"Frame {steps[0][1].index} after each filter in turn; colours from dark (near, "
+            f"Frame {steps[0][1].index} after each filter; colours from dark (near, "
             f"{words.length(low)}) to bright (far, {words.length(high)})."
         )
         if isinstance(steps[0][1], RangeFrame):
             note += (
-                " In the images grey has no measurement and pink was removed by this filter; "
-                "below, the points seen from above and to the side."
+                " Grey pixels have no measurement, pink ones were removed by this filter. Below: "
+                "the points from above and to the side."
             )
-    # What corrects removes nothing.
+    # Corrections remove nothing.
     names = [*removed, *(n for n in here if n not in removed and here[n][0])]
     rows = []
     for name in names:
@@ -67,7 +67,7 @@ def filters(s: Subject) -> Values:
 
 
 def clouds(s: Subject) -> Values:
-    """Return samples of the recording, where its views are clouds."""
+    """Return samples of the recording, if its views are clouds."""
     frames = s.extras.clouds
     every = [images.depth_limits(f) for f in frames if len(f)]
     limits = (0.0, 1.0)
@@ -95,7 +95,7 @@ _TITLES = {
 
 
 def player(s: Subject) -> Values:
-    """Return the images of frames, what is said of each, and where each was taken."""
+    """Return the images of frames, with the status of each."""
     shown = s.extras.pictures
     if not shown:
         return {"player": None, "player_kinds": [], "player_note": "", "fates": []}
@@ -109,7 +109,7 @@ def player(s: Subject) -> Values:
         "player": {
             "index": [p.index for p in shown],
             "told": [
-                told(records[p.index], s.result.components) if p.index in records else ""
+                frame_text(records[p.index], s.result.components) if p.index in records else ""
                 for p in shown
             ],
             "status": [records[p.index].status if p.index in records else "" for p in shown],

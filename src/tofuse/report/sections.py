@@ -1,4 +1,4 @@
-"""What goes into each section of the report, as plain values for the template."""
+"""The content of all sections of the report, as plain values for the template."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tofuse.report import (
     section_components,
     section_frames,
     section_model,
-    section_path,
     section_rig,
     section_sessions,
+    section_trajectory,
     section_views,
     words,
 )
@@ -36,11 +36,11 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         section_rig.rig,
         section_components.components,
         section_model.views,
-        section_path.cameras,
-        section_path.error,
-        section_path.uncertainty,
-        section_path.optimised,
-        section_path.objective,
+        section_trajectory.cameras,
+        section_trajectory.error,
+        section_trajectory.uncertainty,
+        section_trajectory.optimised,
+        section_trajectory.objective,
         section_views.filters,
         section_frames.frames,
         section_frames.loops,
@@ -49,9 +49,9 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         _timings,
         _settings,
     )
-    # To thin the surface takes as long as to draw all plots, and leaves the interpreter to these.
-    with job_pool(1, "tofuse-report") as beside:
-        model = beside.submit(section_model.model, subject)
+    # Simplifying the surface takes as long as all plots, and releases the interpreter lock.
+    with job_pool(1, "tofuse-report") as background:
+        model = background.submit(section_model.model, subject)
         for part in parts:
             out.update(part(subject))
         out.update(model.result())
@@ -118,7 +118,7 @@ def _verdict(s: Subject) -> Values:
 
 
 def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
-    """Name, value and ranges of frames of each line of the accuracy card."""
+    """Name, value and frame ranges of each line of the accuracy card."""
     d = result.diagnostics
     readable = sum(f.status != "skipped" for f in d.frames)
     closed = sum(p.accepted for p in d.loops)
@@ -156,7 +156,7 @@ def _timings(s: Subject) -> Values:
         (name, words.seconds(value), f"{100 * value / total if total else 0:.1f}")
         for name, value in taken.items()
     ]
-    each = f"{words.seconds(total / frames)} a frame" if frames else ""
+    each = f"{words.seconds(total / frames)} per frame" if frames else ""
     return {"timings": rows, "total_time": words.seconds(total), "per_frame": each}
 
 

@@ -1,4 +1,4 @@
-"""What the sections of a report are made from, and what they are made of."""
+"""The input of the sections of a report, and the elements that they consist of."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.report import straight
+from tofuse.report import display_axes
 from tofuse.report.extras import ReportExtras
-from tofuse.report.scene import Scene, finite, make_scene
+from tofuse.report.scene import Scene, finite_poses, make_scene
 from tofuse.results.types import Reconstruction
 
 Values = dict[str, Any]
 
-OUTER = 0.25  # percent of the points at each end that do not count for the measured size
-ROWS = 150  # in a table
+OUTER = 0.25  # percent of the points at each end that the measured size excludes
+ROWS = 150  # maximum in a table
 
 
 @dataclass(frozen=True)
 class Figure:
-    """An inline SVG and what is said below it."""
+    """An inline SVG and its caption."""
 
     svg: str
     caption: str = ""
@@ -29,7 +29,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The result with what several sections need of it.
+    """The result, with data that several sections need.
 
     Attributes
     ----------
@@ -40,8 +40,8 @@ class Subject:
     points, truth
         (N, 3) and (K, 3) finite points of the model and of the true surfaces, world frame.
     straight
-        (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright as
-        `Reconstruction.T_up_world` says, and turned so that the model lies straight.
+        (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright by
+        `Reconstruction.T_up_world`, and rotated so that the model is aligned with them.
     """
 
     result: Reconstruction
@@ -56,13 +56,13 @@ class Subject:
 
     @classmethod
     def of(cls, result: Reconstruction, extras: ReportExtras) -> Subject:
-        """Gather it; a reference of another length or without any pose in common is left out."""
+        """Prepare a result; a reference without any pose in common is ignored."""
         index = _row_indices(result)
         rows = {int(k): row for row, k in enumerate(index)}
         reference = extras.reference
         if reference is not None and (
             reference.shape != result.trajectory.shape
-            or len(finite(reference[result.has_pose])) == 0
+            or len(finite_poses(reference[result.has_pose])) == 0
         ):
             reference = None
         scene = make_scene(result, rows, reference)
@@ -73,7 +73,11 @@ class Subject:
         true = truth.astype(float) if truth is not None and len(truth) else None
         up = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
         shown = points @ up.T if true is None else true @ up.T
-        turn = straight.upright(shown, OUTER) if true is None else straight.boxed(shown)
+        turn = (
+            display_axes.upright_axes(shown, OUTER)
+            if true is None
+            else display_axes.box_axes(shown)
+        )
         return cls(result, extras, index, rows, reference, scene, points, true, turn @ up)
 
 

@@ -1,4 +1,4 @@
-"""Numbers and findings in words: lengths, ranges of frames, the verdict in a sentence."""
+"""Numbers and reasons as text: lengths, ranges of frames, the verdict in a sentence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATUSES = ("tracked", "predicted", "lost", "skipped")
 
 
 def length(metres: float | None) -> str:
-    """Write a length for a person: mm below 10 cm, else m."""
+    """Return a length as text: mm below 10 cm, else m."""
     if metres is None or not np.isfinite(metres):
         return "–"
     if abs(metres) < 0.1:
@@ -26,39 +26,39 @@ def length(metres: float | None) -> str:
 
 
 def signed_length(metres: float) -> str:
-    """Write a difference of lengths with its sign."""
+    """Return a difference of lengths as text, with its sign."""
     return ("+" if metres >= 0 else "−") + length(abs(metres))
 
 
 def share(value: float | None) -> str:
-    """Write a share of 1 in percent."""
+    """Return a fraction as text, in percent."""
     if value is None or not np.isfinite(value):
         return "–"
     return f"{100 * value:.1f} %"
 
 
 def seconds(value: float) -> str:
-    """Write a duration."""
+    """Return a duration as text."""
     if value < 1:
         return f"{1000 * value:.0f} ms"
     return f"{value:.1f} s" if value < 120 else f"{int(value) // 60} min {int(value) % 60:02d} s"
 
 
 def count(number: int, noun: str) -> str:
-    """Write a number of things: "1 frame", "12,000 points"."""
+    """Return a number of things as text: "1 frame", "12,000 points"."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
 
 
 def frame_range(first: int, last: int) -> str:
-    """Write "frame 3" or "frames 3–17"."""
+    """Return "frame 3" or "frames 3–17"."""
     return f"frame {first}" if first == last else f"frames {first}–{last}"
 
 
 def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str, str]]:
-    """Join neighbouring (index, status, reason) that say the same.
+    """Merge consecutive (index, status, reason) with the same status and reason.
 
-    Returns (first index, last index, how many, status, reason). A recording read with a stride
-    has gaps in its indices; neighbours in the list count as neighbours.
+    Returns (first index, last index, count, status, reason). Items that follow each other count as
+    consecutive even if their indices have gaps, as in a recording read with a stride.
     """
     out: list[tuple[int, int, int, str, str]] = []
     for position, status, reason in items:
@@ -79,13 +79,13 @@ class Finding:
     level
         "failed", "degraded" or "note".
     text
-        What was found, with its frames where that tells more.
+        What was found, with its frames where that adds information.
     ranges
         The frames.
     advice
-        What a person can do; may be empty.
+        What the user can do; may be empty.
     where
-        The frames in words; empty where they are all of them.
+        The frames as text; empty if they are all frames.
     """
 
     level: str
@@ -97,9 +97,14 @@ class Finding:
 
 
 def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
-    """Return the reasons for a person, the gravest first.
+    """Return the reasons as the report shows them, the most severe first.
 
-    `total` is the number of frames: what concerns most of them is said without their numbers.
+    Parameters
+    ----------
+    reasons
+        The reasons.
+    total
+        Number of frames: reasons that concern most of them don't list them.
     """
     out = []
     for reason in ranked(reasons):
@@ -112,7 +117,7 @@ def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
 
 
 def _placed(reason: Reason, total: int) -> str:
-    """Add a reason's frames to its text, unless it names them or they are most of all."""
+    """Add a reason's frames to its text, unless it names them or they are the majority."""
     text = sentence(reason.text)
     first, last = reason.frames
     named = {str(first), str(last)} <= set(re.findall(r"\d+", text))
@@ -122,7 +127,7 @@ def _placed(reason: Reason, total: int) -> str:
 
 
 def sentence(text: str) -> str:
-    """End a text with a full stop and begin it with a capital."""
+    """Return a text with a capital at its beginning and a full stop at its end."""
     text = text.strip()
     first = text.split(maxsplit=1)[:1]
     if first and first[0].isalpha():  # a path or a number stays as it is
@@ -131,7 +136,7 @@ def sentence(text: str) -> str:
 
 
 def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
-    """Say in a sentence or two how far the result can be trusted."""
+    """Return the verdict in a sentence or two."""
     d = result.diagnostics
     readable = sum(f.status != "skipped" for f in d.frames)
     placed = int(result.has_pose.sum())

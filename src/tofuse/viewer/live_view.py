@@ -12,7 +12,7 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.report.fields import OF_95_PERCENT
-from tofuse.report.images import data_uri, depth_image, depth_limits, shrink, viridis
+from tofuse.report.images import data_uri, depth_image, depth_limits, subsample, viridis
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
 from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz
@@ -205,7 +205,7 @@ class LiveView:
             drawn = frame.color_image
             if drawn is None:
                 drawn = depth_image(frame, depth_limits(frame), None)
-            image = shrink(drawn, _WIDTH)
+            image = subsample(drawn, _WIDTH)
             source = data_uri(image, jpeg=True)
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.lab.experiments.peaks import AXES, PeaksRun, PeaksSweep
 from tofuse.report import plots
-from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, framed, svg
+from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, make_figure, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,7 @@ def plan(
     extent = box[1] - box[0]
     inner = width - 62.0
     height = float(np.clip(inner * extent[1] / extent[0], 120, 1.15 * inner))
-    figure, axes = framed(width, height + 62, _MARGINS)
+    figure, axes = make_figure(width, height + 62, _MARGINS)
     scale = max(extent[0] / inner, extent[1] / height)
     middle = box.mean(0)
     x0, x1 = middle[0] - scale * inner / 2, middle[0] + scale * inner / 2
@@ -155,7 +155,7 @@ def sweep(found: PeaksSweep) -> list[str]:
     """Draw figure 5.12: error of each parameter over the noise, with the spread of the seeds."""
     drawn = []
     for k, name in enumerate(AXES):
-        figure, axes = framed(330, 220, _MARGINS)
+        figure, axes = make_figure(330, 220, _MARGINS)
         unit, factor = ("m", 1.0) if k < 3 else ("°", 180 / np.pi)
         for which, color in ((0, BEFORE), (1, AFTER)):
             mean = factor * found.axes[:, which, k]
@@ -190,7 +190,7 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         points = np.concatenate(
             [c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)]
         )
-        figure, axes = framed(400, 400 * 0.95, _MARGINS)
+        figure, axes = make_figure(400, 400 * 0.95, _MARGINS)
         some = points[:: max(1, len(points) // 3000)]
         axes.plot(
             some[:, 0], some[:, 2], ".", color=MUTED, markersize=1.2, alpha=0.5, rasterized=True

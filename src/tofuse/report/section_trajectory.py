@@ -1,4 +1,4 @@
-"""The path: cameras before and after, error per axis, and the optimiser's objective."""
+"""The trajectory: cameras before and after optimisation, error per axis, and the objective."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def error(s: Subject) -> Values:
         "both starting at the identity, without further alignment."
         if compared
         else "There is no reference for this recording, so this is the displacement relative to "
-        "the first camera: where the camera truly came back, what is left is error."
+        "the first camera: where the camera returned to its start, it is the error."
     )
     legend = [("before", "6 3", "before optimisation"), ("after", "", "after optimisation")]
     if len(bad):
@@ -154,7 +154,7 @@ def _error_rows(names: list[str], offsets: list[Float64], compared: bool) -> lis
 
 
 def uncertainty(s: Subject) -> Values:
-    """Return how well each final pose is held, one sigma in the worst direction, over frames."""
+    """Return plots of the pose uncertainty over frames: one sigma in the worst direction."""
     C = np.full((len(s.index), 6, 6), np.nan)
     for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
         if record.covariance is not None:
@@ -182,7 +182,7 @@ def uncertainty(s: Subject) -> Values:
 
 
 def optimised(s: Subject) -> Values:
-    """Return what the optimiser and the refinement made of the path, in words."""
+    """Return the outcome of the optimiser and of the refinement as text."""
     d = s.result.diagnostics
     out = []
     if len(d.parts) > 1:
@@ -211,18 +211,18 @@ def optimised(s: Subject) -> Values:
 
 
 def _camera_check(r: Refinement | None) -> str:
-    """What the views say of their camera, in words."""
+    """The check of the camera's calibration as text."""
     if r is None or not r.views:
         return ""
     out = ""
     if r.errors:
-        told = [
+        errors_text = [
             f"{name} {words.signed_length(value)}"
             if name == "offset"
             else f"{name} {100 * value:+.1f} %".replace("-", "−")
             for name, value in r.errors.items()
         ]
-        out = f"Errors of the camera were estimated with them: {', '.join(told)}. "
+        out = f"Calibration errors were estimated jointly: {', '.join(errors_text)}. "
     s = r.calibration_check
     if s is None:
         return out.strip()
@@ -236,14 +236,14 @@ def _camera_check(r: Refinement | None) -> str:
         gap, (m, rad), (m_after, rad_after) = s.gap, s.gap.before, s.gap.after
         out += (
             f"Odometry drift over loop {gap.i}–{gap.j} is {words.length(m)}, "
-            f"{np.degrees(rad):.1f}°; with the camera corrected so, {words.length(m_after)}, "
+            f"{np.degrees(rad):.1f}°; with this correction {words.length(m_after)}, "
             f"{np.degrees(rad_after):.1f}°."
         )
     return out.strip()
 
 
 def objective(s: Subject) -> Values:
-    """Return the objective over iterations (figure 5.3)."""
+    """Return the plot of the objective over iterations (figure 5.3)."""
     values = np.array(s.result.diagnostics.objective, float)
     if not np.isfinite(values).any():
         return {"objective": None, "objective_text": ""}

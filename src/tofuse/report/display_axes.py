@@ -13,7 +13,7 @@ _BOXED = 0.9  # of a box is filled by the hull of points that have its shape
 _MOST = 5000  # points or faces that are tried
 
 
-def upright(points: Float64, outer: float) -> Float64:
+def upright_axes(points: Float64, outer: float) -> Float64:
     """Find the turn about the vertical for which the model's rectangle from above is smallest.
 
     Parameters
@@ -36,18 +36,18 @@ def upright(points: Float64, outer: float) -> Float64:
     return _nearest_axes(axes[int(extents.prod(1).argmin())])
 
 
-def boxed(points: Float64) -> Float64:
-    """Find the axes of the smallest box around exact points, one side of it on a hull face.
+def box_axes(points: Float64) -> Float64:
+    """Return the axes of the smallest box around exact points, with one side on a hull face.
 
-    Arguments and result are as in `upright`, but any direction may be vertical, if the points have
-    the shape of a box: of others, and of points in one plane, only turns about y are tried.
+    Like `upright_axes`, but any direction may be vertical if the points have the shape of a box;
+    otherwise, and for coplanar points, only rotations about y are tried.
     """
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return upright(points, 0.0)
+        return upright_axes(points, 0.0)
     corners = points[hull.vertices]
     faces = np.unique(np.round(np.abs(hull.equations[:, :3]), 2), axis=0, return_index=True)[1]
     best, least = np.eye(3), np.inf
@@ -55,16 +55,16 @@ def boxed(points: Float64) -> Float64:
         axes = _turned(hull.equations[face, :3])
         volumes = np.ptp(axes @ corners.T, axis=2).prod(1)
         k = int(volumes.argmin())
-        # A box that is hardly smaller is no reason to turn away from an earlier one.
+        # Earlier boxes are preferred to ones that are hardly smaller.
         if volumes[k] < (1 - 1e-6) * least:
             best, least = axes[k], float(volumes[k])
     if hull.volume < _BOXED * least:
-        return upright(points, 0.0)
+        return upright_axes(points, 0.0)
     return _nearest_axes(best)
 
 
 def _turned(vertical: Float64) -> Float64:
-    """Return (A, 3, 3) axes with the second along `vertical`, turned about it."""
+    """Return (A, 3, 3) axes with the second along `vertical`, rotated about it."""
     vertical = vertical / np.linalg.norm(vertical)
     helper = np.eye(3)[int(np.abs(vertical).argmin())]
     first = np.cross(helper, vertical)
@@ -77,7 +77,7 @@ def _turned(vertical: Float64) -> Float64:
 
 
 def _nearest_axes(axes: Float64) -> Float64:
-    """Reorder and flip rows so that they are right-handed and nearest to x, y and z."""
+    """Reorder and flip rows so that they are right-handed and closest to x, y and z."""
     best, closest = np.eye(3), -np.inf
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
