@@ -803,7 +803,7 @@ def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
     words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert "1 edge does not fit the others" in told
+    assert "1 edge inconsistent with the others" in told
     assert re.search(r"part from vertex 0: 5 poses, 8 edges", told)
     assert re.search(r"part from vertex 9: 1 poses, 0 edges", told)
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)

@@ -201,7 +201,7 @@ def test_a_recording_that_is_gone_is_named_with_a_remedy(results, tmp_path) -> N
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
     changed_run_json(again, input=run["input"])
-    refused([results["here"], again], str(tmp_path / "was-here"), "gone", "put it back there")
+    refused([results["here"], again], str(tmp_path / "was-here"), "gone", "put it back")
 
 
 def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
@@ -209,7 +209,9 @@ def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
     run = json.loads((again / "run.json").read_text())
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
     changed_run_json(again, frames=frames)
-    refused([results["here"], again], "frames that", "by now", "run `tofuse run` again")
+    refused(
+        [results["here"], again], "does not match the frames", "by now", "run `tofuse run` again"
+    )
 
 
 def test_results_of_clouds_are_refused(results, tmp_path) -> None:
@@ -286,7 +288,7 @@ def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -
     assert (into / "run.json").read_bytes() == before
     assert "is not joined" in capsys.readouterr().out
     assert main([*words[:-1], str(tmp_path / "new")]) == 2
-    assert "--out as well" in capsys.readouterr().err
+    assert "same folder as --out" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
 
 
