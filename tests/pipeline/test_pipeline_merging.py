@@ -201,7 +201,7 @@ def test_a_recording_that_is_gone_is_named_with_a_remedy(results, tmp_path) -> N
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
     changed_run_json(again, input=run["input"])
-    refused([results["here"], again], str(tmp_path / "was-here"), "gone", "put it back")
+    refused([results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back")
 
 
 def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:

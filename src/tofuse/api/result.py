@@ -95,15 +95,13 @@ class Result(Reconstruction):
 
     def _write_report(self, result: Reconstruction, folder: Path) -> None:
         from tofuse.report.extras import ReportExtras
-        from tofuse.report.html import write_report
-        from tofuse.viewer.view_file import NAME, write_view_file
+        from tofuse.viewer.view_file import write_report_and_view
 
         if self.source is not None:
             write_report_files(self.source, self._configuration(self.source), result, folder)
             return
         title = Path(str(result.recording["path"])).name
-        write_report(result, folder / "report.html", ReportExtras(title))
-        write_view_file(result, (), folder / NAME)
+        write_report_and_view(result, folder, ReportExtras(title))
 
     def _configuration(self, source: Recording) -> Config:
         method = self.config["method"]

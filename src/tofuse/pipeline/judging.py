@@ -291,17 +291,12 @@ def judge_files(
 def _write(found: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder) -> None:
     """Write the refined result, with the judgement beside it and at the top of its report."""
     from tofuse.report.extras import ReportExtras
-    from tofuse.report.html import write_report
-    from tofuse.report.pictures import draw
-    from tofuse.viewer.view_file import NAME, write_view_file
+    from tofuse.viewer.view_file import write_report_and_view
 
     def report(result: Reconstruction, here: Path) -> None:
-        pictures = draw(result.diagnostics.samples)
         headline = sentence(found, trajectory.name) if result is found.refined else ""
         title = f"{trajectory.name} on {Path(recording.path).name}"
-        extras = ReportExtras(title=title, headline=headline, pictures=pictures)
-        write_report(result, here / "report.html", extras)
-        write_view_file(result, pictures, here / NAME)
+        write_report_and_view(result, here, ReportExtras(title=title, headline=headline))
         if result is found.refined:
             text = json.dumps(plain(found.to_dict()), indent=1, allow_nan=False)
             (here / "judge.json").write_text(text + "\n", encoding="utf-8")

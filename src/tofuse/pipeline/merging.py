@@ -326,16 +326,11 @@ def _merge_into(
 
 def _report(result: Reconstruction, folder: Path) -> None:
     from tofuse.report.extras import ReportExtras
-    from tofuse.report.html import write_report
-    from tofuse.report.pictures import draw
-    from tofuse.viewer.view_file import NAME, write_view_file
+    from tofuse.viewer.view_file import write_report_and_view
 
-    pictures = draw(result.diagnostics.samples)
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
         headline=" ".join(session_sentences(result)),
-        pictures=pictures,
     )
-    write_report(result, folder / "report.html", extras)
-    write_view_file(result, pictures, folder / NAME)
+    write_report_and_view(result, folder, extras)

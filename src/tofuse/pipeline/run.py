@@ -388,9 +388,7 @@ def write_report_files(
 ) -> None:
     """Write `report.html` and the data of the viewer into a folder."""
     from tofuse.report.extras import ReportExtras
-    from tofuse.report.html import write_report
-    from tofuse.report.pictures import draw
-    from tofuse.viewer.view_file import NAME, write_view_file
+    from tofuse.viewer.view_file import write_report_and_view
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)
@@ -399,19 +397,16 @@ def write_report_files(
         title += f", component {component}"
         truth = None  # its pose relative to this component is unknown
         recording = _frames_of(recording, result)
-    pictures = draw(result.diagnostics.samples)
-    clouds = () if pictures else recording.sample(_DRAWN_CLOUDS)
+    clouds = () if result.diagnostics.samples else recording.sample(_DRAWN_CLOUDS)
     extras = ReportExtras(
         title=title,
         headline=device_sentence(recording, result) if component is None else "",
         filter_steps=_filter_steps(_final_config(config, result), recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth,
-        pictures=pictures,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
     )
-    write_report(result, folder / "report.html", extras)
-    write_view_file(result, pictures, folder / NAME)
+    write_report_and_view(result, folder, extras)
 
 
 def _frames_of(recording: Recording, result: Reconstruction) -> Recording:

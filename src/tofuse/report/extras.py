@@ -26,7 +26,7 @@ class ReportExtras:
     truth_points
         (K, 3) points in m on the true surfaces, in the world frame; None if not known.
     pictures
-        Images of the result's samples of frames, in their order.
+        Images of the result's samples of frames, in their order (`viewer.view_file` adds them).
     clouds
         About a dozen evenly spaced, unfiltered views, if views are clouds.
     headline

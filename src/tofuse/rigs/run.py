@@ -262,18 +262,13 @@ def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
 
 def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None:
     from tofuse.report.extras import ReportExtras
-    from tofuse.report.html import write_report
-    from tofuse.report.pictures import draw
-    from tofuse.viewer.view_file import NAME, write_view_file
+    from tofuse.viewer.view_file import write_report_and_view
 
     def report(result: Reconstruction, here: Path) -> None:
-        pictures = draw(result.diagnostics.samples)
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        extras = ReportExtras(title=f"rig of {cameras}", pictures=pictures, rig=found.rig)
-        write_report(result, here / "report.html", extras)
-        write_view_file(result, pictures, here / NAME)
+        write_report_and_view(result, here, ReportExtras(f"rig of {cameras}", rig=found.rig))
         if result is found.result:
             known = np.isfinite(found.poses[:, 0, 0])
             write_tum(here / TRAJECTORY, found.times[known], found.poses[known])

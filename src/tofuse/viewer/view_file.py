@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
-from tofuse.report.pictures import KINDS, Pictures
+from tofuse.report.extras import ReportExtras
+from tofuse.report.html import write_report
+from tofuse.report.pictures import KINDS, Pictures, draw
 from tofuse.results.types import Reconstruction
 
 NAME = "view.npz"
@@ -38,6 +40,28 @@ class ViewFile:
     points: Float32
     color: UInt8
     pictures: tuple[Pictures, ...]
+
+
+def write_report_and_view(result: Reconstruction, folder: Path, extras: ReportExtras) -> None:
+    """Write `report.html` and `view.npz` of a result.
+
+    Parameters
+    ----------
+    result
+        The result.
+    folder
+        Where to.
+    extras
+        Further content of the report; the images of the result's samples are added to it.
+
+    Raises
+    ------
+    OutputError, OSError
+        If a file can't be written.
+    """
+    pictures = draw(result.diagnostics.samples)
+    write_report(result, folder / "report.html", replace(extras, pictures=pictures))
+    write_view_file(result, pictures, folder / NAME)
 
 
 def write_view_file(result: Reconstruction, pictures: Sequence[Pictures], path: Path) -> None:
