@@ -290,7 +290,7 @@ def test_memory_is_a_resource_of_dask(monkeypatch) -> None:
     monkeypatch.setattr(workers, "_workers", lambda: there)
     small, large = (replace(JOBS[0], memory=memory) for memory in (100, 201))
     workers.check(small)
-    with pytest.raises(InputError, match="of the 2 workers none declares more than 200"):
+    with pytest.raises(InputError, match="none of the 2 workers declares more than 200"):
         workers.check(large)
     at_a_time = {}
     for job in (JOBS[0], small, large):

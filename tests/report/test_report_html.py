@@ -245,7 +245,7 @@ def test_reasons_of_one_kind_are_said_together(tmp_path):
     reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
     text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
     said = " ".join(text.sections["verdict"].split())
-    assert said.count("Distances across the loop may be stretched") == 1
+    assert said.count("Distances across the loop may be distorted") == 1
     assert all(r.text in said for r in reasons)
     # The gravest comes first, wherever it stands.
     assert said.index("Only one.") > said.rindex("drifted.")
