@@ -327,7 +327,7 @@ def test_player_at_another_speed() -> None:
 
 
 def test_player_refuses() -> None:
-    with pytest.raises(InputError, match="go back"):
+    with pytest.raises(InputError, match="decrease"):
         Player(ten_frames(np.array([0.0, 0.2, 0.1])))
     with pytest.raises(InputError, match="speed"):
         Player(ten_frames(), speed=0.0)

@@ -1,1 +1,1 @@
-"""Files of the trade: PLY clouds, TUM trajectories, images; written beside, then renamed."""
+"""File formats: geometry, trajectories, images and tables; atomic writes."""

@@ -1,1 +1,1 @@
-"""What a recording is, and what is wrong with it."""
+"""Inspection of recordings: facts and faults."""

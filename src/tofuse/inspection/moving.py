@@ -96,20 +96,20 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
     # decide that: they may be those of the object.
     still = [p for p in sample.distant_pairs if _still(p)]
     apart = _moved(still) if len(still) >= _OFTEN * len(sample.distant_pairs) else np.zeros(0)
-    shares = max(
+    fractions = max(
         _moved(sample.pairs),
         apart,
         key=lambda moved: np.mean(moved > _MOVED) if len(moved) else 0.0,
     )
-    often = float(np.mean(shares > _MOVED)) if len(shares) else 0.0
-    if often >= _OFTEN:
+    frequency = float(np.mean(fractions > _MOVED)) if len(fractions) else 0.0
+    if frequency >= _OFTEN:
         yield Finding(
             "moving_objects",
-            f"Something moves in front of the camera: in {often:.0%} of the pairs of frames "
-            f"{np.median(shares):.1%} of the image is in the other's free space.",
+            f"Something moves in front of the camera: in {frequency:.0%} of the pairs of frames "
+            f"{np.median(fractions):.1%} of the image is in the other's free space.",
             "Record while nothing moves, or crop it (--max-depth); if it is the object to be "
             "modelled, turning in front of a stationary camera, use --object.",
-            {"moved_share": float(np.median(shares)), "pairs_share": often},
+            {"moved_share": float(np.median(fractions)), "pairs_share": frequency},
         )
 
 
@@ -130,7 +130,7 @@ def check_walls(sample: Sample) -> Iterator[Finding]:
         if region.misfit > _FLAT:
             continue
         largest[region.frame] = max(largest[region.frame], region.fraction)
-    bare = [share > _WALL_FRACTION for share in largest.values()]
+    bare = [fraction > _WALL_FRACTION for fraction in largest.values()]
     if np.mean(bare) >= _OFTEN:
         yield Finding(
             "wall_only",

@@ -74,29 +74,29 @@ def _factor(median: float) -> float:
 
 def check_valid(sample: Sample) -> Iterator[Finding]:
     """Check that enough pixels are valid."""
-    share = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
-    if 0 < share < _FEW_VALID:
+    valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
+    if 0 < valid < _FEW_VALID:
         yield Finding(
             "few_valid",
-            f"Only {share:.1%} of the pixels are valid.",
+            f"Only {valid:.1%} of the pixels are valid.",
             "Move closer, use a longer exposure, or check the confidence threshold.",
-            {"valid_share": share},
+            {"valid_share": valid},
         )
 
 
 def check_saturation(sample: Sample) -> Iterator[Finding]:
     """Check for saturated pixels."""
-    shares = [
+    saturated = [
         float(np.mean(f.amplitude_image >= SATURATED_AMPLITUDE))
         for f in sample.images
         if f.amplitude_image is not None
     ]
-    if shares and (share := float(np.mean(shares))) > _MANY_SATURATED:
+    if saturated and (fraction := float(np.mean(saturated))) > _MANY_SATURATED:
         yield Finding(
             "saturated",
-            f"{share:.0%} of the pixels are saturated and invalid.",
+            f"{fraction:.0%} of the pixels are saturated and invalid.",
             "Use a shorter exposure, or keep farther from shiny and bright objects.",
-            {"saturated_share": share},
+            {"saturated_share": fraction},
         )
 
 
@@ -110,14 +110,14 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
         valid += len(frame)
     if edges < _MIN_EDGES * max(len(sample.images), 1):
         return
-    wide, share = 2 * _REACH * flying / edges, flying / valid
-    if wide > _WIDE and share > _MANY_FLYING:
+    width, fraction = 2 * _REACH * flying / edges, flying / valid
+    if width > _WIDE and fraction > _MANY_FLYING:
         yield Finding(
             "flying_pixels",
-            f"{share:.1%} of the pixels fly between near and far surfaces: edges "
-            f"are {wide:.1f} pixels wide.",
+            f"{fraction:.1%} of the pixels fly between near and far surfaces: edges "
+            f"are {width:.1f} pixels wide.",
             "Keep the filters against flying pixels on; clean the lens, and check its focus.",
-            {"flying_share": share, "edge_width_px": wide},
+            {"flying_share": fraction, "edge_width_px": width},
         )
 
 
@@ -159,10 +159,10 @@ def _flying(r: Float32, valid: Bool) -> tuple[Bool, Bool]:
 def check_wrap(sample: Sample) -> Iterator[Finding]:
     """Check for seams at which the range wraps, and for near surfaces of too low albedo.
 
-    A surface that continues beyond the camera's period reappears at range 0, so far and near touch;
-    and what is that far returns less light than its false range would make it (its apparent
-    albedo, amplitude times the squared range, is small). Pixels with too weak a signal have random
-    ranges and are dark as well: only pixels on a surface with their neighbours count.
+    A surface that continues beyond the camera's period reappears at range 0, so far and near touch,
+    and returns less light than its wrapped range implies: its apparent albedo, amplitude times the
+    squared range, is small. Pixels with too weak a signal have random ranges and are dark as well:
+    only pixels on a surface with their neighbours count.
     """
     period = sample.period_m
     if period is None:

@@ -142,7 +142,7 @@ def camera_info(message: Any, where: str) -> Info:
     Raises
     ------
     InputError
-        If it holds no matrix K.
+        If it has no matrix K.
     """
     K = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
     D = [float(v) for v in getattr(message, "d", getattr(message, "D", ()))]

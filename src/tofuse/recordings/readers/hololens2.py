@@ -29,7 +29,7 @@ from tofuse.recordings.sources import FileSource, read_matrix_pose
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
 _NAME = re.compile(r"(?:.*/)?([0-9]{1,19})(_ab)?\.pgm", re.IGNORECASE)
 _TICKS = 1e7  # a second
-_MOST_BYTES = 1 << 24
+_MAX_BYTES = 1 << 24
 _REMEDY = "copy the recording again"
 
 
@@ -158,7 +158,7 @@ class HoloLens2Source(FileSource):
     def _image(self, tick: int, *, bright: bool) -> NDArray[np.generic]:
         path, begin, size = self.images[tick, bright]
         where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
-        if size > _MOST_BYTES:
+        if size > _MAX_BYTES:
             raise InputError("is too large", where=where, remedy=_REMEDY)
         try:
             with path.open("rb") as file:
@@ -216,7 +216,7 @@ def _images(folder: Path, stream: str) -> _Images:
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
     """Rays (H, W, 2) from a table of unit vectors; NaN where it has none."""
-    data = read_bytes(path, limit=_MOST_BYTES)
+    data = read_bytes(path, limit=_MAX_BYTES)
     height, width = shape
     if len(data) != 12 * height * width:
         raise InputError(

@@ -31,7 +31,7 @@ _NEEDED = (
     "intrinsicCalibModelID",
     "intrinsicCalibModelParameters",
 )
-_MOST_FRAMES, _MOST_BYTES = 1_000_000, 1 << 26  # of a file, and of a frame
+_MAX_FRAMES, _MAX_BYTES = 1_000_000, 1 << 26  # of a file, and of a frame
 _LENS_NUMBERS = 10
 
 
@@ -107,7 +107,7 @@ class IfmH5Source(FileSource):
         for name in _NEEDED:
             if name not in self.fields:
                 raise InputError(f"has no {name}", where=f"{self.path}: {self.name}")
-        if not 0 < len(self.rows) <= _MOST_FRAMES or self.rows.dtype.itemsize > _MOST_BYTES:
+        if not 0 < len(self.rows) <= _MAX_FRAMES or self.rows.dtype.itemsize > _MAX_BYTES:
             raise InputError(
                 f"contains {len(self.rows)} frames of {self.rows.dtype.itemsize} bytes",
                 where=f"{self.path}: {self.name}",

@@ -263,7 +263,7 @@ class _Metadata:
         return float(rate) if 0.01 <= rate <= 1e4 else 60.0
 
     def times(self) -> Float64 | None:
-        """Return the seconds of all frames, or None if they aren't told."""
+        """Return the timestamps in s of all frames, or None if they aren't given."""
         if "frameTimestamps" not in self.data:
             return None
         times = self._numbers("frameTimestamps", None)

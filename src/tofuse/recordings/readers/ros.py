@@ -322,8 +322,8 @@ class RosSource(FileSource):
             first = track.message(0)
             if (first.height, first.width) != (self.camera.height, self.camera.width):
                 continue
-            beside = [track.near(t, MAX_GAP_S) is not None for t in self.timestamps]
-            if sum(beside) > 0.5 * len(beside):
+            matched = [track.near(t, MAX_GAP_S) is not None for t in self.timestamps]
+            if sum(matched) > 0.5 * len(matched):
                 self.metadata["amplitude_topic"] = connection.topic
                 return track
         return None

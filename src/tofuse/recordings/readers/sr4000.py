@@ -103,7 +103,7 @@ class Sr4000Source(FileSource):
         # Where the camera's counter starts again, the frames still follow each other.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():
-            self.warnings.append("time stamps go back; frames stay in the order of files")
+            self.warnings.append("timestamps decrease; frames stay in the order of files")
         self.timestamps = times
 
     def load(self, index: int) -> RangeFrame:
