@@ -22,8 +22,8 @@ from tofuse.files.trajectory import read_tum
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.foreground import Foreground
 from tofuse.lab.simulation.record import simulate
+from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.methods import default
-from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -98,7 +98,7 @@ def prepared(
     recording: Recording, cut: tuple[Filter, ...] = ()
 ) -> tuple[tuple[RangeFrame, ...], tuple[RangeFrame, ...], list[Frame]]:
     """Return frames as the default's tracker gets them, as its model does, and as they are."""
-    config = fitted(default("range"), recording)
+    config = with_recording_defaults(default("range"), recording)
     correctors = [correction.start() for correction in config.corrections]
     past: deque[Frame] = deque(maxlen=config.window - 1)
     tracked, cleaned, bare = [], [], []

@@ -35,9 +35,9 @@ from tofuse.files.memory import give_back
 from tofuse.lab.simulation.record import simulate
 from tofuse.live.device import DeviceError, Settings, Stream
 from tofuse.live.recorder import record
+from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.reconstruct import fitted
 from tofuse.pipeline.run import Options, run
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
@@ -110,7 +110,7 @@ def frames(columns: int, count: int, base: Path, samples: int = SAMPLES) -> bool
         writer.add(frame)
     writer.finish()
     recording = open_recording(there_and_back(short, count, base / "long"))
-    mapper = Mapper(fitted(small(), recording))
+    mapper = Mapper(with_recording_defaults(small(), recording))
     held: list[Held] = []
     for k, frame in enumerate(recording):
         mapper.push(frame)

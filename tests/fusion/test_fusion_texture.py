@@ -217,7 +217,7 @@ def test_what_has_no_colour_darkens_nothing() -> None:
 
 def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
     pytest.importorskip("xatlas")
-    monkeypatch.setattr(atlas_module, "_AT_ONCE", 100)
+    monkeypatch.setattr(atlas_module, "_BATCH", 100)
     wall = sheet(20, 20, 0.05)
     atlas = unwrap(wall, 512)
     np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)

@@ -602,7 +602,7 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
     turned = Volume.around(views, poses, 0.012, options)
     assert turned.turns == 2
     found = fuse_surface(views, poses, options)
-    monkeypatch.setattr(layout, "_TURNS", 1)
+    monkeypatch.setattr(layout, "_MAX_STRIDE", 1)
     full = Volume.around(views, poses, 0.012, options)
     assert full.turns == 1
     assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over

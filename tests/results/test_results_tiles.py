@@ -39,7 +39,7 @@ def made(tmp_path_factory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("tiled") / "tiles"
     mesh = waves()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detail, "_ACROSS", 32)
+        patch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
         tiled = write_tiles(mesh, R, folder)
     root, extras = read_tileset(folder / "tileset.json")
     return SimpleNamespace(folder=folder, mesh=mesh, tiled=tiled, root=root, extras=extras)
@@ -158,7 +158,7 @@ def test_levels_are_as_near_to_the_surface_as_they_say(made) -> None:
 
 
 def test_tiles_are_written_alike_again(made, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(detail, "_ACROSS", 32)
+    monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
     write_tiles(made.mesh, R, tmp_path / "again")
     for path in made.folder.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
@@ -166,7 +166,7 @@ def test_tiles_are_written_alike_again(made, tmp_path, monkeypatch) -> None:
 
 def test_what_is_put_together_to_nothing_is_still_below_a_root(tmp_path, monkeypatch) -> None:
     """Two specks far apart: at some level neither has a triangle left."""
-    monkeypatch.setattr(detail, "_ACROSS", 4)
+    monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 4)
     small = waves(2)
     far = replace(small, vertices=small.vertices + np.float32([40, 0, 0]))
     both = replace(
@@ -259,7 +259,7 @@ def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
 def small_limits(monkeypatch) -> None:
     monkeypatch.setattr(tiles, "MAX_UNTILED_FACES", 10_000)
     monkeypatch.setattr(tiles, "OVERVIEW_BYTES", 600_000)
-    monkeypatch.setattr(detail, "_ACROSS", 32)
+    monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
 
 
 def test_a_large_result_has_tiles_an_overview_and_all_else(tmp_path, small_limits) -> None:

@@ -37,7 +37,7 @@ def folder(tmp_path_factory) -> Iterator[Path]:
     pictures = draw(result.diagnostics.samples)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiles, "MAX_UNTILED_FACES", 10_000)
-        patch.setattr(detail, "_ACROSS", 32)
+        patch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
         write_result(
             replace(result, mesh=flipped),
             OutputFolder(out),
