@@ -104,7 +104,7 @@ def test_realsense_refusals(install: Install) -> None:
     package.plugged_in = False
     with pytest.raises(DeviceError, match="no camera is connected"):
         device("realsense", {}).open()
-    with pytest.raises(DeviceError, match="no camera f999 is plugged in"):
+    with pytest.raises(DeviceError, match="no camera f999 is connected"):
         device("realsense", {"serial": "f999"}).open()
 
 
