@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import revisited_path
 from corner_views import corner
 from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
@@ -19,6 +20,8 @@ from tofuse.registration.base import Registration
 from tofuse.registration.confidence import BELIEVED
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.verification import Assessment
+
+turn = revisited_path.turn  # the fixture
 
 
 def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
