@@ -197,21 +197,24 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S
     return np.array(pairs, np.intp).reshape(-1, 2)
 
 
-def align(estimate: ArrayLike, reference: ArrayLike) -> Float64:
+def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None) -> Float64:
     """Return the rigid motion (4, 4) T_reference_estimate that aligns a trajectory with another.
 
     It minimises the squared distances of the positions of associated poses (N, 4, 4), without scale
     (Horn 1987; Arun et al. 1987; Umeyama 1991 with scale 1). Collinear positions leave one rotation
     unconstrained, coincident ones all: a rail, a camera rotating in place, one or two poses. There
     the orientations determine it. They always contribute, but with the weight of 10 um of spread,
-    which is negligible wherever the positions constrain the rotation.
+    which is negligible wherever the positions constrain the rotation; or, with an arm, with the
+    weight of what a rotation displaces at this distance, m.
     """
     T_e, T_r = np.asarray(estimate, float), np.asarray(reference, float)
     centre_e, centre_r = T_e[:, :3, 3].mean(0), T_r[:, :3, 3].mean(0)
     spread = (T_r[:, :3, 3] - centre_r).T @ (T_e[:, :3, 3] - centre_e) / len(T_e)
     turn = (T_r[:, :3, :3] @ np.swapaxes(T_e[:, :3, :3], 1, 2)).mean(0)
     T = np.eye(4)
-    T[:3, :3] = nearest_rotation(spread + _ORIENTATION_WEIGHT * turn)
+    # The mean squared angle is half the mean squared difference of the matrices.
+    weight = _ORIENTATION_WEIGHT if arm_m is None else arm_m**2 / 2
+    T[:3, :3] = nearest_rotation(spread + weight * turn)
     T[:3, 3] = centre_r - T[:3, :3] @ centre_e
     return T
 

@@ -4,6 +4,10 @@ The poses take the place of tracking; from there on everything is as in a run: l
 all views are refined together. How far the given poses are from the refined ones, and how far those
 may be off themselves, is how far the given ones may be off. Where images contradict even the
 refined poses, the recording is tracked anew, and what the images support better counts.
+
+Whether the given poses are wrong at all is another question: the refined ones err too, and mostly
+where registrations can't know better. Pairs of views, registered around the refined poses, tell how
+far the given poses are from anything that they could have measured (`evaluation.deviation`).
 """
 
 from __future__ import annotations
@@ -22,17 +26,22 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
+from tofuse.evaluation.deviation import Deviation, fitted
+from tofuse.evaluation.deviation import deviation as deviation_of
 from tofuse.evaluation.trajectory import displacement, distances_between
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry import se3
+from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.pipeline.checks import bounds, images, tolerance_of
 from tofuse.pipeline.config import Config, check_views, from_method
 from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.reconstruct import reconstruct, view_kind
+from tofuse.pipeline.reconstruct import view_kind, with_views
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
+from tofuse.posegraph.pair_measurements import measured_pairs
+from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
@@ -41,9 +50,11 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.card import bound, length
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import accuracy_json, plain, reasons_json, write_result
-from tofuse.results.ranges import in_words, runs_of
+from tofuse.results.ranges import Range, in_words, runs_of
 from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
+
+Views = Sequence[PosedView[PreparedView]]
 
 # Frames whose images are compared under the poses.
 _CHECKED = 60
@@ -68,6 +79,9 @@ class Judgement:
         As of a run.
     consistency, refined_consistency
         Map consistency of the given poses and of the refined ones; None if no two views overlap.
+    deviation
+        How far these poses are from what pairs of views measure, and whether that can be chance;
+        None if fewer than two views could be compared.
     displacement_m
         (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
     refined
@@ -83,6 +97,7 @@ class Judgement:
     reasons: tuple[Reason, ...]
     consistency: Consistency | None
     refined_consistency: Consistency | None
+    deviation: Deviation | None
     displacement_m: Float64
     refined: Reconstruction
     started: bool = True
@@ -96,6 +111,7 @@ class Judgement:
             "reasons": reasons_json(self.reasons),
             "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
             "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
+            "deviation": None if self.deviation is None else self.deviation.to_dict(),
             "displacement_m": self.displacement_m,
             "refined": {
                 "from_these_poses": self.started,
@@ -150,21 +166,24 @@ def judge(
     check_views(given, kind)
     compared_images = _Images(recording)
 
-    def made(led: Recording, by: Config) -> tuple[Reconstruction, Seen]:
-        result = reconstruct(led, by, threads=threads, progress=progress)
-        return result, compared_images.under(result.trajectory)
+    def made(led: Recording, by: Config) -> tuple[Reconstruction, Views, Seen]:
+        result, views = with_views(led, by, threads=threads, progress=progress)
+        return result, views, compared_images.under(result.trajectory)
 
     progress.stage("comparing images")
     seen = compared_images.under(poses)
-    refined, after = made(with_odometry(recording, poses), given)
+    refined, views, after = made(with_odometry(recording, poses), given)
     started = True
     if not after.is_supported:
-        other, seen_other = made(recording, config)
+        other, other_views, seen_other = made(recording, config)
         if seen_other.support > after.support:
-            refined, after, started = other, seen_other, False
+            refined, views, after, started = other, other_views, seen_other, False
+    progress.stage("registering pairs")
+    with use_threads(threads), threadpool_limits(1):
+        deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    reasons = ranked([*_reasons(poses, accuracy, seen, after, refined, tolerance_m)])
+    reasons = ranked([*_reasons(poses, accuracy, deviation, seen, after, refined, tolerance_m)])
     return Judgement(
         poses,
         accuracy,
@@ -172,6 +191,7 @@ def judge(
         reasons,
         _consistency(recording, poses),
         _consistency(recording, refined.trajectory),
+        deviation,
         distances,
         refined,
         started,
@@ -310,7 +330,21 @@ def sentence(found: Judgement, name: str) -> str:
     given = bound(found.accuracy, diagonal)
     better = bound(found.refined.diagnostics.accuracy, diagonal)
     how = "refined" if found.started else "tracked anew"
-    return f"{name}: {given}; {how}: {better}."
+    return f"{name}: {given}; {how}: {better}.{_agreement(found.deviation)}"
+
+
+def _agreement(found: Deviation | None) -> str:
+    """Say whether the depth contradicts the poses."""
+    if found is None:
+        return ""
+    if not found.consistent:
+        return (
+            f" Inconsistent with the depth: surfaces displaced by about {length(found.estimate_m)},"
+            f" at least {length(found.at_least_m)} (95 %)."
+        )
+    if not np.isfinite(found.at_most_m):
+        return " Consistent with the depth, as far as that constrains them."
+    return f" Consistent with the depth to within {length(found.at_most_m)} (95 %)."
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
@@ -394,9 +428,23 @@ def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Ac
     return Accuracy(position, rotation, relative, True, at_worst, known.unbounded)
 
 
+def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviation | None:
+    """Compare the poses with pairs of the views that have a pose there and in the main model."""
+    row = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
+    both = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
+    known = set(both.tolist())
+    posed = [view for view in views if row[view.index] in known]
+    if len(posed) < 2:
+        return None
+    at = [row[view.index] for view in posed]
+    fit = fitted(measured_pairs(posed, refined.trajectory[at]))
+    return deviation_of(fit, poses[at], float(np.median([view.depth for view in posed])))
+
+
 def _reasons(
     poses: Float64,
     accuracy: Accuracy,
+    deviation: Deviation | None,
     seen: Seen,
     after: Seen,
     refined: Reconstruction,
@@ -412,7 +460,13 @@ def _reasons(
         )
         yield Reason("images_disagree", everything, text)
     yield from images(seen.cross_view, everything)
-    yield from bounds(accuracy, tolerance_of(tolerance_m, refined.cloud.diagonal_m), indices)
+    allowed = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
+    wrong = [] if deviation is None else [*_wrong(deviation, allowed, everything)]
+    yield from wrong
+    # That poses may be off says nothing more where they are.
+    yield from (
+        r for r in bounds(accuracy, allowed, indices) if not wrong or r.code != "uncertain_poses"
+    )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
     moments = [Moment(f.index, f.timestamp) for f in frames]
     own = {k for k, _ in jumps(_or_none(refined.trajectory), moments)}
@@ -425,6 +479,24 @@ def _reasons(
             f"{indices[first]} is {jumped[first]}."
         )
         yield Reason("jumped", where, text)
+
+
+def _wrong(found: Deviation, allowed_m: float, everything: tuple[Range, ...]) -> Iterator[Reason]:
+    """Give a reason where poses contradict the depth by more than is allowed."""
+    if found.at_least_m <= allowed_m:
+        return
+    text = (
+        f"Registrations contradict the poses: surfaces are displaced by about "
+        f"{length(found.estimate_m)} rms, at least {length(found.at_least_m)} (95 %); the "
+        f"tolerance is {length(allowed_m)}."
+    )
+    steps = tuple((int(a), int(b)) for a, b in found.ids[found.steps])
+    if steps:
+        a, b = steps[0]
+        text += f" The motion from frame {a} to {b} is wrong by itself"
+        others = len(steps) - 1
+        text += f", and {others} other{'' if others == 1 else 's'}." if others else "."
+    yield Reason("inconsistent_poses", steps or everything, text)
 
 
 def _or_none(poses: Float64) -> list[Float64 | None]:

@@ -24,9 +24,11 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.self_calibration import self_calibrated
 from tofuse.pipeline.state_checks import check_tracked
 from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.phones import ARKIT_UP, POSES_BY
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Reconstruction
 
 _TRACKING = "tracking"
@@ -91,6 +93,20 @@ def reconstruct(
     )
 
 
+def with_views(
+    recording: Recording, config: Config, *, threads: int | None = None, progress: Progress
+) -> tuple[Reconstruction, Sequence[PosedView[PreparedView]]]:
+    """Reconstruct a recording, without self-calibration; returns its prepared views as well.
+
+    The views are those that refinement works on: corrected, filtered, and spaced by motion.
+    """
+    config = adapted(config, recording, threads, progress)
+    with threadpool_limits(1):
+        mapper = _track(recording, config, 0, threads, (), progress, NoCheckpoints())
+        result = mapper.finish(NoCheckpoints())
+    return _with_facts(result, recording, config), mapper.views
+
+
 def _track(
     recording: Recording,
     config: Config,
@@ -128,7 +144,7 @@ def _with_facts(result: Reconstruction, recording: Recording, config: Config) ->
     result = described(result, describe(recording))
     if result.up is None and config.outside:
         result = replace(result, up=device_up(recording, result))
-    return result
+    return result, tracked.mapper
 
 
 def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:

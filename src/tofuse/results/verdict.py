@@ -29,6 +29,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "weak_registration": ("degraded", "Frames have too few correspondences."),
     "not_converged": ("degraded", "Registrations stopped before they converged."),
     "rig_changed": ("degraded", "A camera of the rig has moved from its pose in rig.json."),
+    "inconsistent_poses": ("degraded", "Registrations contradict the poses that were given."),
     "uncertain_poses": ("degraded", "Poses may be off by more than the tolerance."),
     "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
     "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
@@ -68,6 +69,7 @@ ADVICE: dict[str, str] = {
     "weak_registration": "Record with smaller steps between frames, or with more structure in "
     "view.",
     "not_converged": "Use more iterations, or record with smaller steps between frames.",
+    "inconsistent_poses": "Use the refined poses, or find out what bent the given ones.",
     "uncertain_poses": "Revisit these places, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",

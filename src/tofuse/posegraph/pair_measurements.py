@@ -1,0 +1,73 @@
+"""What pairs of overlapping views measure of the motion between them, each pair by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tofuse.arrays import Float64, Intp
+from tofuse.geometry import se3
+from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph.accuracy import without_degenerate
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.refine import RefineOptions, chosen
+from tofuse.posegraph.views import KeptView, PosedView, overlaps
+from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.registration.uncertainty import covariance
+
+_ALIGNMENT = ProjectiveOptions()
+# The same pairs as a refinement looks at.
+_PAIRS = RefineOptions()
+
+
+def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
+    """Align every pair of views that overlap, and each view with the one before it.
+
+    Nothing that a pair measures depends on the poses, except which pairs are compared and where
+    their alignments start.
+
+    Parameters
+    ----------
+    views
+        In the order of their frames.
+    poses
+        (N, 4, 4) T_world_camera.
+
+    Returns
+    -------
+    A graph of the frames with these poses, every edge with the covariance that its alignment
+    states (`registration.uncertainty`). What a pair does not constrain carries next to no
+    information.
+    """
+    pairs = _overlapping(views, poses)
+    surfaces = [view.view for view in views]
+    T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+
+    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Float64]]:
+        found = []
+        for (i, j), T in zip(pairs[start:stop].tolist(), T_i_j[start:stop], strict=True):
+            target = [Target(surfaces[i], np.eye(4))]
+            aligned = align(surfaces[j], target, T, _ALIGNMENT)
+            C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
+            found.append((aligned.T_world_source, C, aligned.unobservable * UNITS))
+        return found
+
+    found = [one for chunk in run_chunks(work, len(pairs), 64) for one in chunk]
+    ids = [view.index for view in views]
+    edges = [
+        Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
+        for (i, j), (T, C, _) in zip(pairs.tolist(), found, strict=True)
+    ]
+    return without_degenerate(build_graph(ids, poses, edges), [weak for _, _, weak in found])
+
+
+def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
+    """(M, 2) positions i < j of the views that are compared."""
+    kept = [KeptView.of(view.view, _PAIRS.points) for view in views]
+    pairs = chosen(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
+    after = np.arange(1, len(views))
+    row = np.stack([after - 1, after], 1)
+    return np.unique(np.concatenate([pairs, row]), axis=0)
