@@ -19,7 +19,7 @@ estimates the error, and to where 95 % of them are, which bounds it from below.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -66,11 +66,14 @@ class Fit:
         Standard deviation of the residuals, relative to the stated one.
     freedom
         Degrees of freedom that the scale rests on.
+    depth_m
+        Median depth of what the views see.
     """
 
     graph: PoseGraph
     scale: float
     freedom: float
+    depth_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +87,26 @@ class Deviation:
     at_least_m, at_most_m
         Bounds of it, each 95 %. `at_least_m` is 0 where the poses are consistent with the depth;
         `at_most_m` is inf where some direction is not bounded by any measurement.
+    distance_m
+        Distance from the poses that fit the registrations best, which err as well.
     ids
         (V,) indices of the frames that were compared.
     of_views_m
         (V,) displacement of each that `estimate_m` is the rms of.
     steps
         (S, 2) positions of the views between which the motion alone is inconsistent.
-    scale
-        See `Fit`.
+    fit
+        What they were compared with; other poses of the same recording can be, too.
     """
 
     estimate_m: float
     at_least_m: float
     at_most_m: float
+    distance_m: float
     ids: Intp
     of_views_m: Float64
     steps: Intp
-    scale: float
+    fit: Fit = field(repr=False)
 
     @property
     def consistent(self) -> bool:
@@ -113,17 +119,26 @@ class Deviation:
             "estimate_m": self.estimate_m,
             "at_least_m": self.at_least_m,
             "at_most_m": self.at_most_m,
+            "distance_m": self.distance_m,
             "frames": self.ids.tolist(),
             "of_frames_m": self.of_views_m.tolist(),
             "inconsistent_steps": self.ids[self.steps].tolist(),
         }
 
 
-def fitted(graph: PoseGraph) -> Fit:
+def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     """Fit the poses of a graph to its measurements, and find the size of their errors.
 
-    Wrong registrations count little (Huber 1964). Each view takes part in many pairs, which share
+    Wrong registrations count little, for the poses and for the size of errors (Huber 1964, his
+    second proposal). Each view takes part in many pairs, which share
     its errors: all pairs together count no more than one for each pose but the first.
+
+    Parameters
+    ----------
+    graph
+        Of two views or more, see `posegraph.pair_measurements`.
+    depth_m
+        Median depth of what they see.
     """
     n, m = len(graph.ids), len(graph.edges)
     information, poses = graph.information, graph.poses
@@ -133,7 +148,7 @@ def fitted(graph: PoseGraph) -> Fit:
     for _ in range(_FITS):
         found = _solved(replace(graph, poses=poses, information=information / square))
         poses = found.poses
-        left = square * float((found.weights * found.chi2).sum())
+        left = square * float((found.weights**2 * found.chi2).sum())
         square = (_STATED + left) / (_STATED + spare)
     share = (n - 1) / m
     counted = (found.weights * share / square)[:, None, None] * information
@@ -141,34 +156,30 @@ def fitted(graph: PoseGraph) -> Fit:
         replace(graph, poses=poses, information=counted),
         float(np.sqrt(square)),
         _STATED + share * spare,
+        depth_m,
     )
 
 
-def deviation(fit: Fit, poses: Float64, depth_m: float) -> Deviation:
-    """Compare given poses (V, 4, 4) of the views of a fit with it.
-
-    Parameters
-    ----------
-    depth_m
-        Median depth of what the views see.
-    """
+def deviation(fit: Fit, poses: Float64) -> Deviation:
+    """Compare given poses (V, 4, 4) of the views of a fit with it."""
     graph = fit.graph
-    aligned = align(poses, graph.poses, arm_m=depth_m) @ poses
+    aligned = align(poses, graph.poses, arm_m=fit.depth_m) @ poses
     x = se3.log(se3.inverse(graph.poses) @ aligned)
-    problem = _Corrections(graph, depth_m)
+    problem = _Corrections(graph, fit.depth_m)
     chance = float(f_distribution.ppf(_LEVEL, problem.freedom, fit.freedom))
     estimate = problem.smallest(x, _USUAL * problem.freedom)
     least = problem.smallest(x, _AT_WORST * chance * problem.freedom)
-    known = accuracy_of(graph, Shown(), np.inf)
-    own = float(np.hypot(known.position_m, depth_m * known.rotation_rad))
+    known = accuracy_of(graph, Shown(), 0.0)
+    own = float(np.hypot(known.position_m, fit.depth_m * known.rotation_rad))
     return Deviation(
         problem.norm(estimate),
         problem.norm(least),
         problem.norm(x) + own,
+        problem.norm(x),
         graph.ids,
         problem.lengths(estimate),
         _steps(graph, aligned),
-        fit.scale,
+        fit,
     )
 
 

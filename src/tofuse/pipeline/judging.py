@@ -437,8 +437,8 @@ def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviati
     if len(posed) < 2:
         return None
     at = [row[view.index] for view in posed]
-    fit = fitted(measured_pairs(posed, refined.trajectory[at]))
-    return deviation_of(fit, poses[at], float(np.median([view.depth for view in posed])))
+    depth_m = float(np.median([view.depth for view in posed]))
+    return deviation_of(fitted(measured_pairs(posed, refined.trajectory[at]), depth_m), poses[at])
 
 
 def _reasons(

@@ -1,0 +1,203 @@
+"""Given poses against registrations: how far off they are at least, and whether it is chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+from scipy.optimize import brentq
+
+from tofuse.evaluation.deviation import _Corrections, deviation, fitted
+from tofuse.geometry import se3
+from tofuse.posegraph.build import Measured, build_graph
+
+SIGMA = np.array([0.003] * 3 + [0.001] * 3)
+DEPTH_M = 2.0
+RIGID = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, 2.0, -0.4]))
+
+
+def around(count=24):
+    """Poses on a circle of 1 m, looking along it."""
+    turn = np.linspace(0, 1.5 * np.pi, count)
+    return np.array([se3.exp([0, 0, 0, 0, a, 0]) @ se3.exp([1.0, 0, 0, 0, 0, 0]) for a in turn])
+
+
+def measured(poses, *, seed=0, noise=1.0, reach=4, stated=SIGMA):
+    """A graph of pairs up to `reach` apart, `noise` times as wrong as they state."""
+    rng = np.random.default_rng(seed)
+    edges = []
+    for i in range(len(poses)):
+        for j in range(i + 1, min(i + reach + 1, len(poses))):
+            error = se3.exp(noise * SIGMA * rng.standard_normal(6))
+            T_i_j = se3.inverse(poses[i]) @ poses[j] @ error
+            edges.append(Measured(i, j, T_i_j, np.diag(stated**-2.0)))
+    return build_graph(range(len(poses)), poses, edges)
+
+
+def jumped(poses, motion):
+    out = poses.copy()
+    half = len(out) // 2
+    out[half:] = out[half] @ se3.exp(motion) @ se3.inverse(out[half]) @ out[half:]
+    return out
+
+
+def off(poses, truth):
+    """The norm of `deviation` between two trajectories."""
+    rest = deviation(fitted(measured(truth, noise=0.0), DEPTH_M), poses)
+    return rest.distance_m
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return around()
+
+
+@pytest.fixture(scope="module")
+def fit(truth):
+    return fitted(measured(truth), DEPTH_M)
+
+
+def test_right_poses_are_consistent(truth) -> None:
+    for seed in range(5):
+        found = deviation(fitted(measured(truth, seed=seed), DEPTH_M), truth)
+        assert found.consistent
+        assert found.at_least_m == found.estimate_m == 0
+        assert 0 < found.distance_m < found.at_most_m < 0.05
+        assert not len(found.steps)
+        assert not found.of_views_m.any()
+
+
+def test_a_rigid_motion_of_all_poses_changes_nothing(fit, truth) -> None:
+    wrong = jumped(truth, [0.05, 0, 0, 0, 0.02, 0])
+    a, b = deviation(fit, wrong), deviation(fit, RIGID @ wrong)
+    assert b.at_least_m == pytest.approx(a.at_least_m, rel=1e-2)
+    assert b.estimate_m == pytest.approx(a.estimate_m, rel=1e-2)
+    assert b.distance_m == pytest.approx(a.distance_m, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 3.0])
+def test_wrong_poses_are_off_by_what_is_said(fit, truth, size) -> None:
+    drift = se3.exp(size * np.array([0.002, 0.001, 0.0, 0.0, 0.002, 0.001]))
+    drifting = [truth[0]]
+    for a, b in pairwise(truth):
+        drifting.append(drifting[-1] @ se3.inverse(a) @ b @ drift)
+    shaken = truth @ se3.exp(
+        size * 0.01 * np.random.default_rng(1).standard_normal((len(truth), 6))
+    )
+    wrong = jumped(truth, size * np.array([0.04, 0, 0.03, 0, 0.03, 0]))
+    for poses in (np.array(drifting), shaken, wrong):
+        found, true = deviation(fit, poses), off(poses, truth)
+        assert found.at_least_m <= true
+        assert found.at_least_m <= found.estimate_m <= found.at_most_m
+        assert true <= found.at_most_m
+        if size >= 1:
+            assert found.estimate_m > 0.4 * true
+        if size >= 3:
+            assert not found.consistent
+            assert found.estimate_m > 0.7 * true
+
+
+def test_a_jump_is_found_where_it_is(fit, truth) -> None:
+    found = deviation(fit, jumped(truth, [0.06, 0, 0, 0, 0.03, 0]))
+    half = len(truth) // 2
+    assert [half - 1, half] in found.steps.tolist()
+    assert len(found.steps) == 1
+    assert found.to_dict()["inconsistent_steps"] == [[half - 1, half]]
+
+
+def test_errors_are_compared_with_those_of_this_recording(truth) -> None:
+    """What contradicts sharp registrations is chance among noisy ones that state the same."""
+    wrong = jumped(truth, [0.015, 0, 0, 0, 0.005, 0])
+    for noise, consistent in ((0.2, False), (4.0, True)):
+        fit = fitted(measured(truth, noise=noise), DEPTH_M)
+        assert fit.scale == pytest.approx(noise, rel=0.3)
+        assert deviation(fit, wrong).consistent is consistent
+        assert deviation(fit, truth).consistent
+
+
+def test_a_chain_has_nothing_but_what_it_states(truth) -> None:
+    """Without spare pairs no residual tells the size of errors."""
+    fit = fitted(measured(truth, reach=1), DEPTH_M)
+    assert fit.scale == pytest.approx(1.0)
+    assert deviation(fit, truth).consistent
+    assert not deviation(fit, jumped(truth, [0.3, 0, 0, 0, 0.2, 0])).consistent
+
+
+def test_wrong_registrations_decide_nothing(truth) -> None:
+    graph = measured(truth)
+    rng = np.random.default_rng(5)
+    Z = graph.measurements.copy()
+    bad = rng.choice(len(Z), 5, replace=False)
+    Z[bad] = Z[bad] @ se3.exp(0.2 * rng.standard_normal((5, 6)))
+    fit = fitted(replace(graph, measurements=Z), DEPTH_M)
+    assert deviation(fit, truth).consistent
+    assert not deviation(fit, jumped(truth, [0.08, 0, 0, 0, 0.04, 0])).consistent
+
+
+def test_what_nothing_measures_costs_nothing(truth) -> None:
+    """Along one direction of every camera pairs know nothing: there poses may be anywhere."""
+    row = np.tile(np.eye(4), (12, 1, 1))
+    row[:, 0, 3] = np.linspace(0, 1, 12)
+    stated = SIGMA.copy()
+    stated[0] = 30.0
+    fit = fitted(measured(row, stated=stated), DEPTH_M)
+    far = row.copy()
+    far[:, 0, 3] *= 1.3
+    found = deviation(fit, far)
+    assert found.consistent
+    assert found.distance_m > 0.05
+    assert np.isinf(found.at_most_m)
+    away = far.copy()
+    away[6:, 1, 3] += 0.06
+    found = deviation(fit, away)
+    assert 0 < found.at_least_m < 0.04
+
+
+def test_the_correction_is_the_smallest(fit, truth) -> None:
+    """The same by dense linear algebra: in the eigenvectors of both forms."""
+    problem = _Corrections(fit.graph, DEPTH_M)
+    n = len(truth)
+    rng = np.random.default_rng(2)
+    x = 0.02 * rng.standard_normal((n, 6))
+    unit = np.eye(6 * n).reshape(-1, n, 6)
+    # The form of a sum of two is known from those of each.
+    single = np.array([problem.product(u) for u in unit])
+    S = np.array(
+        [
+            [(problem.product(a + b) - single[p] - single[q]) / 2 for q, b in enumerate(unit)]
+            for p, a in enumerate(unit[:6])
+        ]
+    )
+    assert np.allclose(np.diag(S), single[:6])
+    H = dense(fit.graph)
+    assert np.allclose(H[:6], S, atol=1e-6 * np.abs(H).max())
+    M = np.tile([1, 1, 1, *[DEPTH_M**2] * 3], n) / n
+    values, vectors = eigh(H, np.diag(M))
+    a = vectors.T @ (M * x.ravel())
+    allowed = 0.1 * problem.product(x)
+
+    def left(log_m):
+        return float((values * (a / (1 + np.exp(log_m) * values)) ** 2).sum()) - allowed
+
+    m = np.exp(brentq(left, -30, 30))
+    expected = a - a / (1 + m * values)
+    found = problem.smallest(x, allowed)
+    assert problem.product(x - found) == pytest.approx(allowed, rel=1e-2)
+    assert problem.norm(found) == pytest.approx(np.linalg.norm(expected), rel=1e-3)
+    assert not problem.smallest(x, 2 * problem.product(x)).any()
+
+
+def dense(graph):
+    """The information of all poses."""
+    n = len(graph.ids)
+    H = np.zeros((6 * n, 6 * n))
+    for (i, j), W in zip(graph.edges, graph.information, strict=True):
+        J = np.zeros((6, 6 * n))
+        J[:, 6 * j : 6 * j + 6] = np.eye(6)
+        T_j_i = se3.inverse(graph.poses[j]) @ graph.poses[i]
+        J[:, 6 * i : 6 * i + 6] = -se3.adjoint(T_j_i)
+        H += J.T @ W @ J
+    return H
