@@ -13,7 +13,8 @@ import pytest
 import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError
-from tofuse.evaluation.trajectory import displacement
+from tofuse.evaluation.deviation import deviation
+from tofuse.evaluation.trajectory import align, displacement
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
@@ -60,6 +61,8 @@ def test_right_poses_are_good(of_truth) -> None:
     assert of_truth.started
     assert of_truth.displacement_m.max() < 0.012
     assert of_truth.accuracy.position_m < 0.02
+    assert of_truth.deviation.consistent
+    assert of_truth.deviation.at_most_m < 0.03
     assert of_truth.consistency is not None
     assert of_truth.consistency.inlier_share > 0.9
 
@@ -70,13 +73,31 @@ def test_wrong_poses_are_as_far_off_as_is_said(of_bent, truth) -> None:
     stated = of_bent.accuracy.position_m
     assert wrong < stated < 1.6 * wrong
     assert of_bent.verdict == "degraded"
-    assert [r.code for r in of_bent.reasons] == ["uncertain_poses", "jumped"]
+    assert [r.code for r in of_bent.reasons] == ["inconsistent_poses", "jumped"]
+    assert of_bent.reasons[0].ranges == ((3, 4),)
+    assert "The motion from frame 3 to 4 is wrong by itself." in of_bent.reasons[0].text
     assert of_bent.reasons[1].frames == (4, 4)
     refined = of_bent.refined
     assert displacement(truth, refined.trajectory)[0] < 0.01
     assert refined.diagnostics.accuracy.position_m < 0.01
     assert refined.diagnostics.verdict == "good"
     assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
+
+
+def test_wrong_poses_are_further_from_what_is_measured_than_right_ones(
+    recording, truth, of_truth, of_bent
+) -> None:
+    wrong, right = of_bent.deviation, of_truth.deviation
+    depth_m = wrong.fit.depth_m
+    aligned = align(bent(truth), truth, arm_m=depth_m) @ bent(truth)
+    x = se3.log(se3.inverse(truth) @ aligned) * [1, 1, 1, depth_m, depth_m, depth_m]
+    true = float(np.sqrt((x**2).sum(1).mean()))
+    assert right.estimate_m < 0.005 < wrong.at_least_m <= true < wrong.at_most_m
+    assert wrong.estimate_m == pytest.approx(true, rel=0.3)
+    assert wrong.ids[wrong.steps].tolist() == [[3, 4]]
+    # Other poses of the recording can be compared without registering anything again.
+    again = deviation(right.fit, bent(truth)[right.ids])
+    assert again.estimate_m == pytest.approx(wrong.estimate_m, rel=0.1)
 
 
 def test_a_tolerance_decides(recording, truth) -> None:
@@ -92,7 +113,7 @@ def test_poses_of_another_place_are_contradicted_and_tracked_anew(recording, tru
     found = tofuse.judge(recording, turns @ truth)
     assert not found.started
     assert found.verdict == "degraded"
-    assert "uncertain_poses" in [r.code for r in found.reasons]
+    assert "inconsistent_poses" in [r.code for r in found.reasons]
     assert found.accuracy.rotation_rad > 1
     assert displacement(truth, found.refined.trajectory)[0] < 0.01
     away = np.array([se3.exp(np.array([0, 0, 0, 0, 1.1 * k, 0])) for k in range(8)])
@@ -162,13 +183,20 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     written = {p.name for p in (tmp_path / "out").iterdir()}
     assert written <= set(FILES)
     assert {"trajectory.txt", "report.html", "run.json", "judge.json"} <= written
-    assert "poses.txt: ±" in (tmp_path / "out/report.html").read_text()
+    report = (tmp_path / "out/report.html").read_text()
+    assert "poses.txt: ±" in report
+    assert "Inconsistent with the depth: surfaces displaced by about" in report
+    said = kept["deviation"]
+    assert 0 < said["at_least_m"] <= said["estimate_m"] <= said["at_most_m"]
+    assert len(said["frames"]) == len(said["of_frames_m"])
+    assert said["inconsistent_steps"] == [[3, 4]]
     # A result of it is replaced only if asked to, and is a trajectory itself.
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main(["judge", str(room_recording), str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
     assert "\nout: ±" in out
+    assert "Consistent with the depth to within" in out
     assert "map consistency: given" in out
 
 

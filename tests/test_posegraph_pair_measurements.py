@@ -1,0 +1,50 @@
+"""Pairs of views measure the motion between them, each by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.posegraph.pair_measurements import measured_pairs
+from tofuse.posegraph.views import PosedView
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+
+
+@pytest.fixture(scope="module")
+def views(room_recording):
+    recording = tofuse.open(room_recording)
+    prepared = [prepare_view(frame, SurfaceOptions()) for frame in recording]
+    truth = recording.reference
+    return [PosedView(v, T) for v, T in zip(prepared, truth, strict=True)], truth
+
+
+def test_pairs_measure_the_true_motion_from_poses_that_are_off(views) -> None:
+    posed, truth = views
+    rng = np.random.default_rng(0)
+    start = truth @ se3.exp(0.01 * rng.standard_normal((len(truth), 6)))
+    graph = measured_pairs(posed, start)
+    assert graph.ids.tolist() == list(range(len(truth)))
+    assert np.array_equal(graph.poses, start)
+    i, j = graph.edges.T
+    assert {(k, k + 1) for k in range(len(truth) - 1)} <= set(
+        zip(i.tolist(), j.tolist(), strict=True)
+    )
+    assert (j > i + 1).any()
+    right = graph.with_poses(truth)
+    e = right.residuals()
+    assert np.median(np.linalg.norm(e[:, :3], axis=1)) < 0.004
+    # Six for errors as large as stated.
+    assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12
+
+
+def test_threads_change_nothing(views) -> None:
+    posed, truth = views
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            found.append(measured_pairs(posed, truth))
+    assert np.array_equal(found[0].measurements, found[1].measurements)
+    assert np.array_equal(found[0].information, found[1].information)
