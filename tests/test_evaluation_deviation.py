@@ -156,6 +156,13 @@ def test_what_nothing_measures_costs_nothing(truth) -> None:
     assert 0 < found.at_least_m < 0.04
 
 
+def test_what_measures_nothing_is_refused(truth) -> None:
+    fit = fitted(measured(truth, stated=np.full(6, 1e3)), DEPTH_M)
+    assert fit.unknowns == 0
+    with pytest.raises(ValueError, match="nothing was measured"):
+        deviation(fit, truth)
+
+
 def test_the_correction_is_the_smallest(fit, truth) -> None:
     """The same by dense linear algebra: in the eigenvectors of both forms."""
     problem = _Corrections(fit.graph, DEPTH_M)

@@ -64,7 +64,9 @@ class Fit:
         that this recording shows.
     scale
         Standard deviation of the residuals, relative to the stated one.
-    freedom
+    unknowns
+        Degrees of freedom of the poses, without those that nothing constrains.
+    spare
         Degrees of freedom that the scale rests on.
     depth_m
         Median depth of what the views see.
@@ -72,7 +74,8 @@ class Fit:
 
     graph: PoseGraph
     scale: float
-    freedom: float
+    unknowns: float
+    spare: float
     depth_m: float
 
 
@@ -130,8 +133,8 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     """Fit the poses of a graph to its measurements, and find the size of their errors.
 
     Wrong registrations count little, for the poses and for the size of errors (Huber 1964, his
-    second proposal). Each view takes part in many pairs, which share
-    its errors: all pairs together count no more than one for each pose but the first.
+    second proposal). Each view takes part in many pairs, which share its errors: all pairs together
+    count no more than one for each pose but the first.
 
     Parameters
     ----------
@@ -155,20 +158,29 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     return Fit(
         replace(graph, poses=poses, information=counted),
         float(np.sqrt(square)),
+        share * measured,
         _STATED + share * spare,
         depth_m,
     )
 
 
 def deviation(fit: Fit, poses: Float64) -> Deviation:
-    """Compare given poses (V, 4, 4) of the views of a fit with it."""
+    """Compare given poses (V, 4, 4) of the views of a fit with it.
+
+    Raises
+    ------
+    ValueError
+        If the registrations of the fit constrain nothing.
+    """
+    if not fit.unknowns > 0:
+        raise ValueError("nothing was measured")
     graph = fit.graph
     aligned = align(poses, graph.poses, arm_m=fit.depth_m) @ poses
     x = se3.log(se3.inverse(graph.poses) @ aligned)
     problem = _Corrections(graph, fit.depth_m)
-    chance = float(f_distribution.ppf(_LEVEL, problem.freedom, fit.freedom))
-    estimate = problem.smallest(x, _USUAL * problem.freedom)
-    least = problem.smallest(x, _AT_WORST * chance * problem.freedom)
+    chance = float(f_distribution.ppf(_LEVEL, fit.unknowns, fit.spare))
+    estimate = problem.smallest(x, _USUAL * fit.unknowns)
+    least = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
     known = accuracy_of(graph, Shown(), 0.0)
     own = float(np.hypot(known.position_m, fit.depth_m * known.rotation_rad))
     return Deviation(
@@ -193,10 +205,6 @@ class _Corrections:
         self._A = se3.adjoint(se3.inverse(self._T_i_j))
         self._units = np.array([1.0] * 3 + [depth_m] * 3)
         self._system = PairSystem(n, graph.edges, np.zeros(n, np.bool_))
-        measured = graph.information * np.outer(UNITS, UNITS)
-        scale = np.abs(measured).max()
-        rank = np.linalg.matrix_rank(measured, _UNMEASURED * scale, hermitian=True)
-        self.freedom = float((n - 1) * rank.mean())
 
     def product(self, x: Float64) -> float:
         """x^T S^-1 x."""

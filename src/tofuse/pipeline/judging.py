@@ -81,7 +81,7 @@ class Judgement:
         Map consistency of the given poses and of the refined ones; None if no two views overlap.
     deviation
         How far these poses are from what pairs of views measure, and whether that can be chance;
-        None if fewer than two views could be compared.
+        None if no two views could be compared.
     displacement_m
         (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
     refined
@@ -438,7 +438,8 @@ def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviati
         return None
     at = [row[view.index] for view in posed]
     depth_m = float(np.median([view.depth for view in posed]))
-    return deviation_of(fitted(measured_pairs(posed, refined.trajectory[at]), depth_m), poses[at])
+    fit = fitted(measured_pairs(posed, refined.trajectory[at]), depth_m)
+    return deviation_of(fit, poses[at]) if fit.unknowns > 0 else None
 
 
 def _reasons(
