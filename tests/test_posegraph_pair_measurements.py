@@ -9,7 +9,7 @@ import tofuse
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.pair_measurements import measured_pairs
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 

@@ -41,7 +41,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import view_kind, with_views
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.pair_measurements import measured_pairs
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY

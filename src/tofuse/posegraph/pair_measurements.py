@@ -12,8 +12,8 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.accuracy import without_degenerate
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.refine import RefineOptions, chosen
-from tofuse.posegraph.views import KeptView, PosedView, overlaps
+from tofuse.posegraph.joint_alignment import RefineOptions, spread_evenly
+from tofuse.posegraph.view_store import KeptView, PosedView, overlaps
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
@@ -67,7 +67,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
     """(M, 2) positions i < j of the views that are compared."""
     kept = [KeptView.of(view.view, _PAIRS.points) for view in views]
-    pairs = chosen(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
+    pairs = spread_evenly(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
     after = np.arange(1, len(views))
     row = np.stack([after - 1, after], 1)
     return np.unique(np.concatenate([pairs, row]), axis=0)
