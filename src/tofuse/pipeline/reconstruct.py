@@ -144,7 +144,7 @@ def _with_facts(result: Reconstruction, recording: Recording, config: Config) ->
     result = described(result, describe(recording))
     if result.up is None and config.outside:
         result = replace(result, up=device_up(recording, result))
-    return result, tracked.mapper
+    return result
 
 
 def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
