@@ -209,7 +209,7 @@ def _about(middle: Float64, metres: float, degrees: float, rng: np.random.Genera
 
 def _object(view: RangeFrame) -> RangeFrame:
     """Without the background, which does not move with the object."""
-    ranges = view.depth * (ray_lengths(view.camera.rays()) if view.depth_kind == "z" else 1)
+    ranges = view.depth * (ray_lengths(view.camera) if view.depth_kind == "z" else 1)
     return view.keep(ranges < OBJECT_M)
 
 
