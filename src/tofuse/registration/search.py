@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from tofuse.arrays import Bool, Float32, Float64
+from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_all, run_chunks
@@ -54,6 +54,9 @@ _SEEN = 3000
 # The whole grid is scored on a sixth of the points, and the best so many times the candidates on
 # all.
 _COARSE_SHARE, _KEPT = 6, 200
+# Of the grid of six dimensions first the middles of cells of eight translations are scored, with
+# so many times the reach, and only the translations in this share of the cells, the best.
+_WIDER, _PROMISING = 1.5, 0.1
 _CHUNKS = 16
 # Reaches of the two-way ICP, iteration by iteration, in those of the first.
 _NARROWER = 0.85 ** np.arange(28)
@@ -433,13 +436,44 @@ def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
     rotations = se3.so3_exp(_ball(options.full_angle_step, options.turn, (1.0, 1.0, flat)))
     moves = _ball(options.full_step * depth, options.reach * depth, (1.0, 1.0, 1.0))
     step = depth * max(options.full_step, options.full_angle_step)
-    return _best(
-        _Scorer(s, t, [None, None], step),
-        rotations,
-        moves,
+    scorer = _Scorer(s, t, [None, None], step)
+    turns, shifts = _promising(scorer, rotations, moves, options.full_step * depth, options)
+    few = max(1, options.full_points // _COARSE_SHARE)
+    scores = scorer(rotations[turns], moves[shifts][:, None], few)[:, 0]
+    top = _highest(scores, _KEPT * options.full_candidates)
+    return _thinned(
+        scorer,
+        rotations[turns[top]],
+        moves[shifts[top]],
         options.full_points,
         options.full_candidates,
     )
+
+
+def _promising(
+    scorer: _Scorer, rotations: Float64, moves: Float64, step: float, options: SearchOptions
+) -> tuple[Intp, Intp]:
+    """Which rotations and which translations go together in the cells that score best."""
+    cells, cell = np.unique(np.floor(moves / (2 * step) + 0.25), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell)
+    middles = np.stack([np.bincount(cell, axis) for axis in moves.T], 1) / count[:, None]
+    wider = replace(scorer, reach=_WIDER * scorer.reach)
+    few = max(1, options.full_points // _COARSE_SHARE)
+    scores = wider(rotations, middles[None], few).ravel()
+    best = _highest(scores, max(options.full_candidates, round(_PROMISING * len(scores))))
+    turns, at = np.divmod(best, len(cells))
+    order, first = np.argsort(cell, kind="stable"), np.cumsum(count) - count
+    # All translations of each of these cells, one after the other.
+    several = count[at]
+    within = np.arange(several.sum()) - np.repeat(np.cumsum(several) - several, several)
+    return np.repeat(turns, several), order[np.repeat(first[at], several) + within]
+
+
+def _highest(scores: Float32, count: int) -> Intp:
+    """Positions of the highest scores (n,), at most so many, in order of position."""
+    count = min(len(scores), count)
+    return np.sort(np.argpartition(-scores, count - 1)[:count])
 
 
 @dataclass(frozen=True, eq=False)
@@ -486,11 +520,14 @@ def _best(
 ) -> Float64:
     """Score a grid and return its `count` best poses, (N, 4, 4); of neighbours only the best."""
     scores = scorer(rotations, translations[None], max(1, points // _COARSE_SHARE)).ravel()
-    most = min(len(scores), _KEPT * count)
-    top = np.sort(np.argpartition(-scores, most - 1)[:most])
-    R, x = rotations[top // len(translations)], translations[top % len(translations)]
+    turns, shifts = np.divmod(_highest(scores, _KEPT * count), len(translations))
+    return _thinned(scorer, rotations[turns], translations[shifts], points, count)
+
+
+def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -> Float64:
+    """Of poses (N, 3, 3) and (N, 3) the `count` best, (M, 4, 4); of neighbours only the best."""
     finer = scorer(R, x[:, None], points)[:, 0]
-    order = np.lexsort((top, -finer))
+    order = np.argsort(-finer, kind="stable")
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
     chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)
