@@ -490,9 +490,7 @@ def main(arguments: list[str] | None = None) -> None:
         print_methods(given.scenes, given.data, given.pairs)
         return
     of_search, of_guesses = samples(given.pairs, given.data)
-    print_fit(
-        "Searched: constant, root of margin, support, root of contradiction, degenerate", of_search
-    )
+    print_fit("Searched: constant, root of margin, root of contradiction, degenerate", of_search)
     print_fit("Followed from a guess: constant, support, root of contradiction", of_guesses)
 
 

@@ -24,6 +24,7 @@ from tofuse.registration import cloud_pair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.registration.cloud_pair import register_clouds
+from tofuse.registration.confidence import CLOUDS, Evidence
 from tofuse.registration.reduce import averaged
 from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 
@@ -203,12 +204,48 @@ def test_a_wrong_pose_is_contradicted_by_free_space(scans):
     assert said.violation == 0
 
 
+def with_mixed_pixels(aside):
+    """A disc before a wall, from a place aside in m; pixels on the outline mix both depths."""
+    v, u = np.mgrid[-60:61, -80:81] * 0.005
+    disc = [np.hypot(1.2 * (u + du) + aside, 1.2 * (v + dv)) < 0.3 for du, dv in SUBPIXELS]
+    share = np.mean(disc, axis=0)
+    z = 1.2 * share + 2.0 * (1 - share)
+    points = np.stack([u * z, v * z, z], -1).reshape(-1, 3).astype(np.float32)
+    return points, ((share > 0) & (share < 1)).ravel()
+
+
+SUBPIXELS = [(du, dv) for du in (-0.002, 0, 0.002) for dv in (-0.002, 0, 0.002)]
+
+
+def test_mixed_pixels_do_not_contradict_the_right_pose():
+    (source, mixed), (target, _) = with_mixed_pixels(0.15), with_mixed_pixels(0.0)
+    views = maps(source, target, 0.03)
+    true = se3.exp([0.15, 0, 0, 0, 0, 0])
+    assert cloud_agreement(*views, true).contradiction < 0.002
+    # They do lie where the other view saw through.
+    seen = se3.transform(true, source[mixed].astype(float))
+    assert np.mean(views[1].sphere.before(seen) > 0.1) > 0.1
+    # What is a surface contradicts a wrong one.
+    wrong = cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0]))
+    assert wrong.contradiction > 0.05
+
+
 def test_agreement_is_the_same_both_ways(scans):
     source, target, true = scans
     a, b = maps(source, target)
     there, back = cloud_agreement(a, b, true), cloud_agreement(b, a, se3.inverse(true))
     assert there.score == pytest.approx(back.score, abs=1e-9)
     assert there.support == pytest.approx(back.support, abs=1e-9)
+
+
+def test_without_free_space_a_lead_alone_decides():
+    """The same evidence of images and clouds is weighed by their own models."""
+    cases = [
+        Evidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
+    ]
+    right, other_room, slides = (case.probability for case in cases)
+    assert right > 0.9 > 0.7 > other_room > slides
+    assert "degenerate" in cases[2].objection()
 
 
 # Registration

@@ -22,7 +22,7 @@ from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
-from tofuse.registration.confidence import CERTAIN, CloudEvidence
+from tofuse.registration.confidence import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
@@ -105,12 +105,8 @@ class _Views:
         after = self.judged(T)
         return after if after.agreement.score >= before.agreement.score else before
 
-    def evidence(
-        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
-    ) -> CloudEvidence:
-        said = pose.agreement
-        through = self.knows_free_space
-        return CloudEvidence(said.support, said.contradiction, lead, degenerate, through)
+    def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> Evidence:
+        return Evidence.of(pose.agreement, lead, degenerate, CLOUDS)
 
     def measured(self, found: Registration) -> Registration:
         """A registration with what it knows of its errors."""
