@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -337,6 +339,44 @@ def test_damage_gives_only_our_errors(tmp_path: Path, kind: str) -> None:
                 file.rmdir()
             file.write_bytes(content)
     assert seen[2] + seen[1] > 0
+
+
+def queue(path: Path) -> None:
+    if not hasattr(os, "mkfifo"):
+        pytest.skip("queues of other systems")
+    path.unlink()
+    os.mkfifo(path)
+
+
+HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "metadata is a queue": ("no ordinary file", lambda bag: queue(bag / "metadata.yaml")),
+    "data is a queue": ("no ordinary file", lambda bag: queue(bag / "a.db3")),
+    "parts that double": (
+        "refers to its own parts",
+        lambda bag: (bag / "metadata.yaml").write_text(
+            "a0: &a0 {x: 1}\n"
+            + "".join(f"a{k + 1}: &a{k + 1} {{<<: [*a{k}, *a{k}]}}\n" for k in range(40))
+        ),
+    ),
+    "brackets": ("nested too deeply", lambda bag: (bag / "metadata.yaml").write_text("[" * 10**5)),
+    "too long": (
+        "more than the 16 MiB",
+        lambda bag: os.truncate(bag / "metadata.yaml", 1 << 30),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_folders_that_rosbags_would_read_for_ever_are_refused(tmp_path: Path, name: str) -> None:
+    bag = Bag(tmp_path, "ros2")
+    bag.info("/camera/depth/camera_info")
+    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    path = bag.close()
+    said, spoil = HOSTILE[name]
+    spoil(path)
+    for format_ in ("ros", "realsense-bag"):
+        with pytest.raises(InputError, match=said):
+            open_recording(path, format=format_)
 
 
 def test_without_rosbags_it_is_said_how_to_get_it(

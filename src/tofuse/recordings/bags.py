@@ -12,6 +12,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
+from tofuse.files.reading import input_error, is_folder, read_text
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import check_size
 from tofuse.recordings.ros_messages import GREY, image, taken
@@ -20,6 +21,8 @@ MISSING = "run `pip install 'tofuse[ros]'`, which installs rosbags"
 MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
+_MAX_METADATA_BYTES = 16 << 20
+_MAX_DEPTH = 100  # of brackets in metadata.yaml, of which rosbag2 writes 5
 
 
 def open_bag(path: Path) -> Any:
@@ -31,6 +34,8 @@ def open_bag(path: Path) -> Any:
         If rosbags is missing, or can't open it.
     """
     highlevel, typesys = _rosbags(path, "highlevel", "typesys")
+    if is_folder(path):
+        _check_folder(path)
     return _opened(
         path,
         lambda: highlevel.AnyReader(
@@ -53,6 +58,38 @@ def _rosbags(path: Path, *modules: str) -> list[ModuleType]:
         return [importlib.import_module(f"rosbags.{name}") for name in modules]
     except ImportError as error:
         raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
+
+
+def _check_folder(path: Path) -> None:
+    """Refuse what rosbags would wait for, or read without end.
+
+    It opens whatever metadata.yaml names, and a YAML file of a hundred bytes that refers to its own
+    parts can expand to gigabytes.
+    """
+    try:
+        for entry in path.iterdir():
+            if entry.exists() and not (entry.is_file() or entry.is_dir()):
+                raise InputError(
+                    "is no ordinary file", where=entry, remedy="take it out of the bag"
+                )
+    except OSError as error:
+        raise input_error(error, path) from error
+    metadata = path / "metadata.yaml"
+    text = read_text(metadata, limit=_MAX_METADATA_BYTES)
+    yaml = importlib.import_module("ruamel.yaml")  # as rosbags does
+    depth = 0
+    try:
+        for event in yaml.YAML(typ="safe").parse(text):
+            depth += isinstance(event, yaml.events.CollectionStartEvent)
+            depth -= isinstance(event, yaml.events.CollectionEndEvent)
+            if isinstance(event, yaml.events.AliasEvent) or depth > _MAX_DEPTH:
+                raise InputError(
+                    "refers to its own parts, or is nested too deeply",
+                    where=metadata,
+                    remedy="reindex the bag",
+                )
+    except (yaml.error.YAMLError, ValueError, RecursionError):
+        return  # which rosbags says better
 
 
 def _opened(path: Path, make: Callable[[], Any]) -> Any:
