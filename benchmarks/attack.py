@@ -87,7 +87,7 @@ def damaged_files(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
         return count, [f"seed {k}: {said}" for k, said in outcomes if said not in HELD]
 
     for number, first, count in pieces(each, FILES_IN_PIECE):
-        for name in subjects:
+        for name in reversed(subjects):  # the small ones first
             yield f"damaged: {name}", number, lambda n=name, f=first, c=count: work(n, f, c)
 
 

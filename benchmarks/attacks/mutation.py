@@ -8,27 +8,33 @@ crashes is found out and the others go on.
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-TESTS = Path(__file__).parents[2] / "tests"
+_TESTS = Path(__file__).parents[2] / "tests"  # which make the files
+sys.path[:0] = [str(_TESTS / "helpers"), str(_TESTS / "recordings")]
 _SECONDS = 20  # of the processor, for one file
 _WAITING = 6  # times as long may pass on the clock of a busy machine
 _MORE_BYTES = 3 << 30  # of addresses, than what is loaded has
 _DEEP = 100_000
+# Each process is forked from one that has loaded everything and read nothing: no threads yet.
+_FORKED = multiprocessing.get_context("forkserver")
+_FORKED.set_forkserver_preload(["attacks.loaded"])
 _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
           b"0", b"9" * 5000, b"[", b'{"a":', b"null")  # fmt: skip
 
@@ -41,10 +47,9 @@ class Subject:
     read: Callable[[Path], object]
 
 
+@cache
 def subjects() -> dict[str, Subject]:
     """Return all, by name; those whose optional packages are missing are left out."""
-    if str(TESTS) not in sys.path:
-        sys.path.insert(0, str(TESTS))
     import test_recordings_fuzz as plain
     import test_recordings_fuzz_cameras as cameras
 
@@ -457,8 +462,8 @@ def _check_line(error: Exception) -> None:
         raise AssertionError(f"{len(text)} characters on {len(text.splitlines())} lines")
 
 
-def _work(name: str, first: int, count: int) -> None:
-    """Attack one subject, and print a line for each seed."""
+def _work(name: str, first: int, count: int, told: Connection) -> None:
+    """Attack one subject, and send seed and outcome of each attempt."""
     subject = subjects()[name]
     with tempfile.TemporaryDirectory(prefix="attack-") as base:
         original = Path(base) / "whole"
@@ -470,7 +475,7 @@ def _work(name: str, first: int, count: int) -> None:
         for seed in range(first, first + count):
             copy = Path(base) / "copy"
             shutil.copytree(original, copy, symlinks=True)
-            print(json.dumps([seed, attack(name, subject, seed, copy)]), flush=True)
+            told.send((seed, attack(name, subject, seed, copy)))
             shutil.rmtree(copy)
 
 
@@ -478,27 +483,17 @@ def run(name: str, count: int, first: int = 0) -> Iterator[tuple[int, str]]:
     """Attack one subject with so many seeds, in processes of its own; gives seed and outcome."""
     done, end = first, first + count
     while done < end:
-        command = [sys.executable, "-m", "attacks.mutation", name, str(done), str(end - done)]
-        worker = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            cwd=Path(__file__).parents[1],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
-        )  # fmt: skip
-        assert worker.stdout is not None
-        assert worker.stderr is not None
-        for line in worker.stdout:
-            seed, outcome = json.loads(line)
-            yield seed, outcome
-            done = seed + 1
-        said = worker.stderr.read()
-        worker.stdout.close()
-        worker.stderr.close()
-        if worker.wait() == 0:
+        told, tells = _FORKED.Pipe(duplex=False)
+        worker = _FORKED.Process(target=_work, args=(name, done, end - done, tells))
+        worker.start()
+        tells.close()
+        with told, suppress(EOFError):
+            while True:
+                seed, outcome = told.recv()
+                yield seed, outcome
+                done = seed + 1
+        worker.join()
+        if worker.exitcode == 0:
             return
-        last = (said.strip().splitlines() or ["nothing was said"])[-1]
-        yield done, f"its process ended with {worker.returncode}: {last[:150]}"
+        yield done, f"its process ended with {worker.exitcode}"
         done += 1
-
-
-if __name__ == "__main__":
-    _work(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

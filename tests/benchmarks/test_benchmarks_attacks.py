@@ -48,6 +48,15 @@ def test_damaged_files_are_read_or_refused(attacks, tmp_path: Path) -> None:
     assert min(seen["read"], seen["refused"]) > 50
 
 
+def test_processes_that_crash_are_told_and_the_others_go_on(attacks) -> None:
+    _, mutation = attacks
+    found = list(mutation.run("pose", 3, first=7))
+    assert [seed for seed, _ in found] == [7, 8, 9]
+    assert {outcome for _, outcome in found} <= {"read", "refused"}
+    (crashed,) = mutation.run("no such format", 1)
+    assert crashed == (0, "its process ended with 1")
+
+
 def test_power_cuts(attacks) -> None:
     attack, _ = attacks
     assert attack.cuts(0, 10, seed=3) == (10, [])
