@@ -40,6 +40,17 @@ def test_a_leak_is_noticed(soak, capsys) -> None:
     assert capsys.readouterr().out.count("DID NOT HOLD") == 3
 
 
+def test_a_store_may_fill_but_not_overflow(soak) -> None:
+    def filling(allowed: int) -> list:
+        return [
+            soak.Held(100 * k, int(5e8 + 1e7 * k), 7, 3, stored=int(1e7 * k), allowed=allowed)
+            for k in range(10)
+        ]
+
+    assert soak.judged("some", filling(10**8), soak.RUN_BYTES)
+    assert not soak.judged("some", filling(5 * 10**7), soak.RUN_BYTES)
+
+
 def test_what_a_live_camera_sends_is_recorded(soak, tmp_path: Path, capsys) -> None:
     """Two minutes of its time, of which some is missing, some comes twice, and some late."""
     assert soak.live(32, 120.0, 10.0, tmp_path, mapped=False)

@@ -9,7 +9,7 @@ import pytest
 from tofuse.errors import InputError
 from tofuse.fusion.options import Fusion
 from tofuse.pipeline.budget import views_bytes, voxels_mb
-from tofuse.pipeline.config import from_method
+from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.run import Options, resolve
 
 
@@ -24,6 +24,16 @@ def test_memory_is_divided_in_one_place() -> None:
 def test_unless_asked_for_it_is_as_ever() -> None:
     config = from_method("default")
     assert config.fusion.memory_mb == Fusion().memory_mb == voxels_mb(config.memory_mb)
+
+
+def test_memory_in_a_configuration_is_divided_as_well() -> None:
+    config = changed(from_method("default"), {"memory_mb": 500}, where="test")
+    assert (config.memory_mb, config.fusion.memory_mb) == (500, voxels_mb(500))
+    said = {"memory_mb": 500, "fusion": {"memory_mb": 90}}
+    assert changed(config, said, where="test").fusion.memory_mb == 90
+    assert changed(config, {"fusion": {"memory_mb": 80}}, where="test").memory_mb == 500
+    with pytest.raises(InputError, match="memory_mb"):
+        changed(config, {"memory_mb": "much"}, where="test")
 
 
 def test_too_little_memory_is_refused() -> None:

@@ -108,7 +108,10 @@ def test_numbers_that_no_camera_has(field, value, recording, tmp_path, capfd) ->
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "[" * 900 + "]" * 900])
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "[" * 5000, "a = " + "[" * 900 + "]" * 900, "a." * 10**6 + "a = 1"],
+)
 def test_nested_tables(text, recording, tmp_path, capfd) -> None:
     (tmp_path / "a.toml").write_text(text)
     words = ["run", str(recording), "--out", str(tmp_path / "out")]

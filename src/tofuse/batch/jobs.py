@@ -8,7 +8,6 @@ import io
 import json
 import os
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from glob import escape, glob, has_magic
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.errors import InputError
-from tofuse.files.reading import name_order, parsed, read_text
+from tofuse.files.reading import name_order, parse_toml, read_text
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # other names in the output folder
@@ -164,7 +163,7 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
 
 
 def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
-    data = parsed(tomllib.loads, text, where=path, what="TOML")
+    data = parse_toml(text, where=path)
     shared, tables = data.pop("all", {}), data.pop("job", [])
     if data or not isinstance(shared, dict) or not isinstance(tables, list):
         raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from tofuse.errors import InputError
 
 MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
+_MAX_DOTS = 1000  # on a line of TOML
 
 _REASONS = {
     errno.ENOENT: ("doesn't exist", "check the path"),
@@ -96,6 +98,17 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: s
         raise InputError(f"is not {what} (nested too deeply)", where=where) from error
     except ValueError as error:
         raise InputError(f"is not {what} ({error})", where=where) from error
+
+
+def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
+    """Return what a TOML text from outside says; errors as `parsed`.
+
+    The time that tomllib takes for a dotted key grows with the square of its parts.
+    """
+    if any(line.count(".") > _MAX_DOTS for line in text.split("\n")):
+        raise InputError("is not TOML (nested too deeply)", where=where)
+    found: dict[str, Any] = parsed(tomllib.loads, text, where=where, what="TOML")
+    return found
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES) -> str:

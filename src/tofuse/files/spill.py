@@ -167,12 +167,17 @@ class Spill(Generic[T]):
         Bytes of arrays to keep in memory; the newest item is kept in any case.
     folder
         Of the temporary file; see `SpillFile`.
+
+    Attributes
+    ----------
+    budget
+        As given.
     """
 
     def __init__(self, budget: int, folder: Path | None = None) -> None:
         if budget < 0:
             raise ValueError(f"budget is {budget}, not 0 or more")
-        self._budget = budget
+        self.budget = budget
         self._entries: dict[int, _Entry] = {}
         self._resident: OrderedDict[int, T] = OrderedDict()  # least recently used first
         self._resident_bytes = 0
@@ -260,7 +265,7 @@ class Spill(Generic[T]):
     def _keep(self, number: int, item: T) -> None:
         self._resident[number] = item
         self._resident_bytes += self._entries[number].nbytes
-        while self._resident_bytes > self._budget and len(self._resident) > 1:
+        while self._resident_bytes > self.budget and len(self._resident) > 1:
             oldest = next(iter(self._resident))
             self._write(oldest)
             del self._resident[oldest]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,11 @@ from tofuse import parts
 from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction
 from tofuse.errors import InputError
-from tofuse.files.reading import parsed, read_text
+from tofuse.files.reading import parse_toml, read_text
 from tofuse.filters.base import Filter
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
+from tofuse.pipeline.budget import voxels_mb
 from tofuse.posegraph.external_sensors import ExternalSensor
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.joining import Joining
@@ -124,7 +124,8 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     ----------
     changes
         Nested options as in a TOML file. Tables are merged; a table that names another part
-        replaces the whole part, a list replaces the whole list.
+        replaces the whole part, a list replaces the whole list. `memory_mb` is divided: fusion
+        gets its share of it, unless the same changes say otherwise.
     where
         Names the file in errors.
 
@@ -135,7 +136,7 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     """
     for room in ROOMS:
         parts.discover(room)
-    merged = _merge(config.to_dict(), changes)
+    merged = _merge(config.to_dict(), _divided(changes))
     result: Config = parts.from_dict(Config, merged, where=where)
     return result
 
@@ -154,8 +155,16 @@ def read_changes(path: str | Path) -> dict[str, Any]:
         if not isinstance(config, dict):
             raise InputError("holds no config", where=path, remedy="give a run.json of tofuse")
         return config
-    found: dict[str, Any] = parsed(tomllib.loads, read_text(path), where=path, what="TOML")
-    return found
+    return parse_toml(read_text(path), where=path)
+
+
+def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Add fusion's share of the memory that is asked for."""
+    megabytes = changes.get("memory_mb")
+    if type(megabytes) is not int:  # not asked for, or refused later
+        return changes
+    share = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
+    return dict(_merge(share, changes))
 
 
 def _merge(base: Any, change: Any) -> Any:

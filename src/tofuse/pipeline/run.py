@@ -20,7 +20,6 @@ from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
 from tofuse.pipeline.adaptation import adapted
-from tofuse.pipeline.budget import voxels_mb
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.judging import device_sentence
@@ -313,8 +312,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         config = changed(config, {"fusion": {"voxel_m": options.voxel}}, where="--voxel")
     if options.memory is not None:
         megabytes = options.memory // 1_000_000
-        divided = {"memory_mb": megabytes, "fusion": {"memory_mb": voxels_mb(megabytes)}}
-        config = changed(config, divided, where="--memory")
+        config = changed(config, {"memory_mb": megabytes}, where="--memory")
     if options.tolerance is not None:
         config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
     front: list[dict[str, Any]] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_text
+from tofuse.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, number_in
@@ -78,10 +77,7 @@ def _settings(path: Path) -> Path | None:
 
 def _read(path: Path) -> dict[str, Any]:
     """Return the values of all tables of a file by their own names."""
-    try:
-        data = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"is invalid TOML ({error})", where=path, remedy="correct it") from error
+    data = parse_toml(read_text(path), where=path)
     values: dict[str, Any] = {}
     for key, value in data.items():
         values |= value if isinstance(value, dict) else {key: value}
