@@ -159,6 +159,74 @@ def test_las_that_claims_too_much(tmp_path: Path) -> None:
         tofuse.open(tmp_path / "a.las")[0]
 
 
+def test_las_that_claims_records_without_end(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    write_las(tmp_path / "a.las", POINTS)
+    content = (tmp_path / "a.las").read_bytes()
+    for at in (100, 243):  # of records before and behind the points
+        data = bytearray(content)
+        data[at : at + 4] = struct.pack("<I", 1 << 31)
+        (tmp_path / "a.las").write_bytes(data)
+        with pytest.raises(InputError, match="claims 2147483648 records beside its points"):
+            tofuse.open(tmp_path / "a.las")
+
+
+def test_las_far_from_its_own_bounds(tmp_path: Path) -> None:
+    """What is taken off its points is told by the header, and is nonsense here."""
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    data.write(tmp_path / "a.las")
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    content[179:227] = struct.pack("<6d", *[1e300] * 6)
+    (tmp_path / "a.las").write_bytes(content)
+    for item in tofuse.open(tmp_path / "a.las").read_all():
+        assert isinstance(item, InputError) or np.isfinite(item.points).all()
+
+
+# Of a LAZ file: where its 64-bit number that says where the table of chunks is, is; in the table
+# the number of chunks; and what they claim.
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [("table", 4), ("table", 1 << 60), ("table", -1), ("count", (1 << 32) - 1), ("count", 0)],
+)
+def test_forged_chunks_of_laz_are_refused(tmp_path: Path, where: str, number: int) -> None:
+    """lazrs would set aside 64 GB for them, and end the process where there is not so much."""
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    path = tmp_path / "a.laz"
+    data.write(path)
+    with laspy.open(path) as file:
+        start = int(file.header.offset_to_point_data)
+    content = bytearray(path.read_bytes())
+    (table,) = struct.unpack_from("<q", content, start)
+    if where == "table":
+        struct.pack_into("<q", content, start, number)
+    else:
+        struct.pack_into("<I", content, table + 4, number)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="can't be read"):
+        tofuse.open(path)
+
+
+def test_laz_that_claims_points_of_no_chunk(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    path = tmp_path / "a.laz"
+    data.write(path)
+    content = bytearray(path.read_bytes())
+    for count, said in ((60_000, "hold 50000 points"), (90_000_000, "claims 90000000 points")):
+        struct.pack_into("<I", content, 107, count)
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            tofuse.open(path)
+
+
 def test_e57(tmp_path: Path) -> None:
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "scans.e57"

@@ -177,6 +177,7 @@ def cloud_frame(
     measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
     if shift is not None:
         points = points - shift
+        measured &= (np.abs(points) < FARTHEST_M).all(1)
         origin = None if origin is None else origin - shift
     with np.errstate(over="ignore", invalid="ignore"):
         shifted = points.astype(np.float32, copy=False)

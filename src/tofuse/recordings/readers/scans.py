@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import struct
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +31,7 @@ from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
+_MOST_PACKED = 1000  # times that LAZ packs points; real scans 4 to 15 times
 _MISSING = "give `pip install 'tofuse[scan]'`"
 
 
@@ -62,8 +65,10 @@ def _laspy(path: Path) -> Any:
 
 def _las_header(path: Path) -> Any:
     laspy = _laspy(path)
-    if read_head(path, 4) != b"LASF":
+    head = read_head(path, 375)
+    if head[:4] != b"LASF":
         raise InputError("isn't a LAS file", where=path, remedy="check the file")
+    _check_records(head, path)
     try:
         with laspy.open(path) as file:
             header = file.header
@@ -72,11 +77,61 @@ def _las_header(path: Path) -> Any:
     count, size = int(header.point_count), int(header.point_format.size)
     whole = path.stat().st_size
     packed = bool(getattr(header, "are_points_compressed", False))
-    if count > MAX_POINTS or (not packed and count * size > whole):
+    if count > MAX_POINTS or count * size > whole * (_MOST_PACKED if packed else 1):
         raise InputError(
             f"declares {count} points in {whole} bytes", where=path, remedy="copy the file again"
         )
+    if packed and count:
+        try:
+            _check_chunks(path, header)
+        except Exception as error:  # lazrs has errors of its own
+            raise _damaged(error, path) from error
     return header
+
+
+def _check_records(head: bytes, path: Path) -> None:
+    """Refuse more records beside the points than the file has room for: laspy looks for each."""
+    count = int.from_bytes(head[100:104], "little")
+    more = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
+    if 54 * count + 60 * more > path.stat().st_size:  # bytes of their headers
+        raise InputError(
+            f"claims {count + more} records beside its points",
+            where=path,
+            remedy="copy the file again",
+        )
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Refuse a table of chunks that the file can't have.
+
+    lazrs sets aside what the table asks for, and ends the process where there is not so much. The
+    table follows the chunks: its version, how many there are, and their packed sizes. Where it lies
+    is in front of them, or where that was not known yet in the last 8 bytes (LASzip's
+    specification of LAZ, 2.2).
+    """
+    lazrs = importlib.import_module("lazrs")
+    size, start = path.stat().st_size, int(header.offset_to_point_data)
+    layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    if layout.item_size() != header.point_format.size:
+        raise ValueError("its points are described in two ways")
+    with path.open("rb") as file:
+        file.seek(start)
+        (table,) = struct.unpack("<q", file.read(8))
+        if table <= start:
+            file.seek(-8, os.SEEK_END)
+            (table,) = struct.unpack("<q", file.read(8))
+        if not start + 8 <= table <= size - 8:
+            raise ValueError("its table of chunks is elsewhere")
+        file.seek(table)
+        _, count = struct.unpack("<II", file.read(8))
+        # Each begins with a point that is not packed.
+        if count * layout.item_size() > table - start:
+            raise ValueError(f"it claims {count} chunks")
+        file.seek(start)
+        chunks = lazrs.read_chunk_table(file, layout)
+    points, packed = (sum(each) for each in zip(*chunks, strict=True)) if chunks else (0, 0)
+    if packed > table - start or points < header.point_count:
+        raise ValueError(f"its {count} chunks hold {points} points in {packed} bytes")
 
 
 def _shift(path: Path) -> Float64:
@@ -92,7 +147,7 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
     _las_header(path)
     try:
         points = _laspy(path).read(path)
-        xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1) - shift
+        xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
         amplitude = np.asarray(points["intensity"], np.float32)
         color = None
@@ -107,9 +162,10 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
     return cloud_frame(
         index,
         timestamp,
-        xyz.astype(np.float32),
+        xyz,
         amplitude=amplitude if amplitude.any() else None,
         color=color if color is not None and color.any() else None,
+        shift=shift,
     )
 
 
