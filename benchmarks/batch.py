@@ -83,9 +83,17 @@ def run_alone(recordings: list[Path], out: Path) -> float:
 
 
 def start_batch(list_file: Path, out: Path, *words: object) -> subprocess.Popen[str]:
-    """Begin a batch of one thread a job."""
+    """Begin a batch of one thread a job, which Ctrl-C interrupts.
+
+    A shell lets what it begins in the background ignore Ctrl-C, as would all that begins from
+    there: who runs this in the background wants to interrupt the batch all the same.
+    """
     command = tofuse("batch", list_file, "--out", out, "--threads", 1, *words)
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def finish(batch: subprocess.Popen[str]) -> str:

@@ -80,7 +80,7 @@ class Held:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         handles, tasks = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
         stores = [o for o in gc.get_objects() if isinstance(o, Spill) and len(o)]
-        stored, allowed = (sum(getattr(s, n) for s in stores) for n in ("held_bytes", "budget"))
+        stored, allowed = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
         memory = pages * os.sysconf("SC_PAGE_SIZE")
         return Held(after, memory, handles, tasks, stored, allowed)
 

@@ -163,6 +163,32 @@ def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_in_a_destructor_is_not_lost(name: str, status: int) -> None:
+    """Python drops what is raised there: Ctrl-C would be without effect."""
+    script = (
+        "import os, signal, sys, threading, time, weakref\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from tofuse import cli\n"
+        "class Some: pass\n"
+        "def dropped():\n"
+        f"    os.kill(os.getpid(), signal.{name})\n"
+        "    time.sleep(5)\n"
+        "def command():\n"
+        "    some = Some()\n"
+        "    weakref.finalize(some, dropped)\n"
+        "    del some\n"
+        "    threading.Event().wait(20)\n"
+        "    return 0\n"
+        "cli.main = lambda: cli.told(command)\n"
+        "sys.exit(cli.console())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert done.returncode == status
+    assert done.stderr.count(b"\n") == 1
+
+
 CGROUPS = {
     "none": ({}, None),
     "all": ({"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/cpu.max": "max 100000\n"}, None),

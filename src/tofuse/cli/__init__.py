@@ -8,6 +8,7 @@ but some readable frame has none; 2, nothing was written: one line on stderr say
 
 from __future__ import annotations
 
+import _thread
 import gc
 import os
 import signal
@@ -15,6 +16,11 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from time import sleep
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    Unraisable = Callable[[sys.UnraisableHookArgs], object]
 
 _BROKEN_PIPE = 128 + 13  # as if terminated by SIGPIPE
 _UNCHANGED = "existing files are unchanged, or the new result is complete"
@@ -56,11 +62,39 @@ def ended_by_signals() -> Iterator[None]:
     # Signals that are ignored (nohup) stay ignored. Only the main thread may set handlers.
     wanted = [n for n in numbers if is_main and signal.getsignal(n) == signal.SIG_DFL]
     before = {number: signal.signal(number, end) for number in wanted}
+    hook, sys.unraisablehook = sys.unraisablehook, _resending(sys.unraisablehook)
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _resending(hook: Unraisable) -> Unraisable:
+    """Return a hook that resends a signal if Python discards the exception of its handler.
+
+    Exceptions in finalizers and weak reference callbacks are discarded, and those may run at any
+    bytecode of the main thread.
+    """
+    from tofuse.errors import Ended
+
+    def resend(number: int) -> None:
+        sleep(0.01)  # until the main thread has left the finalizer
+        if hasattr(signal, "pthread_kill"):  # interrupts blocking calls of the main thread
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+        else:
+            signal.raise_signal(number)
+
+    def discarded(error: sys.UnraisableHookArgs) -> None:
+        if isinstance(error.exc_value, KeyboardInterrupt | Ended):
+            number = getattr(error.exc_value, "number", int(signal.SIGINT))
+            # `threading.Thread` takes locks that the main thread may hold at this point.
+            _thread.start_new_thread(resend, (number,))
+        else:
+            hook(error)
+
+    return discarded
 
 
 def report_bugs(command: Callable[[], int]) -> int:
