@@ -33,7 +33,7 @@ DEPTH_LENS = Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
 class Bag:
     """Writes messages to a bag of a kind."""
 
-    def __init__(self, folder: Path, kind: str) -> None:
+    def __init__(self, folder: Path, kind: str, compression: str | None = None) -> None:
         pytest.importorskip("rosbags", reason="the package rosbags is not installed")
         self.kind = kind
         self.store = importlib.import_module("rosbags.typesys").get_typestore(
@@ -49,6 +49,11 @@ class Bag:
             self.path = folder / "a"
             plugin = rosbag2.StoragePlugin["MCAP" if kind == "mcap" else "SQLITE3"]
             self.writer = rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
+        if compression is not None and kind == "ros1":
+            self.writer.set_compression(self.writer.CompressionFormat[compression])
+        elif compression is not None:
+            mode = rosbag2.CompressionMode[compression]
+            self.writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
         self.writer.open()
         self.connections: dict[str, Any] = {}
         if "tf2_msgs/msg/TFMessage" not in self.store.types:

@@ -379,6 +379,27 @@ def test_folders_that_rosbags_would_read_for_ever_are_refused(tmp_path: Path, na
             open_recording(path, format=format_)
 
 
+@pytest.mark.parametrize(
+    ("kind", "packed"),
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
+     ("ros2", "MESSAGE")],
+)  # fmt: skip
+def test_chunks_that_expand_beyond_all_bounds_are_refused(
+    tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = Bag(tmp_path, kind, packed)
+    bag.info("/camera/depth/camera_info")
+    for k in range(3):
+        bag.image(TOPIC, 10 + k, COUNTS[k], "16UC1")
+    path = bag.close()
+    frame = open_recording(path)[2]
+    assert isinstance(frame, RangeFrame)
+    np.testing.assert_allclose(frame.z, COUNTS[2] / 1000, rtol=1e-6)
+    monkeypatch.setattr(bags, "_MAX_CHUNK_BYTES", 100)
+    with pytest.raises(InputError, match="more than 100 bytes"):
+        open_recording(path)
+
+
 def test_without_rosbags_it_is_said_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

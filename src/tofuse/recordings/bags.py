@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import bz2
 import importlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,7 @@ MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
 _MAX_METADATA_BYTES = 16 << 20
+_MAX_CHUNK_BYTES = 1 << 30  # rosbag writes chunks of 768 kB, MCAP of 4 MB
 _MAX_DEPTH = 100  # of brackets in metadata.yaml, of which rosbag2 writes 5
 
 
@@ -55,9 +59,40 @@ def open_container(path: Path) -> Any:
 
 def _rosbags(path: Path, *modules: str) -> list[ModuleType]:
     try:
-        return [importlib.import_module(f"rosbags.{name}") for name in modules]
+        found = [importlib.import_module(f"rosbags.{name}") for name in modules]
     except ImportError as error:
         raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
+    # Of a version of rosbags that has none of it, memory is not bounded.
+    with suppress(ImportError, AttributeError):
+        _bound_chunks()
+    return found
+
+
+@cache
+def _bound_chunks() -> None:
+    """Let rosbags unpack no more of a chunk or message than memory has room for.
+
+    A packed kilobyte may stand for gigabytes, and rosbags takes what comes.
+    """
+    frames = importlib.import_module("lz4.frame")
+    bag = importlib.import_module("rosbags.rosbag1.reader")
+    bag2 = importlib.import_module("rosbags.rosbag2.reader")
+    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    lz4, zstd = _bounded(frames.LZ4FrameDecompressor), _bounded(mcap.zstd.ZstdDecompressor)
+    bag.decompressors.update({"bz2": _bounded(bz2.BZ2Decompressor), "lz4": lz4})
+    mcap.DECOMPRESSORS.update({"lz4": lambda d, _: lz4(d), "zstd": lambda d, _: zstd(d)})
+    bag2.zstd = SimpleNamespace(decompress=zstd, open=mcap.zstd.open)
+
+
+def _bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def unpack(data: bytes) -> bytes:
+        unpacker = make()
+        found: bytes = unpacker.decompress(data, _MAX_CHUNK_BYTES)
+        if not unpacker.eof:
+            raise ValueError(f"a chunk is cut off, or has more than {_MAX_CHUNK_BYTES} bytes")
+        return found
+
+    return unpack
 
 
 def _check_folder(path: Path) -> None:
