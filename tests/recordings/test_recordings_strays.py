@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,11 @@ from made_recordings import make_sr4000
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
+from tofuse.files.pose import read_pose
 from tofuse.files.stamps import stamp, stamps_in
+from tofuse.files.trajectory_formats import read_poses
+from tofuse.posegraph.g2o import read_g2o
+from tofuse.posegraph.given import read_loops
 from tofuse.recordings.rig import is_plain_name, read_rig
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links and queues of other systems")
@@ -117,6 +122,27 @@ def test_nested_tables(text, recording, tmp_path, capfd) -> None:
     words = ["run", str(recording), "--out", str(tmp_path / "out")]
     assert main([*words, "--config", str(tmp_path / "a.toml")]) == 2
     assert capfd.readouterr().err.count("\n") == 1
+
+
+LONG = "1e300 0 0 1"  # a quaternion whose square is more than any number
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "read"),
+    [
+        ("a.g2o", f"VERTEX_SE3:QUAT 0 0 0 0 {LONG}\n", read_g2o),
+        ("a.txt", f"0 0 0 0 {LONG}\n", read_poses),
+        ("loops.txt", f"0 1 0 0 0 {LONG}\n", read_loops),
+        ("pose.txt", f"0 0 0 {LONG}\n", read_pose),
+    ],
+)
+def test_quaternions_of_any_length(name, text, read, tmp_path) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError):
+            read(path)
 
 
 def test_what_is_quoted_of_a_file_has_an_end(tmp_path) -> None:

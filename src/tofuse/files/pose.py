@@ -14,7 +14,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import length, to_matrix
 from tofuse.geometry.se3 import check_pose
 
 FIELD = "T_target_source"
@@ -91,7 +91,7 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
     if len(numbers) not in (7, 8):
         raise InputError(f"contains {len(numbers)} numbers", where=path, remedy=_REMEDY)
     row = np.array(numbers[-7:])
-    norm = float(np.linalg.norm(row[3:]))
+    norm = float(length(row[3:]))
     if abs(norm - 1) > 0.1:
         raise InputError(f"its quaternion has length {norm:.3g}, not 1", where=path, remedy=_REMEDY)
     T = np.eye(4)

@@ -12,7 +12,7 @@ from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
-from tofuse.geometry.quaternion import from_matrix, to_matrix
+from tofuse.geometry.quaternion import from_matrix, length, to_matrix
 
 ASSOCIATION_LIMIT_S = 0.02
 
@@ -45,7 +45,7 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
             raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
         if not np.isfinite(row).all():
             raise InputError("contains a number that is not finite", where=where, remedy=_TUM)
-        if abs(float(np.linalg.norm(row[4:])) - 1) > 0.1:
+        if abs(length(row[4:]) - 1) > 0.1:
             raise InputError(
                 "contains a quaternion that is not of unit length", where=where, remedy=_TUM
             )

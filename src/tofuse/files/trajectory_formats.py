@@ -21,7 +21,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_file, is_folder, read_text
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry import se3
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import length, to_matrix
 
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
@@ -191,7 +191,7 @@ def _rigid(T: Float64, where: str) -> Float64:
 
 
 def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[int]) -> Float64:
-    off = np.abs(np.linalg.norm(q_xyzw, axis=1) - 1)
+    off = np.abs(length(q_xyzw) - 1)
     if (off > 0.1).any():
         raise InputError(
             "contains a quaternion that is not of unit length",

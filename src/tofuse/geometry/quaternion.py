@@ -28,6 +28,12 @@ def to_matrix(q: ArrayLike) -> Float64:
     return unnormalised_matrix(q) / (q * q).sum(-1)[..., None, None]
 
 
+def length(q: ArrayLike) -> Float64:
+    """Norm (...) of quaternions read from files; infinite if float64 can't hold its square."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.linalg.norm(np.asarray(q, float), axis=-1))
+
+
 def from_matrix(R: ArrayLike) -> Float64:
     """Unit quaternion (..., 4) with s >= 0 of rotation matrices (..., 3, 3).
 

@@ -138,7 +138,7 @@ def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[i
         raise InputError(f"holds something that is no number ({error})", where=where) from error
     if not np.isfinite(values).all():
         raise InputError(f"{words[0]} holds a number that is not finite", where=where)
-    length = float(np.linalg.norm(values[3:7]))
+    length = float(quaternion.length(values[3:7]))
     if abs(length - 1) > _UNIT:
         raise InputError(
             f"the quaternion has length {length:.4g}, not 1", where=where, remedy="normalise it"

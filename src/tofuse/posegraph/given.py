@@ -57,7 +57,7 @@ def _loop(words: list[str], where: str) -> GivenLoop:
         raise InputError(f"joins frames {i} and {j}", where=where, remedy="give two frames")
     if len(values) == 0:
         return GivenLoop(min(i, j), max(i, j))
-    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > _UNIT:
+    if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > _UNIT:
         raise InputError(
             "is no rigid motion",
             where=where,

@@ -14,7 +14,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import length, to_matrix
 from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
@@ -135,7 +135,7 @@ class CloudFileSource(FileSource):
                 f"{path}: not 'index x y z qw qx qy qz', ignored; use groundtruth.txt (TUM)"
             )
             return None
-        norms = np.linalg.norm(table[:, 4:], axis=1)
+        norms = length(table[:, 4:])
         if (np.abs(norms - 1) > 0.1).any():
             raise InputError(
                 "contains quaternions that are not of unit length",

@@ -123,7 +123,7 @@ def _row(each: Any) -> tuple[float, str, Float64] | None:
     """Time, parent and T_parent_child (4, 4) of a transform; None if it is not a rigid motion."""
     t, q = each.transform.translation, each.transform.rotation
     numbers = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float)
-    if not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1) > 0.01:
+    if not np.isfinite(numbers).all() or abs(quaternion.length(numbers[3:]) - 1) > 0.01:
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion.to_matrix(numbers[3:]), numbers[:3]

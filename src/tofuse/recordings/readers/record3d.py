@@ -274,7 +274,7 @@ class _Metadata:
         if "poses" not in self.data:
             return None
         table = self._numbers("poses", None, columns=7)
-        norms = np.linalg.norm(table[:, :4], axis=1)
+        norms = quaternion.length(table[:, :4])
         good = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
         poses[good] = np.eye(4)

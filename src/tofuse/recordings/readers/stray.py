@@ -152,7 +152,7 @@ class StraySource(PhoneSource):
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         good = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
-        good &= np.abs(np.linalg.norm(np.where(good[:, None], table, 0)[:, 3:], axis=1) - 1) < 0.01
+        good &= np.abs(quaternion.length(np.where(good[:, None], table, 0)[:, 3:]) - 1) < 0.01
         poses[good] = np.eye(4)
         poses[good, :3, :3] = quaternion.to_matrix(table[good, 3:])
         poses[good, :3, 3] = table[good, :3]
