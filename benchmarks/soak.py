@@ -57,7 +57,9 @@ SAMPLES = 10
 class Held:
     """What the process holds: bytes of memory, open file handles, threads.
 
-    Of the memory, `stored` bytes are in stores of a mapper, which may keep `allowed`.
+    Of the memory, `stored` bytes are in stores of a mapper, which may keep `allowed`. `blocks` are
+    those that Python has allocated: what is left of a run or a frame is among them, while memory is
+    blurred by the gaps between them.
     """
 
     after: int
@@ -66,6 +68,7 @@ class Held:
     threads: int
     stored: int = 0
     allowed: int = 0
+    blocks: int = 0
 
     @property
     def other(self) -> int:
@@ -82,7 +85,8 @@ class Held:
         stores = [o for o in gc.get_objects() if isinstance(o, Spill) and len(o)]
         stored, allowed = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
         memory = pages * os.sysconf("SC_PAGE_SIZE")
-        return Held(after, memory, handles, tasks, stored, allowed)
+        blocks = sys.getallocatedblocks()
+        return Held(after, memory, handles, tasks, stored, allowed, blocks)
 
 
 def growth(held: list[Held]) -> float:
@@ -99,10 +103,11 @@ def growth(held: list[Held]) -> float:
 
 def judged(what: str, held: list[Held], each: float) -> bool:
     """Print what was held, and return whether it stayed within bounds."""
-    print(f"\n{what}\n{'after':>8}{'MB':>9}{'in stores':>11}{'handles':>9}{'threads':>9}")
+    head = f"{'after':>8}{'MB':>9}{'in stores':>11}{'handles':>9}{'threads':>9}{'blocks':>10}"
+    print(f"\n{what}\n{head}")
     for one in held:
         row = f"{one.after:>8}{one.memory / 1e6:>9.1f}{one.stored / 1e6:>11.1f}"
-        print(f"{row}{one.handles:>9}{one.threads:>9}")
+        print(f"{row}{one.handles:>9}{one.threads:>9}{one.blocks:>10}")
     late = held[len(held) // 2 :]
     slope, count = growth(held), late[-1].after - late[0].after
     flat = slope * count <= each * count + NOISE_BYTES

@@ -181,7 +181,7 @@ def test_a_signal_in_a_destructor_is_not_lost(name: str, status: int) -> None:
         "    del some\n"
         "    threading.Event().wait(20)\n"
         "    return 0\n"
-        "cli.main = lambda: cli.told(command)\n"
+        "cli.main = lambda: cli.run_command(command)\n"
         "sys.exit(cli.console())\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)

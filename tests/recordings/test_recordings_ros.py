@@ -360,7 +360,7 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
     ),
     "brackets": ("nested too deeply", lambda bag: (bag / "metadata.yaml").write_text("[" * 10**5)),
     "too long": (
-        "more than the 16 MiB",
+        "more than the limit of 16 MiB",
         lambda bag: os.truncate(bag / "metadata.yaml", 1 << 30),
     ),
 }

@@ -161,7 +161,7 @@ def test_las_that_claims_too_much(tmp_path: Path) -> None:
 
 def test_las_that_claims_records_without_end(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
-    write_las(tmp_path / "a.las", POINTS)
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS))
     content = (tmp_path / "a.las").read_bytes()
     for at in (100, 243):  # of records before and behind the points
         data = bytearray(content)

@@ -76,7 +76,7 @@ def _bound_chunks() -> None:
     """
     frames = importlib.import_module("lz4.frame")
     bag = importlib.import_module("rosbags.rosbag1.reader")
-    bag2 = importlib.import_module("rosbags.rosbag2.reader")
+    bag2: Any = importlib.import_module("rosbags.rosbag2.reader")
     mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
     lz4, zstd = _bounded(frames.LZ4FrameDecompressor), _bounded(mcap.zstd.ZstdDecompressor)
     bag.decompressors.update({"bz2": _bounded(bz2.BZ2Decompressor), "lz4": lz4})
