@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tofuse
 from tofuse.errors import InputError
 from tofuse.files.pcd import read_pcd
 from tofuse.kernels.lzf import lzf_decompress
@@ -204,3 +205,21 @@ def test_damaged_compressed_data(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_bytes(_header("binary_compressed") + bytes(body[:-9]))
     with pytest.raises(InputError, match="cut off"):
         read_pcd(tmp_path / "a.pcd")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [4, 8])
+def test_damaged_floats_are_dropped_without_a_warning(tmp_path: Path, size: int) -> None:
+    """Numbers beyond float32, and NaN whose conversion signals."""
+    good = struct.pack("<3f" if size == 4 else "<3d", 1.0, 2.0, 3.0)
+    signalling = bytes([1, 0, 0, 0, 0, 0, 0xF0, 0x7F] if size == 8 else [1, 0, 0x80, 0x7F])
+    huge = struct.pack("<d", 1e300) if size == 8 else struct.pack("<f", 3e38)
+    zeros = bytes(2 * size)
+    head = (
+        "VERSION .7\nFIELDS x y z\n" + f"SIZE {size} {size} {size}\n" + "TYPE F F F\nCOUNT 1 1 1\n"
+        "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA binary\n"
+    )
+    path = tmp_path / "a.pcd"
+    path.write_bytes(head.encode() + good + signalling + zeros + huge + zeros)
+    frame = tofuse.open(path)[0]
+    assert frame.points.tolist() == [[1.0, 2.0, 3.0]]

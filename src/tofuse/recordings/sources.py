@@ -158,6 +158,12 @@ def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     )
 
 
+def to_float32(values: NDArray[Any]) -> Float32:
+    """Return numbers of a file as float32: infinite beyond its range, NaN for signalling NaN."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32, copy=False)
+
+
 def cloud_frame(
     index: int,
     timestamp: float,
@@ -176,15 +182,14 @@ def cloud_frame(
     # False for NaN; the squares of the remaining coordinates fit into float32.
     measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
     if shift is not None:
-        points = points - shift
+        with np.errstate(over="ignore", invalid="ignore"):
+            points = points - shift
         measured &= (np.abs(points) < FARTHEST_M).all(1)
         origin = None if origin is None else origin - shift
-    with np.errstate(over="ignore", invalid="ignore"):
-        shifted = points.astype(np.float32, copy=False)
     frame = CloudFrame(
         index,
         timestamp,
-        shifted,
+        to_float32(points),
         normals,
         amplitude=amplitude,
         color=color,

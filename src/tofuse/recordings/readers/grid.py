@@ -29,7 +29,7 @@ from tofuse.recordings.organised import (
     origin_behind,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FARTHEST_M
+from tofuse.recordings.sources import FARTHEST_M, to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
@@ -134,7 +134,7 @@ def _read(path: Path) -> Cells:
 
 
 def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
-    return Cells(cloud.points.astype(np.float32), cloud.amplitude, cloud.color, width)
+    return Cells(to_float32(cloud.points), cloud.amplitude, cloud.color, width)
 
 
 def _read_csv(path: Path) -> Cells:
@@ -151,8 +151,8 @@ def _read_csv(path: Path) -> Cells:
     if not named and table.shape[1] == 4:
         light = 3
     with np.errstate(over="ignore"):
-        points = table[:, at].astype(np.float32)
-        amplitude = None if light is None else table[:, light].astype(np.float32)
+        points = to_float32(table[:, at])
+        amplitude = None if light is None else to_float32(table[:, light])
     return Cells(points, amplitude)
 
 

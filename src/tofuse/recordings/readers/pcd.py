@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.pcd import Pcd, read_pcd
@@ -17,7 +15,7 @@ from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import cloud_frame
+from tofuse.recordings.sources import cloud_frame, to_float32
 
 
 @part("reader", "pcd", label="validated")
@@ -52,7 +50,7 @@ def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     return cloud_frame(
         index,
         timestamp,
-        cloud.points.astype(np.float32 if shift is None else np.float64),
+        cloud.points,
         cloud.normals,
         amplitude=cloud.amplitude,
         color=cloud.color,
@@ -92,4 +90,4 @@ def _camera(files: list[Path]) -> Camera | None:
 
 
 def _image(pcd: Pcd) -> Float32:
-    return pcd.cloud.points.astype(np.float32).reshape(pcd.height, pcd.width, 3)
+    return to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
