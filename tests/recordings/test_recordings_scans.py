@@ -155,7 +155,7 @@ def test_las_that_claims_too_much(tmp_path: Path) -> None:
     data = bytearray((tmp_path / "a.las").read_bytes())
     data[247:255] = struct.pack("<Q", 1 << 40)
     (tmp_path / "a.las").write_bytes(data)
-    with pytest.raises(InputError, match="claims 1099511627776 points"):
+    with pytest.raises(InputError, match="declares 1099511627776 points"):
         tofuse.open(tmp_path / "a.las")[0]
 
 
@@ -167,7 +167,7 @@ def test_las_that_claims_records_without_end(tmp_path: Path) -> None:
         data = bytearray(content)
         data[at : at + 4] = struct.pack("<I", 1 << 31)
         (tmp_path / "a.las").write_bytes(data)
-        with pytest.raises(InputError, match="claims 2147483648 records beside its points"):
+        with pytest.raises(InputError, match="declares 2147483648 records beside its points"):
             tofuse.open(tmp_path / "a.las")
 
 
@@ -220,7 +220,7 @@ def test_laz_that_claims_points_of_no_chunk(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     data.write(path)
     content = bytearray(path.read_bytes())
-    for count, said in ((60_000, "hold 50000 points"), (90_000_000, "claims 90000000 points")):
+    for count, said in ((60_000, "contain 50000 points"), (90_000_000, "declares 90000000 points")):
         struct.pack_into("<I", content, 107, count)
         path.write_bytes(content)
         with pytest.raises(InputError, match=said):

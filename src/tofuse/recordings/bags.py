@@ -62,44 +62,44 @@ def _rosbags(path: Path, *modules: str) -> list[ModuleType]:
         found = [importlib.import_module(f"rosbags.{name}") for name in modules]
     except ImportError as error:
         raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
-    # Of a version of rosbags that has none of it, memory is not bounded.
+    # Without effect on versions of rosbags that are organised differently.
     with suppress(ImportError, AttributeError):
-        _bound_chunks()
+        _limit_chunks()
     return found
 
 
 @cache
-def _bound_chunks() -> None:
-    """Let rosbags unpack no more of a chunk or message than memory has room for.
+def _limit_chunks() -> None:
+    """Limit what rosbags decompresses of one chunk or message.
 
-    A packed kilobyte may stand for gigabytes, and rosbags takes what comes.
+    A compressed kilobyte may expand to gigabytes, and rosbags has no limit.
     """
     frames = importlib.import_module("lz4.frame")
     bag = importlib.import_module("rosbags.rosbag1.reader")
     bag2: Any = importlib.import_module("rosbags.rosbag2.reader")
     mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
-    lz4, zstd = _bounded(frames.LZ4FrameDecompressor), _bounded(mcap.zstd.ZstdDecompressor)
-    bag.decompressors.update({"bz2": _bounded(bz2.BZ2Decompressor), "lz4": lz4})
+    lz4, zstd = _limited(frames.LZ4FrameDecompressor), _limited(mcap.zstd.ZstdDecompressor)
+    bag.decompressors.update({"bz2": _limited(bz2.BZ2Decompressor), "lz4": lz4})
     mcap.DECOMPRESSORS.update({"lz4": lambda d, _: lz4(d), "zstd": lambda d, _: zstd(d)})
     bag2.zstd = SimpleNamespace(decompress=zstd, open=mcap.zstd.open)
 
 
-def _bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    def unpack(data: bytes) -> bytes:
-        unpacker = make()
-        found: bytes = unpacker.decompress(data, _MAX_CHUNK_BYTES)
-        if not unpacker.eof:
+def _limited(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def decompress(data: bytes) -> bytes:
+        decompressor = make()
+        found: bytes = decompressor.decompress(data, _MAX_CHUNK_BYTES)
+        if not decompressor.eof:
             raise ValueError(f"a chunk is cut off, or has more than {_MAX_CHUNK_BYTES} bytes")
         return found
 
-    return unpack
+    return decompress
 
 
 def _check_folder(path: Path) -> None:
-    """Refuse what rosbags would wait for, or read without end.
+    """Reject what rosbags would block on, or read without end.
 
-    It opens whatever metadata.yaml names, and a YAML file of a hundred bytes that refers to its own
-    parts can expand to gigabytes.
+    It opens whatever metadata.yaml names, and a YAML file of some hundred bytes that refers to its
+    own parts can expand to gigabytes.
     """
     try:
         for entry in path.iterdir():

@@ -31,7 +31,7 @@ from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
-_MOST_PACKED = 1000  # times that LAZ packs points; real scans 4 to 15 times
+_MAX_COMPRESSION = 1000  # of LAZ; 4 to 15 for scans
 _MISSING = "give `pip install 'tofuse[scan]'`"
 
 
@@ -77,7 +77,7 @@ def _las_header(path: Path) -> Any:
     count, size = int(header.point_count), int(header.point_format.size)
     whole = path.stat().st_size
     packed = bool(getattr(header, "are_points_compressed", False))
-    if count > MAX_POINTS or count * size > whole * (_MOST_PACKED if packed else 1):
+    if count > MAX_POINTS or count * size > whole * (_MAX_COMPRESSION if packed else 1):
         raise InputError(
             f"declares {count} points in {whole} bytes", where=path, remedy="copy the file again"
         )
@@ -90,30 +90,29 @@ def _las_header(path: Path) -> Any:
 
 
 def _check_records(head: bytes, path: Path) -> None:
-    """Refuse more records beside the points than the file has room for: laspy looks for each."""
+    """Reject more records than the file has room for: laspy tries to read each of them."""
     count = int.from_bytes(head[100:104], "little")
     more = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
     if 54 * count + 60 * more > path.stat().st_size:  # bytes of their headers
         raise InputError(
-            f"claims {count + more} records beside its points",
+            f"declares {count + more} records beside its points",
             where=path,
             remedy="copy the file again",
         )
 
 
 def _check_chunks(path: Path, header: Any) -> None:
-    """Refuse a table of chunks that the file can't have.
+    """Reject a chunk table that is inconsistent with the file.
 
-    lazrs sets aside what the table asks for, and ends the process where there is not so much. The
-    table follows the chunks: its version, how many there are, and their packed sizes. Where it lies
-    is in front of them, or where that was not known yet in the last 8 bytes (LASzip's
-    specification of LAZ, 2.2).
+    lazrs allocates what the table declares, and aborts the process if that fails. The table consists
+    of its version, the number of chunks and their compressed sizes. Its offset precedes the chunks,
+    or, if it was unknown at that time, is in the last 8 bytes (LAZ specification of LASzip 2.2).
     """
     lazrs = importlib.import_module("lazrs")
     size, start = path.stat().st_size, int(header.offset_to_point_data)
     layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if layout.item_size() != header.point_format.size:
-        raise ValueError("its points are described in two ways")
+        raise ValueError("the layout of its points is contradictory")
     with path.open("rb") as file:
         file.seek(start)
         (table,) = struct.unpack("<q", file.read(8))
@@ -121,17 +120,17 @@ def _check_chunks(path: Path, header: Any) -> None:
             file.seek(-8, os.SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         if not start + 8 <= table <= size - 8:
-            raise ValueError("its table of chunks is elsewhere")
+            raise ValueError("its chunk table is not in the file")
         file.seek(table)
         _, count = struct.unpack("<II", file.read(8))
-        # Each begins with a point that is not packed.
+        # Each begins with an uncompressed point.
         if count * layout.item_size() > table - start:
-            raise ValueError(f"it claims {count} chunks")
+            raise ValueError(f"it declares {count} chunks")
         file.seek(start)
         chunks = lazrs.read_chunk_table(file, layout)
     points, packed = (sum(each) for each in zip(*chunks, strict=True)) if chunks else (0, 0)
     if packed > table - start or points < header.point_count:
-        raise ValueError(f"its {count} chunks hold {points} points in {packed} bytes")
+        raise ValueError(f"its {count} chunks contain {points} points in {packed} bytes")
 
 
 def _shift(path: Path) -> Float64:
