@@ -104,9 +104,9 @@ def _check_records(head: bytes, path: Path) -> None:
 def _check_chunks(path: Path, header: Any) -> None:
     """Reject a chunk table that is inconsistent with the file.
 
-    lazrs allocates what the table declares, and aborts the process if that fails. The table consists
-    of its version, the number of chunks and their compressed sizes. Its offset precedes the chunks,
-    or, if it was unknown at that time, is in the last 8 bytes (LAZ specification of LASzip 2.2).
+    lazrs allocates what the table declares, and aborts the process if that fails. The table
+    consists of its version, the number of chunks and their compressed sizes. Its offset precedes
+    the chunks or, if it was unknown then, is in the last 8 bytes (specification of LASzip 2.2).
     """
     lazrs = importlib.import_module("lazrs")
     size, start = path.stat().st_size, int(header.offset_to_point_data)
