@@ -1,4 +1,4 @@
-"""Places known again by how they look, wherever the trajectory has them: no pose takes part."""
+"""Place recognition by appearance alone: poses are not used to find candidates."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from tofuse.registration.likeness import (
     unlikeness_of_pairs,
 )
 
-# Of pairs of nearly the same views (this many positions off either way) so many are taken: two can
-# confirm each other, and more would take the place of other loops.
-_BESIDE, _TOGETHER = 3, 2
-# Of up to so many views every two are compared. Of more, so many in between are asked whether the
-# camera left.
+# Pairs whose views differ by at most this many positions are similar, and at most this many of them
+# are chosen: two can confirm each other, more would displace other loops.
+_SIMILAR, _MAX_SIMILAR = 3, 2
+# Maximum number of views that are compared exhaustively; with more, number of views in between that
+# are compared to check whether the camera left.
 _ALL, _BETWEEN = 512, 64
-# How far apart views that look alike may stand: rad, and share of the depth.
+# Maximum distance of views that look alike: rad, and fraction of the depth.
 ALIKE = 0.35
-# The trajectory may be off by so many of its standard deviations.
+# Maximum error of the trajectory, in standard deviations.
 _SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Which views look alike, and how far the trajectory may be off.
+    """Thresholds of similar views and of the drift of the trajectory.
 
     Attributes
     ----------
     most
-        Pairs of a recording at most, those most alike; 0 takes no notice of how views look.
+        Maximum number of pairs of a recording, the most similar first; 0 disables appearance.
     unlike, left
-        How much the two views of a pair may differ at most, and a view in between from either at
-        least: 0 for the same image, 1 for nothing in common.
+        Maximum difference of the two views of a pair, and minimum difference of a view in between
+        from both: 0 for equal images, 1 for nothing in common.
     shift
-        How far the images may be moved against each other, as a share of their width.
+        Maximum shift between the images, as a fraction of their width.
     drift
-        Share of the path, and of the turns on it, by which the trajectory may be off at most. What
-        would need more drift is taken for another place that looks the same.
+        Maximum drift, as a fraction of the path and of the rotation along it. Pairs that imply more
+        are taken for different places that look the same (perceptual aliasing).
     """
 
     most: int = 6
@@ -67,21 +67,21 @@ class Appearance:
         possible: Callable[[int, int], bool],
         known: Collection[tuple[int, int]] = (),
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """Views that look alike though the camera left in between.
+        """Return pairs of views that look alike although the camera left in between.
 
         Parameters
         ----------
         looks
-            Of all views in the order of time, see `likeness.look_of`.
+            Descriptors of all views in the order of time, see `likeness.look_of`.
         possible
-            Whether the trajectory allows that two views show the same place.
+            Whether the trajectory allows that views i and j show the same place.
         known
-            Pairs that are loops for certain: near them nothing is looked for.
+            Pairs that are certain loops: none similar to them is returned.
 
         Returns
         -------
-        Positions (i, j), i < j, of those that are possible and of those that are not, at most
-        `most` of each, the most alike first.
+        Positions (i, j), i < j, of the possible pairs and of the others, at most `most` of each,
+        the most similar first.
         """
         chosen: list[tuple[int, int]] = []
         refused: list[tuple[int, int]] = []
@@ -89,13 +89,13 @@ class Appearance:
             return chosen, refused
         for _, i, j in self._most_alike(looks):
             mine = chosen if possible(i, j) else refused
-            full = len(mine) >= self.most or _beside(i, j, mine) >= _TOGETHER
-            if not full and not _beside(i, j, known):
+            full = len(mine) >= self.most or _similar(i, j, mine) >= _MAX_SIMILAR
+            if not full and not _similar(i, j, known):
                 mine.append((i, j))
         return chosen, refused
 
     def _most_alike(self, looks: Sequence[Float32]) -> list[tuple[float, int, int]]:
-        """How much views i < j differ that look alike, though the camera left in between."""
+        """Return (difference, i, j) of similar views i < j that the camera left in between."""
         if len(looks) > _ALL:
             return self._most_alike_of_many(np.stack(looks))
         far = mutual_unlikeness(looks, self.shift)
@@ -109,7 +109,7 @@ class Appearance:
         return sorted(found)
 
     def _most_alike_of_many(self, looks: Float32) -> list[tuple[float, int, int]]:
-        """The same by an index: each view is compared with those that are likely to be like it."""
+        """As `_most_alike`, with candidates from an index instead of all pairs."""
         i, j = alike(looks, self.shift)
         far = unlikeness_of_pairs(looks, i, j, self.shift)
         found = []
@@ -133,21 +133,21 @@ class Appearance:
         covariance: Float64 | None = None,
         unsure: float = 0.0,
     ) -> bool:
-        """Whether the trajectory may be off by so much.
+        """Whether a correction of the trajectory is within its drift.
 
         Parameters
         ----------
         between
-            (4, 4) from where it has the later view to where it was found.
+            (4, 4) correction: from the later view's pose in the trajectory to its registered pose.
         length, turned
-            Of the path from the earlier view to the later one, m, and of the turns on it, rad.
+            Length of the path between the views, m, and sum of the rotations along it, rad.
         depth
-            Of what they see, m: a view that turns is off to the side as well, by about that.
+            Depth of the scene, m: the lever arm by which rotation errors displace views.
         covariance
-            (6, 6) of the motion between the views, of `between` as a right perturbation. Where it
-            is wide, as along a bare wall, drift may be larger in that direction.
+            (6, 6) of `between` as a right perturbation. Degenerate directions, as along a bare
+            wall, allow for more drift.
         unsure
-            Added to what it may be off, in rad and as a share of the depth.
+            Added tolerance, in rad and as a fraction of the depth.
         """
         far = self.drift * (length + depth * turned) + unsure * depth
         wide = self.drift * (turned + length / depth) + unsure
@@ -159,6 +159,6 @@ class Appearance:
         )
 
 
-def _beside(i: int, j: int, pairs: Collection[tuple[int, int]]) -> int:
-    """Number of the pairs that are of nearly the same views."""
-    return sum(abs(i - k) <= _BESIDE and abs(j - m) <= _BESIDE for k, m in pairs)
+def _similar(i: int, j: int, pairs: Collection[tuple[int, int]]) -> int:
+    """Return the number of pairs of nearly the same views as i and j."""
+    return sum(abs(i - k) <= _SIMILAR and abs(j - m) <= _SIMILAR for k, m in pairs)

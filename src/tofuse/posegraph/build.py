@@ -1,4 +1,4 @@
-"""From what was measured between frames to a pose graph."""
+"""Pose graphs from measurements between frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def build_graph(
     sequence: Sequence[Measured],
     loops: Sequence[Measured] = (),
 ) -> PoseGraph:
-    """Make a graph of frames with poses, and of what was measured between them.
+    """Make the graph of posed frames and of the measurements between them.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def build_graph(
     poses
         (N, 4, 4) T_world_camera.
     sequence, loops
-        Edges of odometry, and edges that close loops; both may be empty.
+        Odometry edges, and loop edges; both may be empty.
 
     Raises
     ------
@@ -66,20 +66,20 @@ def build_graph(
 
 
 def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
-    """Make the graph of a plain sequence: n - 1 motions T_(k-1)_k in a row, and loops.
+    """Make the graph of a sequence of n - 1 consecutive motions T_(k-1)_k, and loops.
 
     The poses are the products of the motions; ids count from 0, and the information of the
-    sequence is the unit matrix.
+    sequence is the identity.
     """
     sequence = [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
     return build_graph(range(len(relative) + 1), accumulate(relative), sequence, loops)
 
 
 def accumulate(relative: Float64) -> Float64:
-    """Poses (n, 4, 4), the identity first, of n - 1 motions T_(k-1)_k (eqs 2.9, 3.1, 3.2)."""
+    """Return poses (n, 4, 4), the identity first, of n - 1 motions T_(k-1)_k (eqs 2.9-3.2)."""
     poses = np.empty((len(relative) + 1, 4, 4))
     poses[0] = np.eye(4)
     for k, T in enumerate(relative):
-        # Rounding must not build up over thousands of products.
+        # Rounding errors would accumulate over thousands of products.
         poses[k + 1] = se3.orthonormalise(poses[k] @ T)
     return poses

@@ -4,10 +4,10 @@ Over all edges (i, j) with measurement G_ij = (R_ij, t_ij) the objective (eq 2.1
 
     sum (angle(R_i R_ij R_j^T) / sigma_a)^2 + (|R_i t_ij + t_i - t_j| / sigma_t)^2
 
-Every edge counts the same: the edges' information is not used. Unknowns are a unit quaternion
-and a translation of every view but the first. The thesis hands this to a general solver; here
-it is written as nonlinear least squares, with a residual of six numbers an edge whose squares
-add up to the objective exactly, and solved by Levenberg-Marquardt with sparse Jacobians.
+All edges have equal weight: their information is not used. Unknowns are a unit quaternion and a
+translation of every view but the first. The thesis uses a general solver; here the objective is
+the sum of squares of six residuals per edge, minimised by Levenberg-Marquardt with sparse
+Jacobians.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tofuse.posegraph.levenberg import check_motions
 
 Normalisation = Literal["thesis", "fusiello"]
 
-_ZERO = 1e-9  # m or rad: below it a length or angle can't be a unit to measure others in
+_ZERO = 1e-9  # m or rad: smaller lengths and angles are no normalisation factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Problem:
 
     @classmethod
     def of(cls, graph: PoseGraph, normalisation: Normalisation) -> Problem:
-        """Take the edges of a graph; see `normalisation_factors`."""
+        """Return the problem of a graph; see `normalisation_factors`."""
         sigma_angle, sigma_translation = normalisation_factors(graph, normalisation)
         R, t = graph.measurements[:, :3, :3], graph.measurements[:, :3, 3]
         return cls(graph.edges, R, t, sigma_angle, sigma_translation)
@@ -77,10 +77,10 @@ class Problem:
         return float((r * r).sum())
 
     def jacobian(self, q: Float64, t: Float64) -> tuple[Float64, Float64]:
-        """Derivatives (M, 6, 6) of the residuals by the motion of the vertices i and of j.
+        """Return the (M, 6, 6) derivatives of the residuals by the vertices i and j.
 
-        A vertex moves by (d, p): t + d, and R turned on the left by the rotation vector p, that
-        is, by quaternion (p / 2, 1) to first order.
+        A vertex is perturbed by (d, p): t + d, and exp(p) R, that is, the quaternion (p / 2, 1) on
+        the left to first order.
         """
         rotation, _, arm = self._errors(q, t)
         # log(exp(p) E) and log(E exp(-p)): left Jacobian inverse, and its transpose.
@@ -112,7 +112,7 @@ def normalisation_factors(
     "thesis" (section 3.5): root mean square of the screw angles, and of the lengths, of the
     sequential relative transformations; of all edges where none is sequential. "fusiello"
     (Fusiello et al. 2002): pi, and the length of each edge's own translation. A factor that
-    would be zero, as for a camera that only turns or only slides, is 1 (rad or m).
+    would be zero, as for pure rotation or pure translation, is 1 (rad or m).
     """
     m = len(graph.edges)
     length = np.linalg.norm(graph.measurements[:, :3, 3], axis=1)
@@ -130,20 +130,19 @@ def normalisation_factors(
 @part("optimiser", "castellani", label="validated")
 @dataclass(frozen=True)
 class Castellani(Optimiser):
-    """Spread the error of the loops evenly over all edges (eq 2.10).
+    """Distribute the error of the loops evenly over all edges (eq 2.10).
 
-    The search starts from the poses in the graph. The first vertex stays where it is. Where the
-    graph falls into parts that no edge joins, each part is optimised by itself, and the first
-    vertex of each stays where it is.
+    The initial estimate is the poses of the graph. Connected parts of the graph are optimised
+    separately; the first vertex of each is fixed.
 
     Attributes
     ----------
     normalisation
         "thesis" or "fusiello", see `normalisation_factors`.
     max_iterations
-        At most so many steps.
+        Maximum number of steps.
     tolerance
-        Stop when a step lowers the objective by less than this share of it.
+        Iterations stop when a step lowers the objective by a smaller fraction.
     """
 
     normalisation: Normalisation = "thesis"
@@ -153,7 +152,7 @@ class Castellani(Optimiser):
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`. The objective is logged after every step, and never rises.
 
-        Raises InputError if a pose or a measurement is no rigid motion.
+        Raises InputError if a pose or a measurement is not a rigid motion.
         """
         check_motions(graph)
         problem = Problem.of(graph, self.normalisation)
@@ -166,7 +165,7 @@ class Castellani(Optimiser):
         for _ in range(self.max_iterations if not converged else 0):
             q_new, t_new, value = step.take(q, t, history[-1])
             if value is None:
-                # No step lowers the objective any more, not even the shortest.
+                # Not even the shortest step lowers the objective.
                 converged = True
                 break
             q, t = q_new, t_new
@@ -181,7 +180,7 @@ class Castellani(Optimiser):
 
 
 def free_vertices(graph: PoseGraph) -> Bool:
-    """(N,) mask of the vertices that may move: all but the first of each connected part."""
+    """Return the (N,) mask of the free vertices: all but the first of each connected part."""
     n = len(graph.ids)
     if n == 0:
         return np.zeros(0, bool)
@@ -194,7 +193,7 @@ def free_vertices(graph: PoseGraph) -> Bool:
 
 
 class _Step:
-    """Levenberg-Marquardt steps, with the damping carried from one to the next."""
+    """Levenberg-Marquardt steps; the damping is kept between them."""
 
     def __init__(self, problem: Problem, free: Bool) -> None:
         self.problem = problem
@@ -203,10 +202,10 @@ class _Step:
         self._assemble = normal_equations(problem.edges, free)
 
     def take(self, q: Float64, t: Float64, value: float) -> tuple[Float64, Float64, float | None]:
-        """Return q, t and the objective after one step down; None if there is no way down."""
+        """Return q, t and the objective after one step; None if no step lowers it."""
         H, g = self._assemble(*self.problem.jacobian(q, t), self.problem.residuals(q, t))
         diagonal = H.diagonal()
-        # No direction goes undamped, not even one in which the objective is flat.
+        # Every direction is damped, even one in which the objective is flat.
         scale = np.maximum(diagonal, 1e-12 * diagonal.max())
         while self.damping < 1e12:
             x = _solve(H + sparse.diags(self.damping * scale, format="csc"), g)
@@ -217,7 +216,7 @@ class _Step:
             d = x.reshape(-1, 6)
             half = np.concatenate([d[:, 3:] / 2, np.ones((len(d), 1))], axis=1)
             turned = quaternion.multiply(half, q[self.free])
-            # The constraint |q| = 1 is met after every step.
+            # Normalised after every step: the constraint |q| = 1.
             q_new[self.free] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
             t_new[self.free] += d[:, :3]
             value_new = self.problem.objective(q_new, t_new)
@@ -234,7 +233,7 @@ def normal_equations(
     """Prepare the assembly of ``H = J^T J`` (sparse) and ``g = -J^T r`` of the free vertices.
 
     Returns a function of the edges' Jacobians J_i and J_j (M, k, 6) and residuals (M, k). The
-    pattern is the same at every step, so it is worked out once.
+    sparsity pattern is the same at every step, and computed once.
     """
     number = np.cumsum(free) - 1
     size = 6 * int(free.sum())

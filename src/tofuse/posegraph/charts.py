@@ -1,7 +1,7 @@
-"""Rotations as unknowns of least squares: by local tangent, by quaternion, by direction cosines.
+"""Parametrisations of rotations in least squares: tangent, quaternion, direction cosines.
 
-A chart says how many numbers stand for a pose, how a small change of them moves the pose, and how
-the pose is rebuilt after a step. The position is treated alike by all.
+A chart defines the number of parameters of a pose, the derivative of the pose by them, and the
+retraction after a step. All treat the position alike.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ Rotation = Literal["tangent", "quaternion", "cosines"]
 
 
 class Chart(Protocol):
-    """Numbers that stand for a pose."""
+    """A parametrisation of poses by `size` numbers."""
 
     size: int
 
     def basis(self, poses: Float64) -> tuple[Float64, Float64] | None:
-        """Derivatives of a pose's right perturbation by its numbers, and what they must not do.
+        """Return the derivatives of a pose's right perturbation by its parameters.
 
-        Returns (n, 6, size), and the (n, size, size) projectors on the directions that leave the
-        rotations; None where the numbers are the perturbation.
+        (n, 6, size), and the (n, size, size) projectors on directions that leave the manifold;
+        None if the parameters are the perturbation.
         """
         ...
 
     def retract(self, poses: Float64, step: Float64) -> Float64:
-        """Poses after (n, size) steps, proper rotations again."""
+        """Return the poses after (n, size) steps, projected onto SE(3)."""
         ...
 
 
 class Tangent:
-    """Six numbers, the right perturbation itself: T exp(d)."""
+    """Six parameters, the right perturbation: T exp(d)."""
 
     size = 6
 
@@ -49,12 +49,12 @@ class Tangent:
 
 
 class Quaternion:
-    """Three numbers and a quaternion that is made a unit again after every step (eq 2.11)."""
+    """A translation and a quaternion, normalised after every step (eq 2.11)."""
 
     size = 7
 
     def basis(self, poses: Float64) -> tuple[Float64, Float64]:
-        """See `Chart.basis`: a change dq turns by twice the vector part of q* dq."""
+        """See `Chart.basis`: a change dq rotates by twice the vector part of q* dq."""
         q = quaternion.from_matrix(poses[:, :3, :3])
         v, s = q[:, :3], q[:, 3]
         P = np.zeros((len(q), 6, 7))
@@ -73,12 +73,12 @@ class Quaternion:
 
 
 class Cosines:
-    """Three numbers and the nine direction cosines; the nearest rotation after every step."""
+    """A translation and the nine direction cosines, orthonormalised after every step."""
 
     size = 12
 
     def basis(self, poses: Float64) -> tuple[Float64, Float64]:
-        """See `Chart.basis`: a change dR turns by the antisymmetric part of R^T dR."""
+        """See `Chart.basis`: a change dR rotates by the antisymmetric part of R^T dR."""
         n = len(poses)
         P = np.zeros((n, 6, 12))
         P[:, :3, :3] = np.eye(3)
@@ -102,7 +102,7 @@ class Cosines:
 
 
 def _moved(poses: Float64, slide: Float64, R: Float64) -> Float64:
-    """Poses with new rotations; the camera moves along a screw meanwhile, as by `se3.exp`."""
+    """Return poses with rotations R, translated along the screw motion, as by `se3.exp`."""
     out = poses.copy()
     turn = se3.so3_log(np.swapaxes(poses[:, :3, :3], 1, 2) @ R)
     along = se3.left_jacobian(turn) @ slide[..., None]

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over edges and gravity: what they say of the poses, and steps down."""
+"""Levenberg-Marquardt over edges and gravity: residuals, normal equations, and steps."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tofuse.posegraph.charts import CHARTS, Chart, Rotation
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import Factor, PairSystem
 
-_NOTHING = 1e-12  # mean squared error of an edge, in units of its information: rounding
+_ROUNDING = 1e-12  # mean squared error of an edge, in units of its information
 
 
 class Problem:
     """Edges and gravity, evaluated and linearised.
 
-    Where the direction of gravity in the world is not known, it is one more pose, of which only
-    two directions matter; the others are held by a unit of information.
+    An unknown direction of gravity in the world is an additional pose with only two observable
+    directions; a prior of unit information constrains the others.
     """
 
     def __init__(
@@ -38,20 +38,20 @@ class Problem:
         self.chart: Chart = CHARTS[rotation]()
         self._Z_inverse = se3.inverse(measurements)
         n = len(fixed)
-        joined, held = pairs, fixed
+        joined, all_fixed = pairs, fixed
         self._single: tuple[Float64, Float64] | None = None
         if gravity is not None:
             world = np.full(len(gravity.vertices), n)
             joined = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
-            held = np.append(fixed, gravity.world is not None)
+            all_fixed = np.append(fixed, gravity.world is not None)
             block = np.zeros((n + 1, 6, 6))
             block[n] = np.eye(6)
             self._single = block, np.zeros((n + 1, 6))
         self.joined = joined
-        self.system = PairSystem(len(held), joined, held, size=self.chart.size)
+        self.system = PairSystem(len(all_fixed), joined, all_fixed, size=self.chart.size)
 
     def start(self, poses: Float64) -> Float64:
-        """Poses with the one of gravity's world behind them, where there is gravity."""
+        """Return the initial poses, followed by that of the vertical if there is gravity."""
         poses = np.array(poses, float)
         if self.gravity is None:
             return poses
@@ -60,7 +60,7 @@ class Problem:
             R = poses[self.gravity.vertices, :3, :3]
             seen = (R @ self.gravity.directions[..., None])[..., 0]
             down = vertical(seen, self.gravity)
-        # The rotation whose third axis is down; the other two don't matter.
+        # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
         x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
         x /= np.linalg.norm(x)
@@ -69,7 +69,7 @@ class Problem:
         return np.concatenate([poses, T[None]])
 
     def errors(self, poses: Float64) -> tuple[Float64, Float64]:
-        """Return the edges' errors (m, 6) and gravity's (g, 3), each over its sigma."""
+        """Return the errors of the edges (m, 6), and those of gravity (g, 3) over their sigma."""
         i, j = self.pairs.T
         e = se3.log(self._Z_inverse @ (se3.inverse(poses[i]) @ poses[j]))
         if self.gravity is None:
@@ -82,7 +82,7 @@ class Problem:
         return (world.T @ R @ self.gravity.directions[..., None])[..., 0]
 
     def gravity_cost(self, down: Float64) -> float:
-        """What gravity's errors (g, 3) add to the objective."""
+        """Return the contribution of gravity's errors (g, 3) to the objective."""
         x = (down**2).sum(-1)
         if self.gravity is None or np.isinf(self.gravity.gate):
             return float((down**2).sum())
@@ -91,7 +91,7 @@ class Problem:
     def linearised(
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
     ) -> tuple[Any, Float64]:
-        """Normal equations (matrix, gradient) where the errors were taken."""
+        """Return the normal equations (matrix, gradient) at the poses of the given errors."""
         J = se3.jacobian_inverse(e)
         JtW = np.swapaxes(J, 1, 2) @ (weights[:, None, None] * self.information)
         H, g = JtW @ J, (JtW @ e[..., None])[..., 0]
@@ -145,11 +145,11 @@ class Problem:
 
 
 def vertical(seen: Float64, gravity: Gravity) -> Float64:
-    """(3,) direction in the world that directions (g, 3) agree on, each by its sigma and gate."""
+    """Return the (3,) robust mean of directions `seen` (g, 3) in the world, weighted by sigma."""
     known = 1 / gravity.sigma**2
     if np.isinf(gravity.gate):
         return np.asarray((seen * known[:, None]).sum(0), np.float64)
-    down = np.median(seen, axis=0)  # which a few can't turn
+    down = np.median(seen, axis=0)  # robust to outliers
     for _ in range(10):
         down = down / max(float(np.linalg.norm(down)), 1e-12)
         x = ((seen - down) ** 2).sum(1) * known
@@ -161,7 +161,7 @@ Cost = Callable[[Float64], Float64]
 
 
 class Descent:
-    """Levenberg-Marquardt steps; the damping is carried from one run to the next."""
+    """Levenberg-Marquardt steps; the damping is kept between runs."""
 
     def __init__(self, problem: Problem, poses: Float64) -> None:
         self.problem, self.poses = problem, poses
@@ -175,11 +175,11 @@ class Descent:
         self.chi2 = np.einsum("mi,mij,mj->m", self.e, self.problem.information, self.e)
 
     def state(self) -> tuple[Float64, Float64, Float64, Float64]:
-        """What `restore` comes back to."""
+        """Return the state that `restore` takes."""
         return self.poses, self.e, self.down, self.chi2
 
     def restore(self, state: tuple[Float64, Float64, Float64, Float64]) -> None:
-        """Go back, and say so in the log."""
+        """Restore a state, and log it."""
         self.poses, self.e, self.down, self.chi2 = state
         self._note()
 
@@ -187,13 +187,16 @@ class Descent:
         self.log.append((self.chi2, self.problem.gravity_cost(self.down)))
 
     def run(self, total: Cost, weights: Cost, tolerance: float, iterations: int) -> bool:
-        """Step down until a step gains too little; whether that came before the last step."""
+        """Iterate until a step lowers the objective by less than `tolerance` of it.
+
+        Returns whether that was reached within the iterations.
+        """
         problem = self.problem
         if problem.fixed.all():
             return True
         value = self._value(total)
         for _ in range(iterations):
-            if value <= _NOTHING * len(problem.pairs):
+            if value <= _ROUNDING * len(problem.pairs):
                 return True
             matrix, gradient = problem.linearised(self.poses, self.e, self.down, weights(self.chi2))
             before = value
@@ -203,7 +206,7 @@ class Descent:
                     break
                 self.damping = max(self.damping * 10, 1e-7)
                 if self.damping > 1e8:
-                    # Not even the shortest step goes down.
+                    # Not even the shortest step lowers the objective.
                     self.damping = 1e-7
                     return True
             value = found
@@ -214,15 +217,15 @@ class Descent:
         return False
 
     def _try(self, matrix: Any, gradient: Float64, total: Cost, value: float) -> float | None:
-        """Take one step if it goes down; the new objective, or None and everything as before."""
+        """Take a step if it lowers the objective; returns the new one, or None if rejected."""
         factor = self.problem.system.factor(matrix, gradient, self.damping)
         step = None if factor is None else factor.step()
         if step is None:
             return None
         kept = self.state()
-        held = self.problem.system.fixed
-        moved = self.problem.chart.retract(self.poses, step)
-        self.poses = np.where(held[:, None, None], self.poses, moved)
+        fixed = self.problem.system.fixed
+        stepped = self.problem.chart.retract(self.poses, step)
+        self.poses = np.where(fixed[:, None, None], self.poses, stepped)
         self._see()
         new = self._value(total)
         if new < value:

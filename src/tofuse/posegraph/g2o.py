@@ -2,8 +2,8 @@
 
 A vertex is ``id tx ty tz qx qy qz qw``; an edge is ``i j`` and the measured T_i_j in the same
 form, then the 21 numbers of the upper triangle of the information matrix, row by row, in the
-order (tx ty tz rx ry rz). Its rotation part is read per radian squared of the rotation vector,
-as GTSAM does (g2o itself means the quaternion's vector part, half as large).
+order (tx ty tz rx ry rz). Its rotation part is read as of the rotation vector in radians, as GTSAM
+does (g2o itself refers to the quaternion's vector part, half as large).
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from tofuse.posegraph.graph import PoseGraph
 
 VERTEX = "VERTEX_SE3:QUAT"
 EDGE = "EDGE_SE3:QUAT"
-# FIX holds a vertex still, which here is always the first; the offset concerns other edges only.
+# FIX fixes a vertex, which here is always the first; the offset concerns other edges only.
 IGNORED = ("FIX", "PARAMS_SE3OFFSET")
 
 _UPPER = np.triu_indices(6)
-_UNIT = 1e-2  # how far a quaternion written with few digits may be from length 1
+_UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
     """Read a pose graph; vertices and edges keep the order of the file.
 
-    An edge counts as odometry where it joins a vertex to the next one in the file, as a loop
-    otherwise. Lines that start with FIX, PARAMS_SE3OFFSET or # are passed over.
+    An edge between consecutive vertices of the file is odometry, any other a loop. Lines that start
+    with FIX, PARAMS_SE3OFFSET or # are skipped.
 
     Raises
     ------
     InputError
-        If the file can't be read or holds no vertex, and, with the line's number: for an unknown
-        tag, a wrong count of numbers, what is not a finite number, a quaternion that is not a
-        unit, information that is not positive semidefinite (or is all zero), a vertex given
-        twice, an edge to a missing vertex or to itself.
+        If the file can't be read or contains no vertex, and, with the line's number: for an unknown
+        tag, a wrong count of numbers, a number that is not finite, a quaternion that is not a
+        unit, information that is not positive semidefinite (or is all zero), a duplicate vertex,
+        an edge to a missing vertex or from a vertex to itself.
     """
     lines = read_text(path).splitlines()
     position: dict[int, int] = {}
@@ -96,7 +96,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> None:
-    """Write a pose graph, every number with all its digits; the same graph, the same bytes.
+    """Write a pose graph with all digits of every number; equal graphs give equal bytes.
 
     Raises
     ------
@@ -175,5 +175,5 @@ def _vectors(T: Float64) -> Float64:
 
 
 def _text(values: Float64) -> str:
-    # Adding zero turns -0.0 into 0.0; repr gives the fewest digits that read back the same.
+    # Adding zero turns -0.0 into 0.0; repr gives the shortest text that reads back exactly.
     return " ".join(repr(float(value) + 0.0) for value in values)

@@ -1,4 +1,4 @@
-"""The file in which a person gives loops by hand."""
+"""The file of loops given by the user."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.files.reading import read_text
 from tofuse.geometry import quaternion, se3
 from tofuse.posegraph.loops import GivenLoop
 
-_UNIT = 1e-2  # how far a quaternion written with few digits may be from length 1
+_UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 
 
 def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[GivenLoop]:
@@ -23,8 +23,8 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
     Raises
     ------
     InputError
-        If the file can't be read, and, with the line's number, for anything else in a line, a
-        frame that doesn't exist, a frame joined to itself, a pair given twice.
+        If the file can't be read, and, with the line's number, for any other content, a frame that
+        doesn't exist, a loop from a frame to itself, a duplicate pair.
     """
     loops: dict[tuple[int, int], GivenLoop] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):

@@ -61,7 +61,7 @@ class Anchors:
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """Poses and measured relative poses, in columns.
+    """Poses and measured relative poses, as arrays.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class PoseGraph:
 
     @classmethod
     def empty(cls) -> PoseGraph:
-        """Return a graph with nothing in it."""
+        """Return a graph without vertices."""
         return cls(
             np.zeros(0, np.intp),
             np.zeros((0, 4, 4)),
@@ -143,17 +143,17 @@ class PoseGraph:
 
 @dataclass(frozen=True)
 class GraphPart:
-    """A part of the graph that no edge joins to the rest, optimised by itself.
+    """A connected part of the graph, optimised separately.
 
     Attributes
     ----------
     first
-        Id of its first vertex, which has not moved.
+        Id of its first vertex, which is fixed.
     vertices, edges
-        How many there are in it.
+        Their numbers.
     before, after
-        The method's objective. Where it could not be lowered they are equal, and the poses are
-        those of the input.
+        The method's objective. If it could not be lowered they are equal, and the poses are those
+        of the input.
     converged
         Whether the stopping rule was met.
     """
@@ -167,27 +167,27 @@ class GraphPart:
 
     @property
     def improved(self) -> bool:
-        """Whether the optimiser found something better than the input."""
+        """Whether the objective is lower than that of the input."""
         return self.after < self.before
 
 
 @dataclass(frozen=True, eq=False)
 class Optimisation:
-    """What an optimiser made of a graph.
+    """The result of an optimiser.
 
     Attributes
     ----------
     graph
-        The graph with its new poses; the first vertex has not moved.
+        The graph with optimised poses; the first vertex is fixed.
     objective
         The method's own objective at the start and after every iteration.
     converged
-        Whether the stopping rule was met before the iterations ran out.
+        Whether the stopping rule was met within the iterations.
     weights
-        (M,) share of its information with which each edge counted in the end, 0 for one that was
-        left out; None where the method counts all in full.
+        (M,) final weight of each edge's information, 0 for rejected edges; None if the method is
+        not robust.
     parts
-        The connected parts of the graph, where the method tells them apart.
+        The connected parts of the graph, if the method distinguishes them.
     """
 
     graph: PoseGraph
@@ -198,19 +198,19 @@ class Optimisation:
 
     @property
     def improved(self) -> bool:
-        """Whether anything better than the input was found, by the method's own objective."""
+        """Whether the method's objective is lower than that of the input."""
         if self.parts:
             return any(part.improved for part in self.parts)
         return len(self.objective) > 1 and self.objective[-1] < self.objective[0]
 
 
 class Optimiser(Protocol):
-    """A method that spreads the error of the loops over the poses."""
+    """A method that distributes the error of the loops over the poses."""
 
     part_kind: ClassVar[str] = "optimiser"
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
-        """Return the graph with better poses; the first vertex stays where it is."""
+        """Return the graph with optimised poses; the first vertex is fixed."""
         ...
 
 

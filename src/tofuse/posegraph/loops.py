@@ -17,7 +17,7 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
 from tofuse.registration.prepared_view import PreparedView
 
-# Keeps the draws of loops apart from those of other stages that register the same pair.
+# Separates the random streams of loops from those of other stages that register the same pair.
 SEED_STAGE = 2
 
 # Assumed standard deviation of a given measurement: 1 cm and 0.01 rad (about half a degree).
@@ -83,7 +83,7 @@ class Loops(Protocol):
     Attributes
     ----------
     points
-        Whether it needs the points of frames, not only prepared views.
+        Whether it requires the points of frames, not only prepared views.
     """
 
     points: ClassVar[bool] = True
@@ -119,8 +119,8 @@ class Loops(Protocol):
         Parameters
         ----------
         poses
-            (4, 4) in one frame, by index of the frames that are looked at: components may have
-            been joined since they were added.
+            (4, 4) T_world_camera by index of the frames to be considered: components may have been
+            joined since they were added.
         covariances
             (6, 6) of these before any loop is closed, relative to the first, as right
             perturbations; NaN where unknown.
@@ -129,7 +129,7 @@ class Loops(Protocol):
 
 
 class LoopDetector(Protocol):
-    """A method that finds places that the camera comes back to."""
+    """A method that detects when the camera revisits a place."""
 
     part_kind: ClassVar[str] = "loops"
 
@@ -138,10 +138,12 @@ class LoopDetector(Protocol):
 
         Parameters
         ----------
+        seed
+            Of the run's random numbers.
         given
-            Loops that a person gave.
+            Loops given by the user.
         views
-            Prepared views of frames with a pose; each is there before its frame is pushed.
+            Prepared views of frames with a pose; each is stored before its frame is pushed.
         """
         ...
 
@@ -150,18 +152,18 @@ class LoopDetector(Protocol):
 class Confirmation:
     """Register two views, and accept them if the error is low and enough points correspond (3.4).
 
-    E of Algorithm 1 falls when points lose their partners, as it is divided by the number of all
-    points; so it is the mean distance of the corresponding points that must be low here.
+    E of Algorithm 1 is normalised by the number of all points, and so decreases when points lose
+    their correspondences; here the mean distance of corresponding points must be low instead.
 
     Attributes
     ----------
     registrations
-        Used one after another, each from where the one before arrived: coarse to fine, as a
-        trajectory has drifted when a loop closes. The last one is judged.
+        Applied sequentially, coarse to fine, each initialised by the one before, as a trajectory
+        has drifted when a loop closes. The last one is judged.
     min_share
-        Least share of the source's points that must correspond, 0 to 1.
+        Minimum fraction of the source's points with a correspondence, 0 to 1.
     max_error
-        Largest mean distance of corresponding points in units of the resolution, that is, E over
+        Maximum mean distance of corresponding points in units of the resolution, that is, E over
         the corresponding points alone.
     """
 
@@ -180,9 +182,9 @@ class Confirmation:
             raise ValueError(f"max_error is {self.max_error}, not above 0")
 
     def objection(self, registration: Registration) -> str:
-        """Return why a registration is not good enough, or nothing if it is.
+        """Return why a registration is rejected; empty if it is accepted.
 
-        A method that says whether its pose is to be believed decides by itself.
+        A method that verifies its pose itself (`believed`) decides.
         """
         if registration.believed is not None:
             return registration.reason
@@ -200,17 +202,17 @@ class Confirmation:
         """Decide whether two views form a loop.
 
         Starts from the guess and, as the trajectory may be far off, from the identity, unless the
-        method looks for rival poses itself; the better end counts: one that is good enough before
-        one that is not, then the one with more corresponding points.
+        method searches for rival poses itself. The better result counts: accepted before rejected,
+        then more corresponding points.
 
         Parameters
         ----------
         source, target
             The views of the later and of the earlier frame.
         guess
-            (4, 4) T_target_source as the trajectory has it.
+            (4, 4) T_target_source of the trajectory.
         seed
-            Of the run: the same pair and seed give the same answer.
+            Of the run: the same pair and seed give the same result.
         """
         i, j = target.index, source.index
         found: list[Registration] = []
@@ -221,7 +223,7 @@ class Confirmation:
             except RegistrationError as error:
                 failure = failure or str(error)
             if found and found[-1].believed is not None:
-                break  # it looked for other poses itself
+                break  # it searched for rival poses itself
         if not found:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
         best = max(found, key=lambda r: (not self.objection(r), r.share, -r.error))
@@ -245,5 +247,5 @@ class Confirmation:
 
 
 def mean_error(registration: Registration) -> float:
-    """E over the corresponding points alone: their mean distance in units of the resolution."""
+    """Return E over the corresponding points: their mean distance in units of the resolution."""
     return registration.error / registration.share if registration.share else np.inf

@@ -1,4 +1,4 @@
-"""What pairs of overlapping views measure of the motion between them, each pair by itself."""
+"""Independent measurements of relative poses from pairs of overlapping views."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, ali
 from tofuse.registration.uncertainty import covariance
 
 _ALIGNMENT = ProjectiveOptions()
-# The same pairs as a refinement looks at.
+# Pairs are selected as in joint refinement.
 _PAIRS = RefineOptions()
 
 
 def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
     """Align every pair of views that overlap, and each view with the one before it.
 
-    Nothing that a pair measures depends on the poses, except which pairs are compared and where
-    their alignments start.
+    The poses only select the pairs and initialise their alignments.
 
     Parameters
     ----------
@@ -38,9 +37,8 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
 
     Returns
     -------
-    A graph of the frames with these poses, every edge with the covariance that its alignment
-    states (`registration.uncertainty`). What a pair does not constrain carries next to no
-    information.
+    A graph of the frames with these poses, every edge with the covariance of its alignment
+    (`registration.uncertainty`). Degenerate directions of a pair have almost no information.
     """
     pairs = _overlapping(views, poses)
     surfaces = [view.view for view in views]
@@ -65,7 +63,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
 
 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
-    """(M, 2) positions i < j of the views that are compared."""
+    """Return (M, 2) positions i < j of the views that are compared."""
     kept = [KeptView.of(view.view, _PAIRS.points) for view in views]
     pairs = spread_evenly(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
     after = np.arange(1, len(views))

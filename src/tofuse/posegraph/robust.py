@@ -1,8 +1,8 @@
-"""Robust kernels: how much an edge counts when its error is larger than its information allows.
+"""Robust kernels: bounded influence of edges with errors beyond their information.
 
 A kernel is a function of an edge's squared error ``x = e^T Omega e`` and a threshold c: its cost
-rho(x), which replaces x in the objective, and its weight w(x) = rho'(x), by which the edge's
-information is multiplied in the next step.
+rho(x), which replaces x in the objective, and its weight w(x) = rho'(x), a factor on the edge's
+information in the next step (iteratively reweighted least squares).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ class Settings:
         Kernel of the loop edges.
     gate
         Threshold on an edge's squared error in units of its information: at 100, ten standard
-        deviations. (That of a good edge is a chi-square variable with six degrees of freedom,
-        above 40 only once in two million; but few are so good.)
+        deviations. (That of an ideal edge is chi-square with six degrees of freedom, above 40 only
+        once in two million; few edges are ideal.)
     max_inflation
         Largest factor on the loops' standard deviations, as stated information is often too large;
-        estimated from the quartile of the loops' errors. Of "truncated" alone.
+        estimated from the quartile of the loops' errors. Only for "truncated".
     rotation
         Parametrisation of rotations, see `tofuse.posegraph.charts`.
     tolerance
         Iterations stop when a step lowers the objective by a smaller fraction.
     max_iterations
-        Largest number of steps, in each of the stages of "truncated".
+        Maximum number of steps, in each of the stages of "truncated".
     """
 
     robust: Robust = "truncated"
@@ -50,12 +50,12 @@ class Settings:
 
 
 def cost(kernel: Robust, x: Float64, c: float) -> Float64:
-    """rho(x) of squared errors x and a threshold c on x.
+    """Return rho(x) of squared errors x and a threshold c on x.
 
     "huber", "cauchy", "geman-mcclure" (Zhang 1997); "dcs", dynamic covariance scaling (Agarwal et
     al. 2013); "switchable", switchable constraints (Suenderhauf and Protzel 2012) with a linear
-    switch, which at its best value s = c / (c + x) costs ``s^2 x + c (1 - s)^2``, the cost of
-    Geman and McClure; "truncated": an edge counts in full or not at all.
+    switch, whose optimum s = c / (c + x) costs ``s^2 x + c (1 - s)^2``, the cost of Geman and
+    McClure; "truncated": truncated least squares.
     """
     if kernel == "huber":
         return np.where(x <= c, x, 2 * np.sqrt(c * np.maximum(x, c)) - c)
@@ -71,7 +71,7 @@ def cost(kernel: Robust, x: Float64, c: float) -> Float64:
 
 
 def weight(kernel: Robust, x: Float64, c: float) -> Float64:
-    """w(x) = rho'(x), 0 to 1."""
+    """Return w(x) = rho'(x), 0 to 1."""
     if kernel == "huber":
         return np.sqrt(c / np.maximum(x, c))
     if kernel == "cauchy":

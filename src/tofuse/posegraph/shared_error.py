@@ -1,13 +1,13 @@
-"""Errors that the pixels of a patch share, in a refinement of many views.
+"""Correlated depth errors of the pixels of a patch, in the joint refinement of many views.
 
-Light by way of other surfaces, scattering and motion bend whole patches of a range image, and each
-view's patches otherwise, so that a thousand pixels of a wall know little more of a pose than one.
-By how much shows in the residuals: patches of two views disagree by more than the noise of their
-pixels allows, and the more so the more the view has changed. What they disagree about is the
-variance of an unknown for each patch of each pair (a component of variance, estimated by moments
-as in restricted maximum likelihood). Where nothing of the kind shows, all pixels count.
+Multipath, scattering and motion bias whole patches of a range image, differently in each view, so
+that a thousand pixels of a wall constrain a pose little better than one. The residuals show the
+magnitude: patches of two views disagree by more than pixel noise, increasingly with the change of
+the viewpoint. The excess is the variance of a random effect for each patch of each pair (a variance
+component, estimated by moments as in restricted maximum likelihood). Without an excess, all pixels
+are independent.
 
-Albedo is not bent like that. So where distances are, it counts for more.
+Albedo has no such errors, so its relative weight increases with those of the distances.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
 from tofuse.registration.prepared_view import PreparedView
 
-# Patches in a row, and rows of patches; errors this far apart are still alike (by 1/e), as a share
-# of the image's width, as the tracker's covariance has it.
+# Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
+# image's width, as in the tracker's covariance.
 ACROSS, DOWN = 6, 4
 PATCHES = ACROSS * DOWN
 _REACH = 0.31
-# A patch with less than this share of the weight of the typical one says nothing.
-_LEAST_WEIGHT = 0.1
-# Views that have changed by less than this, in rad, may still disagree as if by so much.
-_LEAST_CHANGE = 0.02
-# What a single pair can fake is bounded, in units of 1 cm and 1 degree (and 1 of the exposure).
+# Minimum weight of a patch, as a fraction of the median.
+_MIN_WEIGHT = 0.1
+# Smaller changes of the viewpoint, in rad, count as this one.
+_MIN_CHANGE = 0.02
+# Prior sigma of the pose of a single pair, in units of 1 cm and 1 degree (and 1 of the exposure).
 _LOOSEST = 1.8
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 
 def patches_of(points: Float32, surface: PreparedView) -> Int64:
-    """(N,) the patch of each point of a view."""
+    """Return the (N,) patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
     low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))
     share = (rays - low) / np.maximum(high - low, 1e-9)
@@ -55,21 +55,21 @@ def _alike(aspect: float) -> Float64:
 
 
 def alike(surface: PreparedView) -> Float64:
-    """(PATCHES, PATCHES) correlation of the errors of the patches of a view."""
+    """Return the (PATCHES, PATCHES) correlation of the errors of a view's patches."""
     rows, columns = surface.z.shape
     return _alike(rows / columns)
 
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """By how much patches of pairs disagree, and how much of it noise and shared errors explain.
+    """Residuals of the patches of pairs, and the parts that noise and shared errors explain.
 
     Attributes
     ----------
     seen, noise
-        (P,) weighted mean squares of the patches' residuals, and what noise makes of them, m^2.
+        (P,) weighted mean squares of the patches' residuals, and their expectation by noise, m^2.
     share
-        (P,) what shared errors of variance 1 make of them.
+        (P,) their expectation by shared errors of variance 1.
     """
 
     seen: Float64
@@ -77,13 +77,13 @@ class Disagreement:
     share: Float64
 
     def variance(self, growth: Float64) -> float:
-        """Of the errors, for a growth of 1, where that of each pair is `growth` (P,) times it."""
+        """Return the variance of shared errors at growth 1; pairs have `growth` (P,) times it."""
         explained = float(self.share @ growth)
         return max(float((self.seen - self.noise).sum()), 0.0) / max(explained, 1e-12)
 
 
 def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagreement:
-    """Tell by how much the patches of pairs disagree, after allowing for what poses take up.
+    """Compare the residuals of pairs by patch, less what a change of their poses would absorb.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     count = len(sums)
     weight = sums[..., patch_kernels.WEIGHT]
     per_weight = 1 / np.maximum(weight, 1e-12)
-    known = weight > _LEAST_WEIGHT * np.median(weight, axis=1, keepdims=True)
+    known = weight > _MIN_WEIGHT * np.median(weight, axis=1, keepdims=True)
     A = np.zeros((count, kernels.UNKNOWNS, kernels.UNKNOWNS))
     A[:, _UPPER[0], _UPPER[1]] = rows[:, kernels.H : kernels.G]
     A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.H : kernels.G]
@@ -118,14 +118,14 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
 
 
 def growth(depth: Float64, turned: Float64, moved: Float64) -> Float64:
-    """(P,) how the variance of the errors grows with the change between the views of a pair.
+    """Return the (P,) growth of the errors' variance with the change of viewpoint of a pair.
 
     Parameters
     ----------
     depth
         (P,) median depth of the targets, m.
     turned, moved
-        (P,) rad and m from one view to the other.
+        (P,) rotation in rad and translation in m from one view to the other.
     """
-    change = np.maximum(turned + moved / depth, _LEAST_CHANGE)
+    change = np.maximum(turned + moved / depth, _MIN_CHANGE)
     return np.asarray((depth * change) ** 2, np.float64)

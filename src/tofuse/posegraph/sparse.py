@@ -1,12 +1,12 @@
-"""Normal equations of poses that are joined in pairs, and their sparse solution.
+"""Normal equations of pairwise constraints between poses, and their sparse solution.
 
-A pair (i, j) has a relative pose T_i_j = T_i^-1 T_j. Whatever is known of it is a quadratic in
-its right perturbation, ``T_i_j exp(xi)``: half ``xi^T H xi + 2 g^T xi`` with a (6, 6) H and a (6,)
-g. When the poses themselves are perturbed, ``T_k exp(d_k)``, the relative pose moves by::
+A pair (i, j) has a relative pose T_i_j = T_i^-1 T_j. Its constraint is a quadratic in the right
+perturbation, ``T_i_j exp(xi)``: half ``xi^T H xi + 2 g^T xi`` with a (6, 6) H and a (6,) g.
+Perturbations of the poses themselves, ``T_k exp(d_k)``, perturb the relative pose by::
 
     xi = d_j - Ad(T_j_i) d_i
 
-so four blocks and two gradients of the whole system follow from H, g and T_i_j alone.
+so H, g and T_i_j determine four blocks and two gradients of the whole system.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from scipy.sparse.linalg import splu
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 
-# Numbers of a dense right side that is solved for at a time.
+# Maximum size of a dense right-hand side, in numbers.
 _AT_ONCE = 4_000_000
-_FLAT = 1e-12  # of the largest diagonal entry: the least damping that a direction gets
+_FLAT = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
 
 
 class PairSystem:
-    """The sparse system of n poses and m pairs; its pattern and ordering are worked out once.
+    """The sparse system of n poses and m pairs; its pattern and ordering are computed once.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class PairSystem:
     pairs
         (m, 2) positions i (target) and j (source), i != j.
     fixed
-        (n,) mask of poses that don't move; the first of each connected part unless given.
+        (n,) mask of fixed poses; by default the first of each connected part.
     size
         Unknowns of each pose; 6 wherever H and g are those of a relative pose.
     """
@@ -59,7 +59,7 @@ class PairSystem:
         self._layout()
 
     def _sums(self, i: Intp, j: Intp, both: Intp) -> None:
-        """Make the matrices that add up what several pairs say of one block."""
+        """Make the matrices that sum the contributions of pairs to each block."""
         n, m = len(self.free), len(self.pairs)
         self._sum_i = _indicator(self.number[i], n, m)
         self._sum_j = _indicator(self.number[j], n, m)
@@ -72,7 +72,7 @@ class PairSystem:
         self._sum_off = _indicator(where, len(keys), len(both))
 
     def _layout(self) -> None:
-        """Find where each entry of each block lies in the data of the CSC matrix."""
+        """Compute the position of each entry of each block in the data of the CSC matrix."""
         n, k, off = len(self.free), self.size, len(self.rows)
         rows = np.concatenate([np.arange(n), self.rows, self.columns])
         columns = np.concatenate([np.arange(n), self.columns, self.rows])
@@ -111,7 +111,7 @@ class PairSystem:
         g_i, g_j
             (m, k) gradients of each pair.
         single
-            (n, k, k) blocks and (n, k) gradients of what is known of single poses.
+            (n, k, k) blocks and (n, k) gradients of unary terms.
         """
         n, k = len(self.free), self.size
         diagonal = self._sum_i @ ii.reshape(-1, k * k) + self._sum_j @ jj.reshape(-1, k * k)
@@ -144,13 +144,13 @@ class PairSystem:
         return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, single)
 
     def gradient(self, g: Float64, T_i_j: Float64) -> Float64:
-        """Gradient (free poses x 6) of (m, 6) g as in `relative`, by itself."""
+        """Return only the gradient (free poses x 6) of (m, 6) g, as in `relative`."""
         At = np.swapaxes(se3.adjoint(se3.inverse(T_i_j)), 1, 2)
         g_i = -(At @ g[..., None])[..., 0]
         return np.asarray(self._sum_i @ g_i + self._sum_j @ g, np.float64)
 
     def blocks(self, matrix: Any) -> tuple[Float64, Float64]:
-        """Blocks of an assembled matrix: on the diagonal, and below it at `rows`, `columns`."""
+        """Return the blocks of a matrix on the diagonal, and below it at `rows`, `columns`."""
         data = matrix.data
         return data[self._place[0]], data[self._place[1]]
 
@@ -162,19 +162,19 @@ class PairSystem:
         damping: float = 0.0,
         single: tuple[Float64, Float64] | None = None,
     ) -> Float64 | None:
-        """One damped Gauss-Newton step.
+        """Compute a damped Gauss-Newton step.
 
         Parameters
         ----------
         H, g
-            (m, 6, 6) and (m, 6): half the second, and the first derivative of half the objective
-            by the right perturbation of each pair's relative pose: ``J^T W J`` and ``J^T W r``.
+            (m, 6, 6) ``J^T W J`` and (m, 6) ``J^T W r`` of each pair, by the right perturbation of
+            its relative pose.
         T_i_j
-            (m, 4, 4) relative poses where H and g were taken.
+            (m, 4, 4) relative poses at the linearisation point.
         damping
-            Share of the diagonal that is added to it (Levenberg-Marquardt).
+            Fraction of the diagonal that is added to it (Levenberg-Marquardt).
         single
-            Blocks and gradients of single poses, see `assemble`.
+            Blocks and gradients of unary terms, see `assemble`.
 
         Returns
         -------
@@ -203,7 +203,7 @@ class Factor:
 
     def __init__(self, system: PairSystem, matrix: Any, gradient: Float64) -> None:
         self.system, self.gradient, self._matrix = system, gradient, matrix
-        # The blocks are in a good order already; the matrix is symmetric, so no pivoting.
+        # The blocks are in elimination order; the matrix is symmetric, so no pivoting.
         options = {"SymmetricMode": True}
         self._lu = (
             splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
@@ -212,11 +212,11 @@ class Factor:
         )
 
     def step(self) -> Float64 | None:
-        """(n, k) solution of ``matrix x = -gradient``; None if it is not finite."""
+        """Return the (n, k) solution of ``matrix x = -gradient``; None if not finite."""
         return self.solve(self.gradient)
 
     def solve(self, gradient: Float64) -> Float64 | None:
-        """The same with another gradient (free poses x k)."""
+        """As `step`, with another gradient (free poses x k)."""
         system = self.system
         out = np.zeros((system.n, system.size))
         if self._lu is not None:
@@ -227,7 +227,7 @@ class Factor:
         return out
 
     def joint_covariance(self, vertices: Intp) -> Float64:
-        """(v k, v k) covariance of some poses' perturbations together; zero for fixed ones."""
+        """Return the (v k, v k) joint covariance of some poses; zero for fixed ones."""
         system, k = self.system, self.system.size
         vertices = np.asarray(vertices, np.intp)
         out = np.zeros((len(vertices), k, len(vertices), k))
@@ -235,7 +235,7 @@ class Factor:
         if self._lu is None or not len(moving):
             return out.reshape(len(vertices) * k, -1)
         at = (k * system.number[vertices[moving]][:, None] + np.arange(k)).ravel()
-        # At once so many that the memory does not grow with the graph.
+        # In batches, so that memory does not grow with the graph.
         some = max(1, min(64, _AT_ONCE // (k * k * len(system.free))))
         for start in range(0, len(moving), some):
             these = moving[start : start + some]
@@ -248,7 +248,7 @@ class Factor:
         return (C + C.T) / 2
 
     def covariances(self) -> Float64:
-        """(n, 6, 6) marginal covariances of every pose's perturbation; zero for fixed ones.
+        """Return the (n, 6, 6) marginal covariances of the poses; zero for fixed ones.
 
         Raises RuntimeError where the system is not positive definite.
         """
@@ -258,9 +258,10 @@ class Factor:
         return out
 
     def relative_covariances(self, T_i_j: Float64) -> Float64:
-        """(m, 6, 6) covariances of the pairs' relative poses, T_i_j exp(xi); see `covariances`.
+        """Return the (m, 6, 6) covariances of the pairs' relative poses; see `covariances`.
 
-        `T_i_j` (m, 4, 4) are the relative poses where the system was made.
+        `T_i_j` (m, 4, 4) are the relative poses at the linearisation point; covariances are of
+        their right perturbations.
         """
         system = self.system
         diagonal, low = self._inverse()
@@ -278,8 +279,8 @@ class Factor:
         return C
 
     def _inverse(self) -> tuple[Float64, Float64]:
-        """Blocks of the inverse on the diagonal (free, 6, 6), and where pairs have theirs."""
-        # Imported here: Numba takes its time, and most who optimise need no covariances.
+        """Return the blocks of the inverse: diagonal (free, 6, 6), and those of the pairs."""
+        # Imported here: importing Numba is slow, and few callers need covariances.
         from tofuse.kernels.selected_inverse import factorise, fill_in, invert
 
         system = self.system
@@ -292,7 +293,7 @@ class Factor:
         order = np.lexsort((rows, columns))
         start = np.searchsorted(columns[order], np.arange(n + 1)).astype(np.int64)
         full_start, full_rows = fill_in(start, rows[order])
-        # Where the blocks of the matrix are in the pattern of its factor, which has more.
+        # Positions of the matrix's blocks in the pattern of its factor, which is denser.
         of_full = np.repeat(np.arange(n), np.diff(full_start))
         place = np.searchsorted(of_full * n + full_rows, columns * n + rows)
         values = np.zeros((len(full_rows), 6, 6))
@@ -304,7 +305,7 @@ class Factor:
 
 
 def parts_of(n: int, pairs: Intp) -> Intp:
-    """(n,) number of the connected part that each vertex is in, counted by their first vertices."""
+    """Return the (n,) connected part of each vertex, numbered in the order of first vertices."""
     i, j = np.asarray(pairs, np.intp).reshape(-1, 2).T
     adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     _, label = connected_components(adjacency, directed=False)
@@ -313,7 +314,7 @@ def parts_of(n: int, pairs: Intp) -> Intp:
 
 
 def first_of_parts(n: int, pairs: Intp) -> Bool:
-    """(n,) mask of the first vertex of each connected part."""
+    """Return the (n,) mask of the first vertex of each connected part."""
     first = np.zeros(n, bool)
     if n:
         first[np.unique(parts_of(n, pairs), return_index=True)[1]] = True
@@ -321,14 +322,14 @@ def first_of_parts(n: int, pairs: Intp) -> Bool:
 
 
 def _indicator(rows: Intp, n: int, m: int) -> Any:
-    """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are left out."""
+    """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are ignored."""
     used = np.flatnonzero(rows >= 0)
     ones = np.ones(len(used))
     return sparse.csr_matrix((ones, (rows[used], used)), shape=(n, m))
 
 
 def _elimination_order(n: int, i: Intp, j: Intp) -> Intp:
-    """Order of elimination with little fill-in: minimum degree on the graph of the poses."""
+    """Return an elimination order with little fill-in: minimum degree on the pose graph."""
     if n < 2:
         return np.arange(n)
     links = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
