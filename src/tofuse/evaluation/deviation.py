@@ -1,20 +1,19 @@
-"""How far given poses are from what registrations measure, and whether that can be chance.
+"""Deviation of given poses from pairwise registrations, and its statistical significance.
 
-Pairs of views measure the motion between them (`posegraph.pair_measurements`), many more pairs than
-there are poses. So the poses that fit all pairs best can be found, and the residuals of that fit
-show how large the errors of registrations are in this recording, relative to the covariances that
-they state. The given poses either agree with the pairs as well as any poses could, or they don't.
+Pairs of views measure the motion between them (`posegraph.pair_measurements`), with far more pairs
+than poses. A least squares fit gives the poses that agree best with all pairs, and its residuals
+the errors of registrations in this recording, relative to their stated covariances. The given poses
+are consistent if they agree with the pairs as well as correct ones would.
 
-With x the perturbations that turn the fitted poses into the given ones, and S the covariance of the
-fitted poses, a correction d makes the given poses consistent if (x - d)^T S^-1 (x - d) is no larger
-than it may be. The smallest such correction is the solution of a trust-region problem,
-(M + m S^-1) (x - d) = M x, with the one m for which it just is (More and Sorensen 1983). M is the
-norm: the rms over the views of how far the surfaces in view are displaced, by the translation, and
-by the rotation at the median depth. A rigid motion of all poses costs nothing, and neither does
-what no measurement constrains.
+With x the perturbations from the fitted poses to the given ones, and S the covariance of the
+fitted poses, a correction d makes the given poses consistent if (x - d)^T S^-1 (x - d) is below a
+threshold. The smallest such correction is the solution of a trust-region problem,
+(M + m S^-1) (x - d) = M x, with the m at which the threshold is met (More and Sorensen 1983). M is
+the norm: the rms displacement over the views of the surfaces in view, by the translation, and by
+the rotation at the median depth. Gauge freedom and degenerate directions cost nothing.
 
-The size of the smallest correction is stated twice: to where right poses usually are, which
-estimates the error, and to where 95 % of them are, which bounds it from below.
+The norm of the smallest correction is stated for two thresholds: that which correct poses usually
+meet, which estimates the error, and that which 95 % of them meet, which is its lower bound.
 """
 
 from __future__ import annotations
@@ -38,38 +37,37 @@ from tofuse.posegraph.sparse import PairSystem
 from tofuse.registration.projective import UNITS
 
 _LEVEL = 0.95
-# Of a chi-square variable with six degrees of freedom: its median, and where Huber's loss begins.
+# Of a chi-square variable with six degrees of freedom: its median, and Huber's threshold.
 _MEDIAN, _RARE = float(chi_squared.median(6)), float(chi_squared.ppf(0.99, 6))
 _FITS = 3
-# The stated covariances count as much as so many residuals that confirm them.
+# Degrees of freedom of the prior of the scale, the stated covariances.
 _STATED = 6.0
-# Errors of the camera that all views of a place share show in no residual. The squares of the true
-# poses' perturbations are so many times what the residuals show: usually, and in 95 % of recordings
-# (docs/uncertainty.md).
+# Systematic errors of the camera, equal in all views of a place, show in no residual. Ratio of the
+# squared perturbations of the true poses to those the residuals show: usually, and in 95 % of
+# recordings (docs/uncertainty.md).
 _USUAL, _AT_WORST = 1.5, 6.0
 # Information of a direction, in units of 1 cm and 1 degree, that no measurement constrains.
 _UNMEASURED = 1e-4
-_LEAST_SCALE = 1e-6
-_STRIDE = np.log(100.0)  # between the weights that are tried first
+_MIN_SCALE = 1e-6
+_STRIDE = np.log(100.0)  # of the weights when bracketing the root
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The poses that fit the measurements of all pairs best.
+    """The least squares fit of poses to the measurements of all pairs.
 
     Attributes
     ----------
     graph
-        With these poses; its information is what the pairs together know, at the size of errors
-        that this recording shows.
+        With these poses; its information is scaled to the errors of this recording.
     scale
         Standard deviation of the residuals, relative to the stated one.
     unknowns
-        Degrees of freedom of the poses, without those that nothing constrains.
+        Degrees of freedom of the poses, without unconstrained ones.
     spare
-        Degrees of freedom that the scale rests on.
+        Degrees of freedom of the estimate of the scale.
     depth_m
-        Median depth of what the views see.
+        Median depth of the views, m.
     """
 
     graph: PoseGraph
@@ -81,25 +79,25 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
-    """How far given poses are from what the registrations of a recording measure.
+    """Deviation of given poses from the registrations of a recording.
 
     Attributes
     ----------
     estimate_m
-        Rms displacement of the surfaces in view by errors of the poses; 0 where none are seen.
+        Rms displacement of the surfaces in view by errors of the poses; 0 if none are detected.
     at_least_m, at_most_m
-        Bounds of it, each 95 %. `at_least_m` is 0 where the poses are consistent with the depth;
-        `at_most_m` is inf where some direction is not bounded by any measurement.
+        Its bounds, each 95 %. `at_least_m` is 0 if the poses are consistent with the depth;
+        `at_most_m` is inf if a direction is not bounded by any measurement.
     distance_m
-        Distance from the poses that fit the registrations best, which err as well.
+        Distance from the fitted poses, which have errors too.
     ids
         (V,) indices of the frames that were compared.
     of_views_m
-        (V,) displacement of each that `estimate_m` is the rms of.
+        (V,) displacement of each, whose rms is `estimate_m`.
     steps
         (S, 2) positions of the views between which the motion alone is inconsistent.
     fit
-        What they were compared with; other poses of the same recording can be, too.
+        The fit they were compared with; other poses of the recording can be compared with it too.
     """
 
     estimate_m: float
@@ -117,7 +115,7 @@ class Deviation:
         return self.at_least_m == 0
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `judge.json` holds."""
+        """Return the entry of `judge.json`."""
         return {
             "estimate_m": self.estimate_m,
             "at_least_m": self.at_least_m,
@@ -130,22 +128,21 @@ class Deviation:
 
 
 def fitted(graph: PoseGraph, depth_m: float) -> Fit:
-    """Fit the poses of a graph to its measurements, and find the size of their errors.
+    """Fit the poses of a graph to its measurements, and estimate the scale of their errors.
 
-    Wrong registrations count little, for the poses and for the size of errors (Huber 1964, his
-    second proposal). Each view takes part in many pairs, which share its errors: all pairs together
-    count no more than one for each pose but the first.
+    Both are robust to wrong registrations (Huber 1964, his second proposal). The pairs of a view
+    share its errors: all pairs together have the weight of one per pose but the first.
 
     Parameters
     ----------
     graph
         Of two views or more, see `posegraph.pair_measurements`.
     depth_m
-        Median depth of what they see.
+        Median depth of the views, m.
     """
     n, m = len(graph.ids), len(graph.edges)
     information, poses = graph.information, graph.poses
-    square = max(float(np.median(_squares(graph))) / _MEDIAN, _LEAST_SCALE)
+    square = max(float(np.median(_squares(graph))) / _MEDIAN, _MIN_SCALE)
     measured = int((np.linalg.eigvalsh(information * np.outer(UNITS, UNITS)) > _UNMEASURED).sum())
     spare = max(measured - 6 * (n - 1), 0)
     for _ in range(_FITS):
@@ -165,7 +162,7 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
 
 
 def deviation(fit: Fit, poses: Float64) -> Deviation:
-    """Compare given poses (V, 4, 4) of the views of a fit with it.
+    """Compare given poses (V, 4, 4) T_world_camera of the views of a fit with it.
 
     Raises
     ------
@@ -207,21 +204,21 @@ class _Corrections:
         self._system = PairSystem(n, graph.edges, np.zeros(n, np.bool_))
 
     def product(self, x: Float64) -> float:
-        """x^T S^-1 x."""
+        """Return x^T S^-1 x."""
         i, j = self._graph.edges.T
         e = x[j] - (self._A @ x[i][..., None])[..., 0]
         return float(np.einsum("mi,mij,mj->m", e, self._graph.information, e).sum())
 
     def lengths(self, x: Float64) -> Float64:
-        """(V,) displacements of the surfaces in view, m."""
+        """Return the (V,) displacements of the surfaces in view, m."""
         return np.asarray(np.linalg.norm(x * self._units, axis=1), np.float64)
 
     def norm(self, x: Float64) -> float:
-        """Rms of the displacements, m."""
+        """Return the rms of the displacements, m."""
         return float(np.sqrt((self.lengths(x) ** 2).mean()))
 
     def smallest(self, x: Float64, allowed: float) -> Float64:
-        """The smallest d (V, 6) with (x - d)^T S^-1 (x - d) <= allowed."""
+        """Return the smallest d (V, 6) with (x - d)^T S^-1 (x - d) <= allowed."""
         if self.product(x) <= allowed:
             return np.zeros_like(x)
 
@@ -236,7 +233,7 @@ class _Corrections:
         return x - self._rest(x, float(np.exp(brentq(excess, low, high, xtol=1e-3))))
 
     def _rest(self, x: Float64, m: float) -> Float64:
-        """(M + m S^-1)^-1 M x."""
+        """Return (M + m S^-1)^-1 M x."""
         M = self._units**2 / len(x)
         single = np.tile(np.diag(M), (len(x), 1, 1)), -M * x
         H = m * self._graph.information
@@ -246,7 +243,7 @@ class _Corrections:
 
 
 def _steps(graph: PoseGraph, poses: Float64) -> Intp:
-    """Pairs of views in a row between which the motion by poses (V, 4, 4) can't be chance."""
+    """Return consecutive views between which the motion of poses (V, 4, 4) is inconsistent."""
     i, j = graph.edges.T
     row = np.flatnonzero(j == i + 1)
     share = (len(graph.ids) - 1) / len(graph.edges)
@@ -256,7 +253,7 @@ def _steps(graph: PoseGraph, poses: Float64) -> Intp:
 
 
 def _squares(graph: PoseGraph) -> Float64:
-    """(M,) squared errors of the edges, in units of their information."""
+    """Return the (M,) squared errors of the edges, in units of their information."""
     e = graph.residuals()
     return np.asarray(np.einsum("mi,mij,mj->m", e, graph.information, e), np.float64)
 

@@ -1,4 +1,4 @@
-"""The job of `tofuse evaluate`: a trajectory against a reference, and against its own images."""
+"""`tofuse evaluate`: compare a trajectory with a reference, and with the images at its poses."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _TRAJECTORY = "trajectory.txt"  # of a result
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """How far a trajectory is from a reference.
+    """Errors of a trajectory relative to a reference.
 
     Attributes
     ----------
     error
         Absolute and relative errors.
     ate_interval_m
-        Bounds of the true ATE, where it is known how far off the reference may be.
+        Bounds of the true ATE; None if the error of the reference is unknown.
     consistency
-        How well the recording's images agree at these poses; None without a recording.
+        Map consistency of the recording's images at these poses; None without a recording.
     """
 
     error: TrajectoryError
@@ -74,16 +74,16 @@ def evaluate(
     Parameters
     ----------
     estimate, reference
-        A file or folder of any format that is read (a result, a recording with a reference), or
+        A file or folder of any supported format (a result, a recording with a reference), or
         (N, 4, 4) T_world_camera of the frames of the recording, NaN where there is none.
     recording
-        Knows the times of frames where the files don't; with it the agreement of its images is
-        measured as well.
+        Provides the timestamps of frames if the files don't, and images whose map consistency is
+        measured.
     reference_error_m
-        By how much the reference may be off, rms.
+        Rms error of the reference, m.
     config
-        That of the result which the poses are of: its images are compared with the camera that it
-        was made with, if that was calibrated. Unless given, that of an estimate that is a result.
+        That of the result the poses belong to: images are compared with its self-calibrated camera,
+        if any. By default read from an estimate that is a result.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def evaluate(
 
 
 def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corrector, ...]:
-    """What puts frames right as the result did that the poses are of, if they are of one."""
+    """Return the correctors of the result the poses belong to; none if they are of no result."""
     if config is not None:
         return CameraErrors.made_with(config)
     if not isinstance(estimate, str | Path):
@@ -150,7 +150,7 @@ def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses
 def _timed(
     found: TimedPoses, given: Poses, clock: Clock | None, name: str
 ) -> tuple[Float64, Float64]:
-    """Times and poses. Those of an array are of the recording's frames, in their order."""
+    """Return times (N,) and poses (N, 4, 4); those of an array are of the recording's frames."""
     if isinstance(given, str | Path) or clock is None:
         return found.timed(clock, name)
     if len(found.poses) != len(clock[0]):

@@ -1,13 +1,13 @@
-"""Judging poses from elsewhere: do they agree with the depth, and how much better could they be?
+"""Assessing poses from other sources: their consistency with the depth, and their accuracy.
 
-The poses take the place of tracking; from there on everything is as in a run: loops are closed, and
-all views are refined together. How far the given poses are from the refined ones, and how far those
-may be off themselves, is how far the given ones may be off. Where images contradict even the
-refined poses, the recording is tracked anew, and what the images support better counts.
+The poses replace tracking; the rest is as in a run: loops are closed, and all views are refined
+jointly. The error bound of the given poses is their distance from the refined ones plus the error
+bound of those. If images contradict even the refined poses, the recording is tracked anew, and the
+trajectory with more support by the images counts.
 
-Whether the given poses are wrong at all is another question: the refined ones err too, and mostly
-where registrations can't know better. Pairs of views, registered around the refined poses, tell how
-far the given poses are from anything that they could have measured (`evaluation.deviation`).
+Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
+not prove the given poses wrong. Pairs of views, registered around the refined poses, test that
+(`evaluation.deviation`).
 """
 
 from __future__ import annotations
@@ -56,23 +56,22 @@ from tofuse.results.verdict import ranked, verdict_of
 
 Views = Sequence[PosedView[PreparedView]]
 
-# Frames whose images are compared under the poses.
+# Number of frames whose images are compared under the poses.
 _CHECKED = 60
-# Where less of what overlapping images say supports the poses, another trajectory is looked for.
+# With a smaller fraction of supporting measurements the recording is tracked anew.
 _SUPPORTED = 0.95
-# Where fewer views overlap than this share of those that do under the refined poses, most of the
-# poses are wrong.
-_MOST = 0.5
+# With fewer overlapping views, relative to the refined poses, most poses are wrong.
+_MIN_OVERLAPPING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What the depth says of poses from elsewhere.
+    """Assessment of poses from another source by the depth images.
 
     Attributes
     ----------
     poses
-        (N, 4, 4) T_world_camera of the frames as given, NaN where none is.
+        (N, 4, 4) T_world_camera of the frames as given, NaN where there is none.
     accuracy
         Of these poses.
     verdict, reasons
@@ -80,15 +79,15 @@ class Judgement:
     consistency, refined_consistency
         Map consistency of the given poses and of the refined ones; None if no two views overlap.
     deviation
-        How far these poses are from what pairs of views measure, and whether that can be chance;
-        None if no two views could be compared.
+        Deviation of these poses from pairwise registrations, and its significance; None if no two
+        views could be compared.
     displacement_m
         (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
     refined
-        The result of a refinement that started from the poses; or of a run of its own, where the
+        The result of a refinement initialised with the poses; or of an independent run, if the
         images support that better.
     started
-        Whether `refined` started from the poses.
+        Whether `refined` was initialised with the poses.
     """
 
     poses: Float64
@@ -103,7 +102,7 @@ class Judgement:
     started: bool = True
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `judge.json` holds, but for numbers that are inf."""
+        """Return the content of `judge.json`, with inf as it is."""
         return {
             "schema": 1,
             "verdict": self.verdict,
@@ -140,8 +139,8 @@ def judge(
         Range images, as of `tofuse.open`.
     trajectory
         A file of any format of `files.trajectory_formats`, the folder of a result, or (N, 4, 4)
-        T_world_camera of the frames, NaN where there is none. Poses with times are assigned to the
-        frames that are nearest in time, within 20 ms.
+        T_world_camera of the frames, NaN where there is none. Timed poses are assigned to the
+        nearest frames in time, within 20 ms.
     tolerance_m
         Accuracy required of good poses, m; see `Config`.
     threads
@@ -157,8 +156,7 @@ def judge(
     progress = progress or Silent()
     poses = poses_for(recording, trajectory)
     kind = view_kind(recording)
-    # What else moves with the camera says nothing of these poses, and images are compared with the
-    # camera as it is stated.
+    # External sensors do not measure these poses, and images are compared with the stated camera.
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, outside=(), self_calibration=False
     )
@@ -200,29 +198,29 @@ def judge(
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What overlapping images say of poses."""
+    """Cross-view consistency of overlapping images under given poses."""
 
     cross_view: CrossViewConsistency
 
     @property
     def overlapping(self) -> float:
-        """Share of the views that overlap with another one."""
-        shares = self.cross_view.support_of_views()
-        return float(np.isfinite(shares).mean()) if len(shares) else 0.0
+        """Fraction of the views that overlap with another one."""
+        support = self.cross_view.support_of_views()
+        return float(np.isfinite(support).mean()) if len(support) else 0.0
 
     @property
     def support(self) -> float:
-        """Share of the overlapping measurements that support the poses, times `overlapping`."""
+        """Fraction of the overlapping measurements that support the poses, times `overlapping`."""
         return float(np.nan_to_num(self.cross_view.support())) * self.overlapping
 
     @property
     def is_supported(self) -> bool:
-        """Whether all views overlap with others, and hardly anything contradicts the poses."""
+        """Whether almost all views overlap, and almost no measurement contradicts the poses."""
         return self.support >= _SUPPORTED
 
 
 class _Images:
-    """Some frames of a recording, each read and prepared once, to be compared under any poses."""
+    """A sample of frames, read and prepared once, to be compared under different poses."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -236,7 +234,7 @@ class _Images:
         return Seen(compare_views([view for _, view in found], poses[chosen]))
 
     def _view(self, k: int) -> PreparedView | None:
-        """The k-th frame, prepared; None if it can't be read."""
+        """Return the k-th frame as a prepared view; None if it can't be read."""
         if k not in self._views:
             try:
                 frame = self._recording[k]
@@ -270,14 +268,14 @@ def judge_files(
     options: JudgeOptions | None = None,
     progress: Progress | None = None,
 ) -> Judgement:
-    """Judge the poses in a file, and write the refined result if a folder is given for it.
+    """Judge the poses in a file, and write the refined result if an output folder is given.
 
     Raises
     ------
     InputError
         If the recording or the poses can't be used.
     OutputError
-        If the result can't be written; nothing that was there before has changed then.
+        If the result can't be written; an existing folder is then unchanged.
     """
     options, progress = options or JudgeOptions(), progress or Silent()
     opening = Opening(
@@ -299,8 +297,8 @@ def judge_files(
             threads=options.threads,
             progress=progress,
         )
-        told = {**found.refined.recording, "opening": opening.to_dict()}
-        found = replace(found, refined=replace(found.refined, recording=told))
+        facts = {**found.refined.recording, "opening": opening.to_dict()}
+        found = replace(found, refined=replace(found.refined, recording=facts))
         if folder is not None:
             progress.stage("writing")
             with threadpool_limits(1):
@@ -309,7 +307,7 @@ def judge_files(
 
 
 def _write(found: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder) -> None:
-    """Write the refined result, with the judgement beside it and at the top of its report."""
+    """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.report.extras import ReportExtras
     from tofuse.viewer.view_file import write_report_and_view
 
@@ -325,7 +323,7 @@ def _write(found: Judgement, trajectory: Path, recording: Recording, folder: Out
 
 
 def sentence(found: Judgement, name: str) -> str:
-    """Say what the judgement comes to: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
+    """Summarise the judgement: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
     diagonal = found.refined.cloud.diagonal_m
     given = bound(found.accuracy, diagonal)
     better = bound(found.refined.diagnostics.accuracy, diagonal)
@@ -334,7 +332,7 @@ def sentence(found: Judgement, name: str) -> str:
 
 
 def _agreement(found: Deviation | None) -> str:
-    """Say whether the depth contradicts the poses."""
+    """State whether the depth contradicts the poses."""
     if found is None:
         return ""
     if not found.consistent:
@@ -348,7 +346,7 @@ def _agreement(found: Deviation | None) -> str:
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
-    """Say how accurate the poses are that a phone found itself; empty if none did.
+    """State the accuracy of a phone's own poses; empty if there are none.
 
     "ARKit's poses: ±31 mm (95 %); these: ±9 mm."
     """
@@ -366,12 +364,12 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
 
 
 def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64:
-    """(N, 4, 4) poses of the frames of a recording, NaN where a trajectory has none; see `judge`.
+    """Return the (N, 4, 4) poses of a recording's frames, NaN where there is none; see `judge`.
 
     Raises
     ------
     InputError
-        If fewer than two frames have a pose, or an array is of another length.
+        If fewer than two frames have a pose, or an array has the wrong shape.
     """
     where = "trajectory"
     if isinstance(trajectory, str | Path):
@@ -407,13 +405,13 @@ def _distances(poses: Float64, refined: Float64) -> Float64:
 
 
 def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
-    """Of the given poses: how far from the refined ones, and how far those may be off."""
+    """Return the bound of the given poses: distance from the refined ones plus their bound."""
     known = refined.diagnostics.accuracy
     both = np.flatnonzero(np.isfinite(distances))
     if not known.assessed or not len(both):
         return known
     moved, turned = displacement(refined.trajectory[both], poses[both])
-    # In the worst case both are in one direction.
+    # In the worst case both have the same direction.
     position, rotation = moved + known.position_m, turned + known.rotation_rad
     worst = int(both[np.argmax(distances[both])])
     at_worst = WorstFrame(
@@ -429,7 +427,7 @@ def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Ac
 
 
 def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviation | None:
-    """Compare the poses with pairs of the views that have a pose there and in the main model."""
+    """Compare the poses with registered pairs of views that have a given and a refined pose."""
     row = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
     both = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
     known = set(both.tolist())
@@ -454,7 +452,7 @@ def _reasons(
     frames = refined.diagnostics.frames
     indices = [f.index for f in frames]
     everything = ((indices[0], indices[-1]),)
-    if seen.overlapping < _MOST * after.overlapping:
+    if seen.overlapping < _MIN_OVERLAPPING * after.overlapping:
         text = (
             f"Only {seen.overlapping:.0%} of the images overlap with another under these poses; "
             f"under the refined ones {after.overlapping:.0%} do."
@@ -464,7 +462,7 @@ def _reasons(
     allowed = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
     wrong = [] if deviation is None else [*_wrong(deviation, allowed, everything)]
     yield from wrong
-    # That poses may be off says nothing more where they are.
+    # Uncertain poses are no further reason if they are known to be wrong.
     yield from (
         r for r in bounds(accuracy, allowed, indices) if not wrong or r.code != "uncertain_poses"
     )
@@ -483,7 +481,7 @@ def _reasons(
 
 
 def _wrong(found: Deviation, allowed_m: float, everything: tuple[Range, ...]) -> Iterator[Reason]:
-    """Give a reason where poses contradict the depth by more than is allowed."""
+    """Yield a reason if poses contradict the depth by more than the tolerance."""
     if found.at_least_m <= allowed_m:
         return
     text = (

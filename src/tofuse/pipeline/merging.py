@@ -1,9 +1,9 @@
-"""Merging: the results of several runs in one map.
+"""Multi-session mapping: merging the results of several runs into one map.
 
-Each session, a recording with the poses that its result states, is a component of one large run.
-From there on everything is as in a run: components are joined where views of both sides say so and
-none contradicts, loops between them are closed, all views are refined together, and fused. The
-world stays that of the first result. What can't be joined stays apart.
+Each session, a recording with the poses of its result, is a component of one large run. The rest is
+as in a run: components are joined where registered views of both confirm it and none contradicts,
+loops between them are closed, all views are refined jointly, and fused. The world frame is that of
+the first result. Sessions that can't be joined remain separate components.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from tofuse.results.types import (
 )
 from tofuse.results.verdict import verdict_of
 
-# View pairs that are registered at most to join the same two sessions, and searches for each
-# session that is to be joined.
+# Maximum number of view pairs that are registered to join two sessions, and number of searches per
+# session to be joined.
 _TRIES, _SEARCHES = 24, 48
-# Which probability of being right a join must have.
-_SURELY = 0.99
+# Minimum probability that a join is correct.
+_MIN_PROBABILITY = 0.99
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class MergeOptions:
     Attributes
     ----------
     only_joined
-        Whether nothing is written where the last session can't be joined to the first.
+        Whether nothing is written if the last session can't be joined to the first.
     """
 
     out: Path
@@ -79,27 +79,27 @@ def merge(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Put the results of several runs into one map, in the world of the first.
+    """Merge the results of several runs into one map, in the world frame of the first.
 
     Parameters
     ----------
     results
         Output folders of `tofuse run` or `tofuse merge`; at least two sessions. Their recordings
-        must be where they were.
+        must still be available.
     tolerance_m
-        As of `Config`; that of the first result unless given.
-    seed, threads
-        As of `reconstruct`.
+        As in `Config`, m; by default that of the first result.
+    seed, threads, progress
+        As in `reconstruct`.
 
     Returns
     -------
-    A result as of a run, with `sessions` and `session_pairs`. What can't be joined to the first one
-    is a component with a model of its own.
+    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    first one are components with models of their own.
 
     Raises
     ------
     InputError
-        If something is no result, or its recording is gone or has changed.
+        If a folder is not a result, or its recording is missing or has changed.
     """
     progress = progress or Silent()
     sessions = read_sessions(results, threads, progress)
@@ -110,13 +110,17 @@ def merge(
 
 
 def merged_config(sessions: Sequence[Session]) -> Config:
-    """How sessions are joined, refined and fused: by default, the model as of the first one."""
+    """Return the configuration of a merge: the default, with the model options of the first."""
     first = sessions[0].config
     default = from_method("default")
     outside = default.outside if all(s.config.outside for s in sessions) else ()
     searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
-        default.joining, main="first", tries=_TRIES, searches=searches, min_probability=_SURELY
+        default.joining,
+        main="first",
+        tries=_TRIES,
+        searches=searches,
+        min_probability=_MIN_PROBABILITY,
     )
     return replace(
         default,
@@ -153,11 +157,11 @@ def merge_sessions(
         result = mapper.finish()
         progress.stage("comparing sessions")
         with use_threads(mapper.threads):
-            return _told(result, sessions, firsts, mapper.views, recording)
+            return _with_sessions(result, sessions, firsts, mapper.views, recording)
 
 
 def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
-    """The recordings of all sessions as one, and the index of the first frame of each."""
+    """Return the recordings of all sessions as one, and the index of the first frame of each."""
     sources: list[Source] = []
     names: list[str] = []
     firsts, count = [], 0
@@ -179,21 +183,21 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
 
 
 def _config_of(session: Session, first: int) -> Config:
-    """How the frames of a session are prepared, and which poses they have."""
+    """Return the configuration of a session, with its stated poses as odometry."""
     given = session.config.odometry
     assert isinstance(given, GivenPoses)
     stated = {k + first: pose for k, pose in session.stated.items()}
     return replace(session.config, odometry=StatedPoses(stated, given))
 
 
-def _told(
+def _with_sessions(
     result: Reconstruction,
     sessions: Sequence[Session],
     firsts: Sequence[int],
     views: Sequence[PosedView[PreparedView]],
     recording: Recording,
 ) -> Reconstruction:
-    """The result, which says what became of each session."""
+    """Return the result with its sessions, their overlaps and changes."""
     pose = Model.of(result).poses
     records = tuple(
         SessionRecord(
@@ -222,17 +226,17 @@ def _told(
         changes=session_changes(result, records, views),
     )
     reasons = tuple(_reasons(result))
-    told = replace(result.diagnostics, reasons=reasons, verdict=verdict_of(reasons))
-    return replace(result, diagnostics=told)
+    diagnostics = replace(result.diagnostics, reasons=reasons, verdict=verdict_of(reasons))
+    return replace(result, diagnostics=diagnostics)
 
 
 def _T_main_session(
     posed: dict[int, StatedPose], first: int, pose: dict[int, Float64], *, fixed: bool
 ) -> Float64 | None:
-    """(4, 4) from the world of a session's result into the main one; None where it is apart.
+    """Return (4, 4) T_main_session between the world frames; None if the session is not joined.
 
-    The refinement has moved its frames a little against each other, so this is what fits best; but
-    of the first session, whose world is the main one, its first frame counts.
+    Refinement has changed the relative poses of its frames, so this is a least squares alignment;
+    for the first session (`fixed`), whose world frame is the main one, that of its first frame.
     """
     main = min((s.component for s in posed.values()), default=None)
     both = [k for k, s in posed.items() if s.component == main and k + first in pose]
@@ -246,7 +250,7 @@ def _T_main_session(
 
 
 def _reasons(result: Reconstruction) -> Iterator[Reason]:
-    """The reasons, as they are to be told where sessions stay apart: they are named."""
+    """Return the reasons, with the names of sessions that are not joined."""
     apart = [s.name for s in result.sessions if s.T_main_session is None]
     for reason in result.diagnostics.reasons:
         if apart and reason.code == "few_poses" and _has_most(result):
@@ -260,7 +264,7 @@ def _reasons(result: Reconstruction) -> Iterator[Reason]:
 
 
 def _has_most(result: Reconstruction) -> bool:
-    """Whether the main model has most frames of the sessions that are part of it."""
+    """Whether the main model contains most frames of the sessions joined to it."""
     joined = [s for s in result.sessions if s.T_main_session is not None]
     frames = [
         f
@@ -271,7 +275,7 @@ def _has_most(result: Reconstruction) -> bool:
 
 
 def check_result(folder: Path) -> None:
-    """Refuse what can't be merged with a result that is still to be made; see `merge`."""
+    """Raise InputError if a result can't be merged with a later one; see `merge`."""
     sessions_of(folder, 0, None, Silent())
 
 
@@ -285,7 +289,7 @@ def merge_files(
     InputError
         See `merge`.
     OutputError
-        If the result can't be written; nothing that was there before has changed then.
+        If the result can't be written; an existing folder is then unchanged.
     """
     # Claimed before the results are read: it may be one of them.
     with OutputFolder(options.out, overwrite=options.overwrite) as folder:

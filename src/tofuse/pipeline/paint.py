@@ -1,4 +1,4 @@
-"""The texture of a finished model, from frames that are read again."""
+"""The texture of a finished model, from reread frames."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 
-# Maximum number of views and of textured triangles: more are hardly visible, and take long to lay
-# out.
+# Maximum number of views and of textured triangles: more are hardly visible, and slow to unwrap.
 _VIEWS, _FACES = 60, 60_000
 # Metres of motion that blur as much as one radian.
 _METRES_PER_RADIAN = 1.0
@@ -66,15 +65,15 @@ def paint(
             poses.append(result.trajectory[k])
     if not views:
         return None
-    # BLAS sums differ with its number of threads; ours don't.
+    # Sums of BLAS depend on its number of threads; those of the kernels don't.
     with use_threads(threads), threadpool_limits(1):
         return textured(mesh.decimated(_FACES), views, np.array(poses), size)
 
 
 def steadiest_frames(result: Reconstruction, max_frames: int = _VIEWS) -> list[int]:
-    """Return positions of tracked frames: the one with the least motion blur of each stretch.
+    """Return positions of tracked frames: the one with the least motion blur of each segment.
 
-    Stretches have equal numbers of frames, at most `max_frames` of them.
+    The trajectory is divided into at most `max_frames` segments of equal numbers of frames.
     """
     tracked = [k for k, f in enumerate(result.diagnostics.frames) if f.status == "tracked"]
     posed = np.array([k for k in tracked if result.has_pose[k]], np.intp)

@@ -17,7 +17,7 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     """Pool estimates by a random-effects model with Student's t, which is robust to outliers.
 
     The k-th estimate is t-distributed about the pooled value, with the squared scale ``tau^2 +
-    s^2 / information_k``: tau is how much the estimates truly differ, s the unit of the noise
+    s^2 / information_k``: tau is the heterogeneity of the estimates, s the unit of the noise
     (random-effects meta-analysis, DerSimonian and Laird 1986; with t, Baker and Jackson 2008).
     Neither is known, and all three are integrated over a grid with flat priors (of tau and s, on
     their logarithm).
@@ -27,7 +27,7 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     estimates
         (n,) of the same quantity, at least 2.
     information
-        (n,) above 0, proportional to one over the variance of their noise.
+        (n,) above 0, proportional to the inverse variance of their noise.
 
     Returns
     -------
@@ -46,8 +46,8 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     scales = spread * np.geomspace(_MIN_DEVIATION, _MAX_DEVIATION, _DEVIATIONS)
     value, tau, s = np.meshgrid(values, scales, scales, indexing="ij")
     logs = np.zeros(value.shape)
-    for estimate, share in zip(estimates, known, strict=True):
-        variance = tau**2 + s**2 / share
+    for estimate, precision in zip(estimates, known, strict=True):
+        variance = tau**2 + s**2 / precision
         logs -= 0.5 * np.log(variance)
         logs -= 0.5 * (_FREEDOM + 1) * np.log1p((estimate - value) ** 2 / variance / _FREEDOM)
     weight = np.exp(logs - logs.max()).sum((1, 2))

@@ -1,6 +1,6 @@
-"""Self-calibration: a recording that shows a calibration error is reconstructed without it.
+"""Self-calibration: calibration errors that a recording shows are corrected.
 
-Refined views show whether an error of the focal length or the depth offset bends the trajectory:
+Refined views show whether an error of the focal length or the depth offset distorts the trajectory:
 corrected, they support each other better, and the drift over a loop is smaller
 (`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
 which stays only if the stated bound of the poses is smaller (`posegraph.accuracy`). If neither
@@ -23,7 +23,7 @@ from tofuse.results.card import length
 from tofuse.results.types import Diagnostics, Reason, Reconstruction, SelfCalibration
 from tofuse.results.verdict import ranked
 
-# The first estimate uses poses that the error has bent, the second one does not.
+# The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
 # Options of `CameraErrors` by the names of the errors.
 _FIELDS = {"focal": "focal", "offset": "offset_m"}
@@ -52,7 +52,7 @@ def self_calibrated(
         shown = _shown(best)
         if shown is None:
             break
-        suspicion, error = shown
+        check, error = shown
         wrong = corrected.and_then(error)
         progress.note(f"views agree better with {in_words(wrong)}: reconstructing again with it")
         again = once(replace(config, corrections=(wrong, *config.corrections)))
@@ -62,7 +62,7 @@ def self_calibrated(
         calibration = SelfCalibration(
             wrong.focal,
             wrong.offset_m,
-            {_FIELDS[suspicion.best]: suspicion.sigmas[suspicion.best]},
+            {_FIELDS[check.best]: check.sigmas[check.best]},
             (_bound(first), _bound(again)),
         )
         best = replace(again, diagnostics=_with_calibration(again, calibration))
@@ -77,7 +77,7 @@ def in_words(wrong: CameraErrors) -> str:
 
 
 def _shown(result: Reconstruction) -> tuple[CalibrationCheck, CameraErrors] | None:
-    """Return the calibration error that the views show, of several the one that helps most."""
+    """Return the calibration error that explains the views best; None without an alarm."""
     refinement = result.diagnostics.refinement
     found = None if refinement is None else refinement.calibration_check
     if found is None or not found.alarm:

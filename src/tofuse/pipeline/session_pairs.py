@@ -1,4 +1,4 @@
-"""Which sessions of a merged result overlap, and what speaks for it."""
+"""Overlap of the sessions of a merged result, with its evidence."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tofuse.results.types import Reconstruction, SessionChange, SessionPair, Ses
 
 View = PosedView[PreparedView]
 
-# Views of each session that are compared with those of the others.
+# Number of views of each session that are compared with those of the others.
 _COMPARED = 60
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One of the models of a result: the main one, or that of a component apart.
+    """One of the models of a result: the main one, or that of a separate component.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class Model:
         return cls(result, {f.index: T for f, T in frames if np.isfinite(T).all()})
 
     def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
-        """Some of the views of a session with a pose here, evenly spaced."""
+        """Return evenly spaced views of a session that have a pose in this model."""
         mine = [v for v in views if session.has(v.index) and v.index in self.poses]
         return [mine[k] for k in evenly(np.arange(len(mine)), _COMPARED)]
 
     def links(self, one: SessionRecord, other: SessionRecord) -> set[tuple[int, int]]:
-        """Pairs of frames of two sessions whose registrations hold here."""
+        """Return frame pairs (i < j) of two sessions with accepted registrations."""
         diagnostics = self.result.diagnostics
         ends = [(join.link.i, join.link.j) for join in diagnostics.joins]
         ends += [(loop.i, loop.j) for loop in diagnostics.loops if loop.accepted]
@@ -59,18 +59,18 @@ class Model:
         }
 
     def sure(self, one: SessionRecord, other: SessionRecord) -> float | None:
-        """Probability that what joined two sessions is right; None where others did."""
-        said = [
+        """Return the probability that the join of two sessions is correct; None if indirect."""
+        probabilities = [
             join.probability
             for join in self.result.diagnostics.joins
             if join.probability is not None
             and any(one.has(k) for k in (join.link.i, join.link.j))
             and any(other.has(k) for k in (join.link.i, join.link.j))
         ]
-        return min(max(said), MAX_STATED_PROBABILITY) if said else None
+        return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
 
     def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> CrossViewConsistency:
-        """What views of two sessions say of each other."""
+        """Return the cross-view consistency between views of two sessions."""
         both = [*ours, *theirs]
         poses = np.array([self.poses[v.index] for v in both]).reshape(-1, 4, 4)
         return compare_views([v.view for v in both], poses, [0] * len(ours) + [1] * len(theirs))
@@ -82,12 +82,14 @@ def session_pairs(
     stated: Sequence[Collection[int]],
     views: Sequence[View],
 ) -> tuple[SessionPair, ...]:
-    """Say of each two sessions whether they are in one model, and what speaks for an overlap.
+    """Return for each two sessions whether they are in one model, and the evidence of overlap.
 
     Parameters
     ----------
+    result, records
+        The merged result, and its sessions.
     stated
-        Of each session the components that its frames were in before.
+        For each session, the components of its frames before the merge.
     views
         Prepared views of frames with a pose.
     """
@@ -118,7 +120,7 @@ def _pair(
     *,
     before: bool,
 ) -> SessionPair:
-    """What connects two sessions in one model."""
+    """Return the links and the overlap of two sessions in one model."""
     seen = model.seen(ours, theirs)
     overlap = np.isfinite(seen.support_of_views())
     share = seen.support()
@@ -137,7 +139,7 @@ def _pair(
 def session_changes(
     result: Reconstruction, records: Sequence[SessionRecord], views: Sequence[View]
 ) -> tuple[SessionChange, ...]:
-    """Say what changed between each two sessions in the main model.
+    """Detect changes of the scene between each two sessions in the main model.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Results of earlier runs as sessions: recordings, opened again, with the poses they state."""
+"""Results of earlier runs as sessions: reopened recordings with their poses."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ _REMEDY = "give the --out of `tofuse run`"
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """One recording, and what a result states of its frames.
+    """One recording, and the poses that a result states for its frames.
 
     Attributes
     ----------
     name
-        What it is called in words.
+        Unique name for display.
     result
         Folder of the result.
     opening
         How its recording was opened.
     recording
-        The frames that the result is of.
+        The frames of the result.
     config
-        By which they are corrected and filtered, with odometry "given".
+        Their corrections and filters, with odometry "given".
     stated
-        By the index of a frame in the recording. Components are numbered over all sessions: those
-        of one result that were joined have the same number and frame.
+        By the index of a frame in the recording. Components are numbered over all sessions: joined
+        components of one result have the same number and coordinate frame.
     """
 
     name: str
@@ -55,20 +55,20 @@ class Session:
 
     @property
     def posed(self) -> dict[int, StatedPose]:
-        """What has a pose."""
+        """The stated frames with a pose."""
         return {k: s for k, s in self.stated.items() if s.T_component_camera is not None}
 
 
 def read_sessions(
     results: Sequence[str | Path], threads: int | None, progress: Progress
 ) -> list[Session]:
-    """Read the sessions of several results, in their order; a merged one gives all of its own.
+    """Read the sessions of several results, in order; a merged result yields all of its own.
 
     Raises
     ------
     InputError
-        If a folder holds no result, its recording is gone or another one by now, or holds clouds;
-        or if something was given twice, or a single session.
+        If a folder contains no result, its recording is missing, has changed or contains clouds;
+        or if a result was given twice, or only one session.
     """
     folders = [Path(each) for each in results]
     for a, b in combinations(folders, 2):
@@ -89,7 +89,7 @@ def read_sessions(
         )
     for one, other in combinations(sessions, 2):
         _check_different(one, other)
-    return _named_apart(sessions)
+    return _uniquely_named(sessions)
 
 
 def sessions_of(
@@ -100,7 +100,7 @@ def sessions_of(
     Raises
     ------
     InputError
-        If it can't be merged with any other; see `read_sessions`.
+        If the result can't be merged with any other; see `read_sessions`.
     """
     return [
         _session(part, stated, folder, threads, progress)
@@ -111,7 +111,7 @@ def sessions_of(
 def _read_parts(
     folder: Path, components: int
 ) -> list[tuple[StoredRecording, dict[int, StatedPose]]]:
-    """Read what a result says of its recordings and of their frames, by index in the recording.
+    """Read the recordings of a result and the poses of their frames, by index in the recording.
 
     Its components are numbered from `components`.
     """
@@ -138,7 +138,7 @@ def _session(
     threads: int | None,
     progress: Progress,
 ) -> Session:
-    """Open the recording of a part of a result again."""
+    """Reopen the recording of a part of a result."""
     recording = reopen(part, folder)
     frame = recording.first_readable()
     if frame is not None and kind_of(frame) != "range":
@@ -153,7 +153,7 @@ def _session(
 
 
 def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
-    """What a result says of each frame, by index."""
+    """Return the pose and status that a result states for each frame, by index."""
     poses = _poses(folder, dict(run))
     main = {k: (T, components) for k, T in poses.items()}
     apart = [k for k, c in enumerate(run.get("components", ())) if c["T_main_component"] is None]
@@ -176,22 +176,22 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
 
 
 def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
-    """(4, 4) T_world_camera by index, of the frames in the main model of a folder."""
+    """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
     run = read_run_json(folder / "run.json") if run is None else run
     indices, poses = main_poses(folder, run)
     return dict(zip(indices, poses, strict=True))
 
 
 def _config(
-    told: Mapping[str, Any],
+    stored: Mapping[str, Any],
     recording: Recording,
     folder: Path,
     threads: int | None,
     progress: Progress,
 ) -> Config:
-    """The configuration of a result, with the odometry that takes poses as they are."""
+    """Return the configuration of a result, with `GivenPoses` as odometry."""
     where = f"{folder / 'run.json'}: config"
-    config = changed(from_method("default"), told, where=where)
+    config = changed(from_method("default"), stored, where=where)
     given = GivenPoses()
     if isinstance(config.odometry, Keyframes | GivenPoses):
         odometry = config.odometry
@@ -207,7 +207,7 @@ def _config(
 
 
 def _check_different(one: Session, other: Session) -> None:
-    """Refuse frames that would count twice."""
+    """Raise InputError if frames of one recording are in both sessions."""
 
     def facts(session: Session) -> tuple[object, ...]:
         o = session.opening
@@ -222,8 +222,8 @@ def _check_different(one: Session, other: Session) -> None:
         )
 
 
-def _named_apart(sessions: list[Session]) -> list[Session]:
-    """Give each session a name of its own."""
+def _uniquely_named(sessions: list[Session]) -> list[Session]:
+    """Return the sessions with unique names."""
     names = [session.name for session in sessions]
     taken: set[str] = set()
     out = []
