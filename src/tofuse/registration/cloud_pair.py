@@ -1,9 +1,9 @@
-"""Two clouds that may be far apart: where one lies in the other, and what is believed.
+"""Global registration of two clouds, with a probability of being right.
 
-The pose is followed from the guess. Where both clouds then agree so well that it is as good as
-certain, that is the answer. Else poses are proposed by shapes that are alike (`registration.fpfh`);
-each is aligned, and judged by what both clouds say of it (`registration.cloud_agreement`) and by
-its lead over its rivals.
+The clouds are first aligned from the guess. If their agreement makes that pose practically
+certain, it is returned. Else poses are proposed by feature matching (`registration.fpfh`); each is
+aligned and evaluated by the agreement of both clouds (`registration.cloud_agreement`) and by its
+lead over rival poses.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
 
-# Points of either view at most, once they are averaged to be compared.
+# Maximum number of points of each averaged view.
 _POINTS = 10_000
-# Proposals that are aligned closely.
+# Number of proposals that are aligned at full resolution.
 _POLISHED = 8
-# Poses that differ by more resolutions, or rad, are different answers.
+# Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
-# Of a pose at the guess and one that leads by less than this share of the points, the first.
+# A pose near the guess is preferred to one that leads by less than this fraction of the points.
 _LEAD = 0.02
-# Support below which the guess is also followed from coarse to fine.
-_LEAST_SUPPORT = 1 / 3
-# Score that may be lost by noise alone when a pose is aligned once more.
+# Support below which the views are also aligned from the guess from coarse to fine.
+_MIN_SUPPORT = 1 / 3
+# Loss of score by noise when a pose is aligned again.
 _GIVEN_UP = 0.02
-# Points that show whether a rival ends where the best pose does.
+# Points used to test whether a rival converges to the best pose.
 _RIVAL_POINTS = 2500
-# Finest resolution in spacings of so many points.
+# Finest resolution, in spacings of this number of points.
 _FINER, _SPACED = 0.5, 5000
 
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """A pose T_target_source and what both views say of it."""
+    """A pose T_target_source (4, 4) and its agreement."""
 
     T_target_source: Float64
     agreement: Agreement
-    # Where it was followed from; None for poses that were searched.
+    # Start of its alignment; None for proposals.
     guess: Float64 | None = None
 
 
-# Where nothing fits: the rival of a pose that has no other.
+# Placeholder for the rival of a pose without one; nothing fits there.
 _NOWHERE = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Two clouds that were averaged alike, ready to be compared."""
+    """Two clouds averaged to the same resolution."""
 
     source: Frame
     target: Frame
@@ -88,14 +88,14 @@ class _Views:
 
     @property
     def knows_free_space(self) -> bool:
-        """Whether the viewpoints of both, and so their free space, are known."""
+        """Whether the viewpoint, and so the free space, is known for both views."""
         return self.there.viewpoint is not None and self.here.viewpoint is not None
 
     def judged(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.there, self.here, T))
 
     def polished(self, T: Float64) -> _Pose:
-        """Align by some of the points of the averaged source."""
+        """Align with a subset of the averaged source's points; T (4, 4) if that scores lower."""
         before = self.judged(T)
         try:
             for icp in _polish(self.size):
@@ -109,18 +109,18 @@ class _Views:
         return Evidence.of(pose.agreement, lead, degenerate, CLOUDS)
 
     def measured(self, found: Registration) -> Registration:
-        """A registration with what it knows of its errors."""
+        """Return a registration with its information matrix."""
         T, free = found.T_target_source, found.unobservable
         return replace(found, information=cloud_information(self.there, self.here, T, free))
 
     def differ(self, a: Float64, b: Float64) -> bool:
-        """Whether two poses take the middle of the source elsewhere, or turn it otherwise."""
+        """Whether two poses (4, 4) are distinct hypotheses."""
         points = self.there.view.points.astype(np.float64)
         return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
 
 
 def _finest(view: Frame) -> float:
-    """Spacing of a view's points in m, but not much finer than that of some thousand of them."""
+    """Return a view's point spacing in m, bounded below by that of some thousand points."""
     share = min(1.0, _SPACED / max(len(view), 1))
     return spacing(view) * max(_FINER, float(np.sqrt(share)))
 
@@ -138,22 +138,26 @@ def register_clouds(
 
     Parameters
     ----------
+    source, target
+        Views; at least one is a cloud.
     guess
-        (4, 4) T_target_source; the identity is tried first unless given.
+        (4, 4) T_target_source; the identity unless given.
+    rng
+        Source of the random samples.
     seen
-        What the images that they were seen as gave, if they were; one more proposal.
+        Result of the registration as images, if any: one more proposal.
     always_search
-        Whether to search even if the pose that was followed from the guess is as good as certain.
+        Whether to search even if the pose aligned from the guess is practically certain.
 
     Returns
     -------
-    Where the views fit only with the source 10, 100 or 1000 times as large, or as small, the pose
-    is of that, it is not believed, and the reason says so.
+    The registration. If the views fit only with the source scaled by a power of ten from 0.001 to
+    1000, the pose is that of the scaled source, not believed, and `reason` states the scale.
 
     Raises
     ------
     RegistrationError
-        If there are too few points, or too few of them correspond anywhere.
+        If there are too few points, or no pose has enough correspondences.
     """
     power = _power_of_scale(source, target)
     if power and not always_search:
@@ -200,7 +204,7 @@ def _registered(
     found = _registration(views, best, poses)
     if guess is None or best.guess is not None or not len(found.unobservable):
         return views.measured(found)
-    # What differs along degenerate directions alone stays as in the guess.
+    # Poses that differ along degenerate directions only: keep the guess there.
     hold = Hold.of(found.unobservable, views.there.view.points.astype(np.float64))
     across = hold.across(se3.inverse(near.T_target_source) @ found.T_target_source)
     if views.differ(near.T_target_source, near.T_target_source @ across):
@@ -209,7 +213,7 @@ def _registered(
 
 
 def _power_of_scale(source: Frame, target: Frame) -> int:
-    """Power of ten by which the target is larger than the source, -3 to 3; 0 if it is not."""
+    """Power of ten (-3 to 3) of the ratio of the target's extent to the source's, else 0."""
     there, here = extent(source.points), extent(target.points)
     if there == 0 or here == 0:
         return 0
@@ -220,7 +224,7 @@ def _power_of_scale(source: Frame, target: Frame) -> int:
 def _registered_scaled(
     source: Frame, target: Frame, scale: float, rng: np.random.Generator
 ) -> Registration | None:
-    """Register the source with its lengths scaled; None where that is not believed."""
+    """Register the scaled source; None if the result is not believed."""
     points = source.points * np.float32(scale)
     scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
     try:
@@ -233,9 +237,9 @@ def _registered_scaled(
 def measured_as_clouds(
     source: Frame, target: Frame, found: Registration, rng: np.random.Generator
 ) -> Registration:
-    """A registration of the images of two clouds, with what the clouds say of its errors.
+    """Return a registration of two clouds' images with the information matrix of the clouds.
 
-    Images of clouds have holes, and no noise that is known.
+    Images of clouds have holes, and their noise is unknown.
     """
     views = _Views.of(source, target, rng)
     free = cloud_unobservable(views.there, views.here, found.T_target_source)
@@ -245,7 +249,7 @@ def measured_as_clouds(
 def follow_clouds(
     source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
 ) -> Registration:
-    """Register two clouds from a guess (4, 4) alone; see `register_clouds`."""
+    """Register two clouds from a guess (4, 4) without a search; see `register_clouds`."""
     views = _Views.of(source, target, rng)
     near = replace(views.polished(guess), guess=guess)
     if views.evidence(near).probability < CERTAIN:
@@ -256,12 +260,12 @@ def follow_clouds(
 
 
 def _proposed(views: _Views, start: Float64) -> list[_Pose]:
-    """Poses that shapes propose, and where a start leads at all scales.
+    """Return the poses of feature matching, and of coarse-to-fine ICP if they lack support.
 
     Raises
     ------
     RegistrationError
-        If there is none.
+        If there is no pose.
     """
     found, failure = [], None
     try:
@@ -273,7 +277,7 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
         found += [views.polished(c.T_target_source) for c in candidates[:_POLISHED]]
     except RegistrationError as error:
         failure = error
-    if any(pose.agreement.support > _LEAST_SUPPORT for pose in found):
+    if any(pose.agreement.support > _MIN_SUPPORT for pose in found):
         return found
     try:
         near = CoarseToFine().register(views.source, views.target, start, views.rng)
@@ -290,7 +294,7 @@ def _apart(a: Float64, b: Float64) -> float:
 
 
 def _polish(size: float) -> tuple[Icp, ...]:
-    """Few iterations with a wide reach, then with a narrow one; reaches are in resolutions."""
+    """Return ICP with few iterations at a wide reach, then at a narrow one, in resolutions."""
     plain = Icp(
         size,
         source=Uniform(800),
@@ -304,9 +308,10 @@ def _polish(size: float) -> tuple[Icp, ...]:
 
 
 def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
-    """The first of some poses that is another answer than the best one, which became T (4, 4).
+    """Return the first pose distinct from the best one, whose alignment is T (4, 4).
 
-    Where noise is large, poses end far apart that all points would lead to the same one.
+    With large noise, subsets of the points converge to different poses where all points converge to
+    the same one, so rivals are aligned with more points before they are compared.
     """
     averaged = views.there.view, views.here.view
     for pose in poses:
@@ -323,9 +328,9 @@ def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _P
 
 
 def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = None) -> Registration:
-    """Align all points from the best pose, and say what is believed of it.
+    """Align all points from the best pose and evaluate its evidence.
 
-    Its rival is one of the others, best first. Without any nothing was compared with it.
+    The rival is one of `poses`, the best first; None if the pose was not compared with others.
     """
     T = best.T_target_source
     averaged = views.there.view, views.here.view

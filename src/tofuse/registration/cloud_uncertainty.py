@@ -1,18 +1,16 @@
-"""How far the pose between two clouds can be trusted.
+"""Covariance of the pose between two point clouds.
 
 As for images (`registration.uncertainty`) the covariance is that of an M-estimate, ``X^-1 B X^-1``
-(Huber 1981, ch. 6): X the slope of the gradient, from the product of both views' normals, in which
-their noise cancels, and B the covariance of the gradient. Where clouds come from and what is wrong
-with them is not known, so that B is learnt from the residuals at the final pose alone. Both clouds
-are bent against each other, by multipath, an error over range, or by points
-that stand for surfaces they are not quite on: a random field of displacements, whose parts along
-any axis have the covariance ``s^2 exp(-d / l)`` over the distance d. On top of it is noise. A
-residual is the displacement along its normal, plus noise.
+(Huber 1981, ch. 6): X is the Hessian, from the product of both views' normals, in which their
+noise cancels, and B the covariance of the gradient. The error model of a cloud is unknown, so B is
+estimated from the residuals at the final pose. The relative distortion of the clouds, by
+multipath, range errors or sampling, is modelled as a random field of displacements, whose
+components have the covariance ``s^2 exp(-d / l)`` over the distance d. A residual is the
+displacement along its normal, plus white noise.
 
-What the field has in common with a motion the pose has taken up, and no residual shows it; but s
-and l, learnt from what the pose could not take up, tell how large it is (restricted likelihood:
-Patterson and Thompson 1971). They are not known exactly: the covariance is the mean over all of
-them, by how likely they make the residuals.
+The part of the field that equals a rigid motion is absorbed by the pose and invisible in the
+residuals; its size follows from s and l, which are estimated from the rest (restricted likelihood:
+Patterson and Thompson 1971). The covariance is marginalised over s and l on a grid.
 """
 
 from __future__ import annotations
@@ -31,33 +29,33 @@ from tofuse.registration.pairs import (
     unobservable_directions,
 )
 
-# How far a point may be from the nearest one of its surface, in resolutions, and the cosine of the
-# largest angle between their normals.
+# Maximum distance of corresponding points, in resolutions, and minimum cosine between their
+# normals.
 _NEAR, _ALIKE = 3.0, 0.75
-# Patches: edge in resolutions at least, how many at most, and how many to learn from.
+# Patches: minimum edge in resolutions and its growth factor; maximum number, and minimum number for
+# an estimate of the field.
 _EDGE, _LARGER = 2.0, 1.05
-_MOST_PATCHES, _LEAST_PATCHES = 120, 12
-# Variances of the field that are tried, relative to that of the noise of a patch.
+_MAX_PATCHES, _MIN_PATCHES = 120, 12
+# Grid of variances of the field, relative to that of the noise of a patch.
 _SHARES = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
-# Lengths of correlation that are tried, from the patches' edge to this many sizes of the overlap:
-# what bends a view may reach further than what both views share of it.
+# Grid of correlation lengths, from the patches' edge to this many sizes of the overlap: distortions
+# may be correlated beyond it.
 _LENGTHS, _FURTHEST = 5, 4.0
-# Least slope of the gradient, as a share of what the matches and their weights say, and points of
-# which it is measured.
+# Lower limit of the Hessian relative to the Gauss-Newton approximation, and number of points of its
+# finite differences.
 _STEEPNESS, _TRIED = 0.1, 1500
-# Residuals below this share of the resolution say nothing about the true error of the points.
-_LEAST_SIGMA = 1e-3
-# Sigma along directions that nothing holds, in sizes of the overlap, or in rad.
+# Lower limit of the residuals' sigma, as a fraction of the resolution.
+_MIN_SIGMA = 1e-3
+# Sigma along degenerate directions, in sizes of the overlap, or in rad.
 _UNBOUNDED = 100.0
 
 
 def cloud_information(
     source: CloudMap, target: CloudMap, T_target_source: Float64, unobservable: Float64
 ) -> Float64:
-    """(6, 6) information of a pose (4, 4), in 1/m and 1/rad, right perturbation in the source.
+    """Return the information (6, 6) of a pose (4, 4), in 1/m and 1/rad, right perturbation.
 
-    The inverse of the covariance, but for the `unobservable` directions (k, 6): there is none along
-    these, to speak of.
+    It is the inverse of the covariance, and nearly zero along the `unobservable` directions (k, 6).
     """
     pairs = _Pairs.of(source, target, T_target_source)
     if pairs is None:
@@ -65,8 +63,8 @@ def cloud_information(
         return np.diag((_UNBOUNDED * np.r_[[size] * 3, [1.0] * 3]) ** -2.0)
     shift = np.eye(4)
     shift[:3, 3] = -pairs.centre
-    # From the perturbation about the origin to that about the centroid, in units in which turns
-    # move the points as far as slides.
+    # From the perturbation about the origin to that about the centroid, in units in which rotations
+    # move the points as far as translations.
     unit = np.array([1, 1, 1, *[1 / pairs.size] * 3])
     to_centre = se3.adjoint(shift) / unit[:, None]
     slope = _slope(source, target, T_target_source, pairs, unit)
@@ -75,7 +73,7 @@ def cloud_information(
 
 
 def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Float64:
-    """(k, 6) directions of the right perturbation that two clouds don't hold at a pose (4, 4)."""
+    """Return the degenerate directions (k, 6) of the right perturbation at a pose (4, 4)."""
     pairs = _Pairs.of(source, target, T_target_source)
     if pairs is None:
         return np.eye(6)
@@ -94,7 +92,7 @@ def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Floa
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points of the source and what they miss the target by, in the source's frame.
+    """Correspondences and their point-to-plane residuals, in the source's frame.
 
     Attributes
     ----------
@@ -105,11 +103,11 @@ class _Pairs:
     residual
         (m,) distance along the normal, m.
     normals, target_normals, source_normals
-        (m, 3) mean of both, and each; all to one side.
+        (m, 3) mean of both, and each; consistently oriented.
     weight
         (m,) of the robust loss.
     resolution
-        m.
+        Voxel size of the averaged clouds, m.
     """
 
     centre: Float64
@@ -124,7 +122,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, source: CloudMap, target: CloudMap, T: Float64, every: int = 1) -> _Pairs | None:
-        """Match every so manieth point with the nearest of the target; None if few are near."""
+        """Match every n-th point with its nearest neighbour in the target; None if few match."""
         size = max(source.size, target.size)
         p = source.view.points[::every].astype(np.float64)
         nearest, _ = target.tree.nearest(se3.transform(T, p), _NEAR * size)
@@ -151,10 +149,10 @@ class _Pairs:
     @property
     def noise(self) -> float:
         """Robust standard deviation of the residuals, m."""
-        return max(1.4826 * float(np.median(np.abs(self.residual))), _LEAST_SIGMA * self.resolution)
+        return max(1.4826 * float(np.median(np.abs(self.residual))), _MIN_SIGMA * self.resolution)
 
     def kept(self, unit: Float64) -> Float64:
-        """(6, 6) sum of w times the symmetrised product of both Jacobians: noise cancels in it."""
+        """Sum of w times the symmetrised product of both Jacobians (6, 6), where noise cancels."""
         Ja = _jacobian(self.points, self.target_normals) * unit
         Jb = _jacobian(self.points, self.source_normals) * unit
         X = (Ja * self.weight[:, None]).T @ Jb
@@ -166,13 +164,13 @@ class _Pairs:
         return np.asarray((J * self.weight[:, None]).T @ J, np.float64)
 
     def gradient(self, centre: Float64, unit: Float64) -> Float64:
-        """(6,) sum of w J r, about another centre (3,)."""
+        """Sum of w J r (6,) about another centre (3,)."""
         J = _jacobian(self.points + (self.centre - centre), self.normals) * unit
         return np.asarray((self.weight * self.residual) @ J, np.float64)
 
 
 def _jacobian(points: Float64, normals: Float64) -> Float64:
-    """(m, 6) derivative of the distances along normals (m, 3) by the right perturbation."""
+    """Derivative (m, 6) of point-to-plane distances by the right perturbation."""
     return np.concatenate([normals, np.cross(points, normals)], axis=1)
 
 
@@ -183,7 +181,7 @@ class _Patches:
     Attributes
     ----------
     places, normals
-        (n, 3) m, and mean normals, shorter than 1 where the surface is bent.
+        (n, 3) centroids in m, and mean normals, shorter than 1 where the surface is curved.
     residual
         (n,) m.
     responses
@@ -203,7 +201,7 @@ class _Patches:
 
     @classmethod
     def of(cls, pairs: _Pairs, unit: Float64) -> _Patches:
-        """Divide the points into cubes, and those of a cube by the axis that their normals face."""
+        """Group points by voxel and by the dominant axis of their normals."""
         facing = np.abs(pairs.normals).argmax(1).astype(np.int64)
         edge = _EDGE * pairs.resolution
         while True:
@@ -213,16 +211,16 @@ class _Patches:
             key = ((cell[:, 0] * rows + cell[:, 1]) * layers + cell[:, 2]) * 3 + facing
             patch = np.unique(key, return_inverse=True)[1]
             count = int(patch.max()) + 1
-            if count <= _MOST_PATCHES:
+            if count <= _MAX_PATCHES:
                 break
-            edge *= _LARGER * float(np.sqrt(count / _MOST_PATCHES))
+            edge *= _LARGER * float(np.sqrt(count / _MAX_PATCHES))
         total = np.bincount(patch, pairs.weight)
-        told = total > 0
+        valid = total > 0
 
         def mean(values: Float64) -> Float64:
             columns = values.reshape(len(values), -1).T
             sums = [np.bincount(patch, pairs.weight * c) for c in columns]
-            return np.stack(sums, -1)[told] / total[told, None]
+            return np.stack(sums, -1)[valid] / total[valid, None]
 
         J = _jacobian(pairs.points, pairs.normals) * unit
         return cls(
@@ -230,41 +228,41 @@ class _Patches:
             mean(pairs.normals),
             mean(pairs.residual)[:, 0],
             mean(J),
-            np.asarray(total[told], np.float64),
+            np.asarray(total[valid], np.float64),
             edge,
         )
 
 
 def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) -> Float64:
-    """(6, 6) about the centroid, without directions (k, 6) that are free."""
-    held = np.eye(6)
+    """Return the information (6, 6) about the centroid, degenerate along `free` (k, 6)."""
+    constrained = np.eye(6)
     H = np.zeros((6, 6))
     if len(free):
         _, s, vt = np.linalg.svd(free)
         count = int((s > 1e-9 * s[0]).sum())
-        held = vt[count:].T
+        constrained = vt[count:].T
         H += vt[:count].T @ vt[:count] / (_UNBOUNDED * pairs.size) ** 2
-    if not held.shape[1]:
+    if not constrained.shape[1]:
         return H
     patches = _Patches.of(pairs, unit)
-    if len(patches.residual) >= _LEAST_PATCHES:
-        meat = _learnt(patches, patches.responses @ held)
-    else:  # nothing can be learnt of what they share: as few independent points as there may be
-        meat = NEIGHBOURS * pairs.noise**2 * held.T @ pairs.weighed(unit) @ held
-    bread = np.linalg.inv(held.T @ slope @ held)
-    # A pose that was found in another way differs from where the points would take it: half of the
-    # square is the variance that two estimates of the same share.
-    step = bread @ held.T @ pairs.gradient(pairs.centre, unit)
+    if len(patches.residual) >= _MIN_PATCHES:
+        meat = _estimated(patches, patches.responses @ constrained)
+    else:  # too few patches for the field: assume neighbourhoods to be fully correlated
+        meat = NEIGHBOURS * pairs.noise**2 * constrained.T @ pairs.weighed(unit) @ constrained
+    bread = np.linalg.inv(constrained.T @ slope @ constrained)
+    # A pose from another estimator is not the minimum: half the squared difference of the two
+    # estimates is their common variance.
+    step = bread @ constrained.T @ pairs.gradient(pairs.centre, unit)
     C = bread @ meat @ bread + 0.5 * np.outer(step, step)
-    C += (_LEAST_SIGMA * pairs.resolution) ** 2 / len(pairs.points) * np.eye(len(C))
-    return np.asarray(H + held @ np.linalg.inv(C) @ held.T, np.float64)
+    C += (_MIN_SIGMA * pairs.resolution) ** 2 / len(pairs.points) * np.eye(len(C))
+    return np.asarray(H + constrained @ np.linalg.inv(C) @ constrained.T, np.float64)
 
 
 def _slope(source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: Float64) -> Float64:
-    """X (6, 6): how the gradient ``sum w J r`` changes with the pose, points matched anew.
+    """Return X (6, 6), the derivative of the gradient ``sum w J r``, matches updated.
 
-    Where noise is as large as the spacing of the points, each finds a nearest one that it misses by
-    less, wherever the pose is: the gradient is less steep than its matches say. So it is measured.
+    Where noise is as large as the point spacing, nearest neighbours follow the pose and the
+    gradient is less steep than with fixed matches. So it is taken by finite differences.
     """
     every = max(1, len(source.view.points) // _TRIED)
     to, back = np.eye(4), np.eye(4)
@@ -296,20 +294,20 @@ def _slope(source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: 
 
 
 def _bounded(S: Float64, least: float) -> Float64:
-    """A symmetric matrix with eigenvalues from `least` to 1."""
+    """Clip the eigenvalues of a symmetric matrix to the range from `least` to 1."""
     values, vectors = np.linalg.eigh(S)
     return np.asarray((vectors * np.clip(values, least, 1.0)) @ vectors.T, np.float64)
 
 
-def _learnt(patches: _Patches, J: Float64) -> Float64:
-    """Mean of ``J^T W V W J`` over the covariances V that the residuals make likely."""
-    n, held = J.shape
+def _estimated(patches: _Patches, J: Float64) -> Float64:
+    """Posterior mean of ``J^T W V W J`` over the residuals' covariance V."""
+    n, constrained = J.shape
     root = np.sqrt(patches.weight)
     y, A = root * patches.residual, root[:, None] * J
     apart = np.linalg.norm(patches.places[:, None] - patches.places, axis=2)
     along = (patches.normals @ patches.normals.T) * np.outer(root, root) / np.mean(root**2)
     largest = max(_FURTHEST * float(np.percentile(apart, 90)), 2 * patches.edge)
-    freedom = max(n - held, 1)
+    freedom = max(n - constrained, 1)
     likely, meat = [], []
     for length in np.geomspace(patches.edge, largest, _LENGTHS):
         values, vectors = np.linalg.eigh(along * np.exp(-apart / length))

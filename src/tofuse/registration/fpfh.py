@@ -1,4 +1,4 @@
-"""Clouds without a guess: shapes around points that are alike, and the motion most agree on."""
+"""Global registration of clouds by matching fast point feature histograms."""
 
 from __future__ import annotations
 
@@ -31,50 +31,50 @@ from tofuse.registration.sample_consensus import (
 from tofuse.registration.shape import shape_at
 
 _BINS = 11
-# Resolution of the averaged views in spacings of the points: of samples taken by chance, means of
-# several say more about the surface.
+# Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
-# Neighbours of a point at most, of those within reach.
-_MOST_NEAR = 60
-# Points of an averaged cloud lie by chance within a cell: what two that are taken for the same
-# differ by along each axis, and how far they may be apart to fit, in resolutions.
+# Maximum number of neighbours within reach.
+_MAX_NEAR = 60
+# Sampling noise of an averaged point along each axis, and maximum distance of points that fit, in
+# resolutions.
 _SCATTER, _FITS = 0.4, 1.5
-# Extent of a surface across relative to that along it, at most.
+# Maximum extent of a surface across relative to that along it.
 _ROUGHEST = 0.6
-# Motions are rivals that differ by more: resolutions, and rad. Matches turn a body roughly.
+# Motions that differ by more are distinct: resolutions, and rad (rotations from matches are
+# inaccurate).
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.3
-# How far ICP looks at each iteration, resolutions, and the fewest points that it goes on with.
+# Reach of ICP per iteration, resolutions, and minimum number of correspondences.
 _REACHES, _FEWEST = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
-# Cosine of the angle between normals that fit.
+# Minimum cosine of the angle between normals that fit.
 _ALIKE = 0.8
 
 
 @part("registration", "fpfh")
 @dataclass(frozen=True)
 class Fpfh(Registrar):
-    """Fast point feature histograms (Rusu et al. 2009), and the motion that most matches agree on.
+    """Fast point feature histograms (Rusu et al. 2009) with robust consensus of the matches.
 
-    Both views are averaged alike to few points. What the surface is like around each is told by
-    histograms of angles between normals, which no motion changes. Points whose histograms are most
-    alike, both ways, are matched; nearly all matches may be wrong. Of the motions that many agree
-    on that is taken under which most points of the source fit, and refined. The guess is not used.
+    Both views are averaged to the same resolution. Each point is described by histograms of angles
+    between normals, which are invariant to rigid motion; mutual nearest neighbours are matched,
+    and nearly all matches may be outliers. Of the consensus motions the one under which most points
+    of the source fit is chosen and refined. The guess is not used.
 
     Attributes
     ----------
     points
-        Of either view, at most, once they are averaged.
+        Maximum number of points of each averaged view.
     reach
-        How far around a point its histogram looks, in resolutions of the averaged views.
+        Radius of the histograms' neighbourhood, in resolutions of the averaged views.
     neighbours
         Points of each plane fit.
     signed
-        Whether it is known on which side of a surface the sensor was. Arrays of points are taken
-        to be seen from their origin.
+        Whether the orientation of the normals is known. Arrays of points are assumed to be seen
+        from their origin.
     way, inliers, leaders
-        How the motion is found that most matches agree on, see `ConsensusOptions`.
+        Options of the consensus, see `ConsensusOptions`.
     refine
-        Whether generalised ICP makes the pose exact (`CoarseToFine`, from the resolution of the
-        averaged views on); else it is what the matches say.
+        Whether the pose is refined by generalised ICP (`CoarseToFine`, starting at the resolution
+        of the averaged views); else it is that of the matches.
     """
 
     points: int = 4000
@@ -110,7 +110,7 @@ class Fpfh(Registrar):
     ) -> Registration:
         """See `Registrar.register`; without `refine` its points are the matches.
 
-        `margin` is the lead in the share of the averaged points that fit.
+        `margin` is the lead in the fraction of the averaged points that fit.
 
         Raises
         ------
@@ -128,7 +128,7 @@ class Fpfh(Registrar):
         return replace(finer, margin=first.margin)
 
     def candidates(self, source: Frame, target: Frame, rng: np.random.Generator) -> Candidates:
-        """Find the poses that many matches agree on, and how well the averaged views fit there.
+        """Return the consensus poses of the matches, and how well the averaged views fit there.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Fpfh(Registrar):
         ]
         distinct: list[Candidate] = []
         for one in sorted(settled, key=lambda c: -c.share):
-            # What settles where a better one does is no rival.
+            # Discard poses that converge to a better one.
             if all(
                 are_distinct(
                     one.T_target_source,
@@ -164,7 +164,7 @@ class Fpfh(Registrar):
 
     def _described(self, view: CloudFrame, size: float) -> Described:
         shape = shape_at(view, np.arange(len(view)), self.neighbours)
-        # What is not on a surface has no shape around it, and spoils that of its neighbours.
+        # Points that are on no surface have no descriptor and corrupt those of their neighbours.
         known = np.isfinite(shape.normals).all(1) & (shape.roughness < _ROUGHEST)
         points, normals = view.points[known].astype(np.float64), shape.normals[known]
         if len(points) < self.inliers:
@@ -186,7 +186,7 @@ class Described:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose T_target_source (4, 4), the share of averaged points that fit, and its matches."""
+    """A pose T_target_source (4, 4), the fraction of averaged points that fit, and its matches."""
 
     T_target_source: Float64
     share: float
@@ -195,7 +195,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """What matches of two views agree on.
+    """Consensus poses of the matches of two views.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ class Candidates:
     pairs
         All matches.
     poses
-        Distinct ones, that under which most points fit first.
+        Distinct poses, in order of decreasing fit.
     """
 
     size: float
@@ -213,7 +213,7 @@ class Candidates:
 
 
 def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float64:
-    """(n, 33) fast point feature histograms.
+    """Return fast point feature histograms (n, 33).
 
     With p and q a point and a neighbour, d the unit vector from p to q, and u, v, w the axes
     ``n_p, u x d, u x v``, the angles are ``v . n_q``, ``u . d`` and ``atan2(w . n_q, u . n_q)``,
@@ -222,14 +222,16 @@ def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float
 
     Parameters
     ----------
+    points, normals
+        (n, 3) points in m, and unit normals.
     reach
-        Neighbours are at most so far away, m.
+        Maximum distance of neighbours, m.
     signed
-        Whether normals point to a known side. If not, what changes with the side is left out: the
-        angles are folded so that a normal and its opposite give the same.
+        Whether normals are oriented. If not, the angles are folded so that a normal and its
+        opposite give the same histogram.
     """
     n = len(points)
-    near, squared = KdTree(points).neighbours(points, min(_MOST_NEAR + 1, n))
+    near, squared = KdTree(points).neighbours(points, min(_MAX_NEAR + 1, n))
     own, around = np.empty((n, 3, _BINS)), np.empty((n, 3 * _BINS))
     run_chunks(
         lambda a, b: kernels.histograms(points, normals, near, squared, reach, signed, own, a, b), n
@@ -240,7 +242,7 @@ def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float
 
 
 def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
-    """Positions in a (n, d) and b (m, d) of rows that are nearest to each other."""
+    """Return the positions in a (n, d) and b (m, d) of mutual nearest neighbours."""
     there = _nearest(a, b)
     back = _nearest(b, a)
     i = np.flatnonzero(back[there] == np.arange(len(a)))
@@ -248,7 +250,7 @@ def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
 
 
 def _nearest(a: Float64, b: Float64) -> Int64:
-    """(n,) position in b (m, d) of the row nearest to each of a (n, d); the first of equals."""
+    """Return the position (n,) in b (m, d) of the nearest neighbour of each row of a (n, d)."""
     rows = np.ascontiguousarray(a, np.float32)
     columns = np.ascontiguousarray(b.T, np.float32)
     nearest = np.empty(len(a), np.int64)
@@ -259,7 +261,7 @@ def _nearest(a: Float64, b: Float64) -> Int64:
 def _settled(
     source: Described, target: Described, tree: KdTree, T: Float64, size: float
 ) -> tuple[Float64, float]:
-    """Where ICP over the averaged points ends, and the share of the source's that then fit."""
+    """Refine T (4, 4) by ICP over the averaged points; return it and the fraction that fits."""
     for far in _REACHES:
         fits, nearest = _fitting(source, target, tree, T, far * size)
         if np.count_nonzero(fits) < _FEWEST:
@@ -273,9 +275,9 @@ def _settled(
 def _fitting(
     source: Described, target: Described, tree: KdTree, T: Float64, far: float
 ) -> tuple[Bool, Int64]:
-    """(n,) points of the source near a surface of the target that is turned alike, and which."""
+    """Return which source points fit a target point with a similar normal (n,), and its index."""
     nearest, squared = tree.nearest(se3.transform(T, source.points), far)
     turned = source.normals @ T[:3, :3].T
-    # Where none is near, the square is infinite, and the last normal compared for nothing.
+    # Without a neighbour the squared distance is infinite and the normals are irrelevant.
     alike = np.abs((turned * target.normals[nearest]).sum(1)) > _ALIKE
     return (squared < far * far) & alike, nearest

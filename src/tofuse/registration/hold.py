@@ -1,4 +1,4 @@
-"""Directions that the data doesn't hold come from the guess (Zhang, Kaess and Singh 2016)."""
+"""Solution remapping: degenerate directions keep the guess (Zhang, Kaess and Singh 2016)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Hold:
     directions
         (k, 6) about the source's origin, as in `Registration.unobservable`.
     centre
-        (3,) middle of the source's points, m.
+        (3,) centroid of the source's points, m.
     size
-        Their rms distance from it, m, which makes angles comparable with lengths.
+        Their rms distance from it, m, which scales angles to lengths.
     """
 
     directions: Float64
@@ -30,25 +30,25 @@ class Hold:
 
     @classmethod
     def of(cls, directions: Float64, points: Float64) -> Hold:
-        """Hold `directions` of a source with the given points (n, 3)."""
+        """Fix `directions` (k, 6) of a source with the given points (n, 3)."""
         centre = points.mean(0)
         size = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
         return cls(directions, centre, size or 1.0)
 
     def along(self, T: Float64) -> Float64:
-        """Return the part (4, 4) along the directions of a small motion in the source's frame."""
+        """Return the component (4, 4) of a small motion T in the source's frame along them."""
         return self._project(T, along=True)
 
     def across(self, T: Float64) -> Float64:
-        """Return the part (4, 4) of a small motion in the source's frame that is free."""
+        """Return the component (4, 4) of a small motion T in the source's frame across them."""
         return self._project(T, along=False)
 
     def _project(self, T: Float64, *, along: bool) -> Float64:
         back = np.eye(4)
         back[:3, 3] = -self.centre
         scale = np.array([1, 1, 1, self.size, self.size, self.size])
-        held = (self.directions @ se3.adjoint(back).T) * scale
-        basis = np.linalg.svd(held, full_matrices=False)[2]
+        scaled = (self.directions @ se3.adjoint(back).T) * scale
+        basis = np.linalg.svd(scaled, full_matrices=False)[2]
         xi = se3.log(se3.about(-self.centre, T)) * scale
         part = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
         return se3.about(self.centre, se3.exp((part if along else xi - part) / scale))

@@ -1,8 +1,8 @@
-"""Which views look alike, at a glance: small images, compared at some shifts.
+"""Appearance-based place recognition with small images, compared at several shifts.
 
-Of each view a small image is kept of how far the surfaces are and how they reflect, both as
-logarithms. Two views look alike if their images differ little at some shift of one against the
-other, as a camera that is turned a little sees the same, moved. No pose takes part.
+The descriptor of a view is a small image of log depth and log albedo. Two views are similar if
+their descriptors differ little at some relative shift, which approximates a small rotation of the
+camera. No pose is needed.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from tofuse.registration.prepared_view import PreparedView
 
 _ROWS, _COLUMNS = 9, 12
 _CHUNKS = 16
-# Logarithms that differ by more are as good as unknown.
-_MOST_DEPTH, _MOST_LIGHT = 0.3, 0.5
-# Share of the cells of which both views know the albedo, below which it is not compared.
+# Limits of the differences of the logarithms.
+_MAX_DEPTH, _MAX_ALBEDO = 0.3, 0.5
+# Minimum fraction of cells with albedo in both views, below which it is not compared.
 _LIT = 0.2
-# Of the index of looks: principal components, and answers to each question.
+# Of the index of descriptors: principal components, and nearest neighbours per query.
 _COMPONENTS, _ANSWERS = 8, 6
 
 
 def look_of(view: PreparedView) -> Float32:
-    """(2, 9, 12) mean log depth and log albedo of each cell, NaN where little is known."""
+    """Return the descriptor (2, 9, 12): mean log depth and log albedo per cell, NaN if unknown."""
     rows, columns = view.z.shape
     i = np.arange(rows) * _ROWS // rows
     j = np.arange(columns) * _COLUMNS // columns
@@ -46,15 +46,17 @@ def look_of(view: PreparedView) -> Float32:
 
 
 def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
-    """(N,) how much views (N, 2, 9, 12) differ from one (2, 9, 12), each at its best shift.
+    """Return the distances (N,) of descriptors to one, each at its best shift.
 
-    0 for the same image, 1 for nothing in common. Exposure is what the albedo differs by on
-    average, and does not count. Views without light on both sides are compared by depth alone.
+    0 for the same image, 1 for nothing in common. The mean difference of log albedo is exposure,
+    and ignored. Views without albedo in both are compared by depth alone.
 
     Parameters
     ----------
+    look, others
+        Descriptors (2, 9, 12) and (N, 2, 9, 12).
     shift
-        Largest one, as a share of the width.
+        Largest shift, as a fraction of the width.
     """
     across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     best = np.ones(len(others))
@@ -67,7 +69,7 @@ def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
 
 
 def mutual_unlikeness(looks: Sequence[Float32] | Float32, shift: float) -> Float64:
-    """(N, N) how much views differ from each other, see `unlikeness`."""
+    """Return the pairwise distances (N, N) of descriptors (N, 2, 9, 12), see `unlikeness`."""
     stack = np.asarray(looks)
     far = np.ones((len(stack), len(stack)))
 
@@ -80,7 +82,7 @@ def mutual_unlikeness(looks: Sequence[Float32] | Float32, shift: float) -> Float
 
 
 def unlikeness_of_pairs(looks: Float32, i: Intp, j: Intp, shift: float) -> Float64:
-    """(M,) how much the views of pairs differ, of views (N, 2, 9, 12), see `unlikeness`."""
+    """Return the distances (M,) of the pairs i, j of descriptors, see `unlikeness`."""
     out = np.ones(len(i))
     order = np.argsort(i, kind="stable")
     different, begin = np.unique(i[order], return_index=True)
@@ -96,11 +98,11 @@ def unlikeness_of_pairs(looks: Float32, i: Intp, j: Intp, shift: float) -> Float
 
 
 def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
-    """Pairs i < j of views (N, 2, 9, 12) that are likely to look alike: some of each view.
+    """Return candidate pairs i < j of similar descriptors (N, 2, 9, 12), some for each view.
 
-    An index by the first principal components of blocks of cells. It is asked for each view at each
-    shift, and answers with the nearest ones; what is nearest there is compared cell by cell by who
-    asks. Views next to each other in time are left out, as these always look alike.
+    A k-d tree over the first principal components of blocks of cells is queried for each view at
+    each shift (see `unlikeness`). Callers compare the candidates cell by cell. Consecutive views
+    are left out, as these are always similar.
     """
     n = len(looks)
     described = _blocks(looks, 0, 0)
@@ -124,9 +126,9 @@ def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
 
 
 def _blocks(looks: Float32, v: int, u: int) -> Float64:
-    """(N, 24) means over blocks of 3 x 3 cells, of looks moved by v rows and u columns.
+    """Return means (N, 24) over blocks of 3 x 3 cells of descriptors shifted by v rows, u columns.
 
-    Where a block is not known it is as views are on average; light is less its own mean.
+    Unknown blocks get the mean of all views; log albedo is relative to the view's mean.
     """
     moved = np.full_like(looks, np.nan)
     to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
@@ -136,8 +138,8 @@ def _blocks(looks: Float32, v: int, u: int) -> Float64:
     known = np.isfinite(cells)
     count = known.sum((3, 5))
     total = np.where(known, cells, 0).sum((3, 5))
-    # As differences are counted: up to what is as good as unknown.
-    means = total / np.maximum(count, 1) / np.array([_MOST_DEPTH, _MOST_LIGHT])[:, None, None]
+    # Scaled by the limits of the differences.
+    means = total / np.maximum(count, 1) / np.array([_MAX_DEPTH, _MAX_ALBEDO])[:, None, None]
     seen = count > 0
     own = np.where(seen, means, 0).sum((2, 3)) / np.maximum(seen.sum((2, 3)), 1)
     means[:, 1] -= own[:, 1, None, None]
@@ -146,17 +148,17 @@ def _blocks(looks: Float32, v: int, u: int) -> Float64:
 
 
 def _differ(here: Float32, there: Float32) -> Float64:
-    """(N,) mean of what cells differ by, of the most that counts."""
+    """Return the mean differences (N,) of the cells, relative to their limits."""
     apart = there - here
     known = np.isfinite(apart)
     count = known.sum((2, 3))
     apart = np.where(known, apart, 0)
     exposure = apart[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
-    depth = np.minimum(np.abs(apart[:, 0]) / _MOST_DEPTH, 1)
-    light = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MOST_LIGHT, 1)
+    depth = np.minimum(np.abs(apart[:, 0]) / _MAX_DEPTH, 1)
+    light = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
     cells = here[0].size
     far = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
-    # Albedo is known of smooth surfaces alone: where it is not, nothing is told.
+    # Albedo is known for smooth surfaces only; other cells are ignored.
     shade = np.where(known[:, 1], light, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
     lit = count[:, 1] > _LIT * cells
     return np.asarray(np.where(lit, 0.5 * (far + shade), far), np.float64)

@@ -1,7 +1,7 @@
-"""Pairs of points with the normals of their surfaces, in the frame where motions are solved for.
+"""Point pairs with normals, in the frame of the normal equations.
 
-Everything is turned into the source's frame, about the centroid of its paired points: there the
-right perturbation is nearly free of coupling between translation and rotation.
+Everything is rotated into the source's frame, about the centroid of its paired points, where the
+right perturbation has little coupling between translation and rotation.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from tofuse.registration.interfaces import Alignment, Matches
 Loss = Literal["square", "huber", "cauchy", "tukey"]
 
 FEWEST_PAIRS = 6
-# Residuals below this share of the resolution say nothing about the true error of the points.
+# Lower limit of the residuals' sigma, as a fraction of the resolution.
 _SMALLEST_SIGMA = 1e-3
 # Tuning constants for 95 % efficiency on normal errors, in standard deviations.
 _HUBER, _CAUCHY, _TUKEY = 1.345, 2.385, 4.685
 _MAD = 1.4826
-# Eigenvalues this small, relatively, are rounding errors.
+# Relative eigenvalues below this are rounding errors.
 _RANK_TOLERANCE = 1e-10
-# Normals further apart than 60 degrees are of different surfaces.
+# Normals that differ by more than 60 degrees are of different surfaces.
 _ALIKE = 0.5
-# Share of a direction's information that must not be noise. Directions that slide have less than
-# 0.15, those that a few points in a hundred hold more than 0.5.
+# Minimum fraction of a direction's information that is not noise. Degenerate directions have less
+# than 0.15, directions constrained by a few percent of the points more than 0.5.
 _SIGNAL = 0.4
 
 
@@ -48,13 +48,13 @@ class SurfacePairs:
     points
         (m, 3) source points relative to it, m.
     residual
-        (m, 3) from target point to moved source point, m, turned into the source's frame.
+        (m, 3) from target point to transformed source point, m, rotated into the source's frame.
     target_normals, source_normals
-        (m, 3) unit normals of both surfaces, turned into the source's frame.
+        (m, 3) unit normals of both surfaces, rotated into the source's frame.
     weight
-        (m,) of the pairs, by their noise.
+        (m,) weights of the pairs by their noise.
     resolution
-        m.
+        Point spacing or voxel size of the views, m.
     """
 
     T_target_source: Float64
@@ -82,7 +82,7 @@ class SurfacePairs:
         return T @ to @ se3.exp(xi) @ back @ se3.inverse(T)
 
     def to_origin(self, H: Float64) -> Float64:
-        """Turn information (6, 6) about the centre into that about the source's origin."""
+        """Transform information (6, 6) about the centre to the source's origin."""
         shift = np.eye(4)
         shift[:3, 3] = -self.centre
         adjoint = se3.adjoint(shift)
@@ -104,9 +104,14 @@ class SurfacePairs:
 
 
 def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = False) -> SurfacePairs:
-    """Turn matches into pairs with normals of the target and, if asked for, of the source.
+    """Convert matches to pairs with normals of the target and, if `source`, of the source.
 
-    Pairs without them are left out. Raises RegistrationError where fewer than six remain.
+    Pairs without normals are left out.
+
+    Raises
+    ------
+    RegistrationError
+        If fewer than six pairs remain.
     """
     i, j = matches.source, matches.target
     T = alignment.T_target_source
@@ -131,7 +136,7 @@ def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = Fals
 
 
 def _noise_weights(matches: Matches, alignment: Alignment) -> Float64:
-    """Inverse variance of each pair relative to their mean, ones where sigma isn't known."""
+    """Return inverse variances (m,) relative to their mean; ones if sigma is unknown."""
     a, b = alignment.source.variance, alignment.target.variance
     if a is None or b is None or len(matches) == 0:
         return np.ones(len(matches))
@@ -141,19 +146,19 @@ def _noise_weights(matches: Matches, alignment: Alignment) -> Float64:
 
 
 def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
-    """Weights (m,) of pairs in a sum of information: less where many share one target point.
+    """Return the information weights (m,) of pairs, reduced where many share one target point.
 
-    With noise alike in both views, m pairs with one target point tell as much about its plane as
-    ``2 m / (1 + m)`` pairs with a target point of their own.
+    With equal noise in both views, m pairs with one target point have the information of
+    ``2 m / (1 + m)`` pairs with distinct target points.
     """
     count = np.bincount(matches.target, minlength=len(alignment.target))
     return 2 / (1 + count[matches.target])
 
 
 def in_scales(residual: Float64, resolution: float) -> Float64:
-    """Return sizes (m,) of residuals in m by their scale.
+    """Return absolute residuals (m,), given in m, relative to their robust scale.
 
-    That is 1.4826 times the median of the sizes, and a thousandth of the resolution at least.
+    The scale is 1.4826 times their median, at least a thousandth of the resolution.
     """
     size = np.abs(residual)
     return np.asarray(size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * resolution))
@@ -178,7 +183,7 @@ def variance_of(square: float, weight: Float64, resolution: float) -> float:
 
 
 def solve(H: Float64, g: Float64, size: float) -> Float64:
-    """Solve ``H xi = -g``, with no motion along directions that H doesn't hold at all.
+    """Solve ``H xi = -g`` by the pseudo-inverse, without motion along null directions of H.
 
     `size` (m) makes rotations comparable with translations.
     """
@@ -195,8 +200,8 @@ def cross_information(pairs: SurfacePairs, variance: float) -> Float64:
     """Return ``sum w (Jt^T Js + Js^T Jt) / (2 variance)`` (6, 6), about the pairs' centre.
 
     Jt and Js are the derivatives of the distance along the target's and along the source's
-    normal. The noise of the two views is independent and cancels in the product, where in the
-    plain information ``Jt^T Jt`` it adds up, and makes a flat wall look known in every direction.
+    normal. The noise of the two views is independent and cancels in the product. In the plain
+    information ``Jt^T Jt`` it accumulates, and seems to constrain a flat wall in every direction.
     """
     a, b = pairs.target_normals, pairs.source_normals
     H, _, _ = plane_sums(pairs.points, a, b, np.zeros(len(pairs)), pairs.weight)
@@ -204,14 +209,13 @@ def cross_information(pairs: SurfacePairs, variance: float) -> Float64:
 
 
 def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
-    """Return the directions (k, 6) of the right perturbation that the pairs don't hold.
+    """Return the degenerate directions (k, 6) of the right perturbation.
 
-    Looked for are the eigenvectors of the cross-information, with lengths in resolutions and
-    angles in those that move points at the rms distance from the centroid by one. One is not held
-    where its sigma is above one, or where most of its plain information is noise, and not in the
-    cross-information.
+    Candidates are the eigenvectors of the cross-information, with lengths in resolutions and
+    angles scaled by the rms distance from the centroid. One is degenerate if its sigma exceeds one,
+    or if most of its plain information is noise, and absent from the cross-information.
     """
-    # Which side a normal is on doesn't matter here.
+    # The orientation of the normals is irrelevant here.
     together = (pairs.target_normals * pairs.source_normals).sum(1)
     turned = pairs.source_normals * np.sign(together)[:, None]
     pairs = replace(pairs, source_normals=turned).keep(np.abs(together) > _ALIKE)
@@ -225,8 +229,8 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     both, plain = direction_products(
         pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
     )
-    held = (values > 1) & (both > _SIGNAL * plain)
+    constrained = (values > 1) & (both > _SIGNAL * plain)
     shift = np.eye(4)
     shift[:3, 3] = pairs.centre
-    free = directions[~held] @ se3.adjoint(shift).T
+    free = directions[~constrained] @ se3.adjoint(shift).T
     return free / np.linalg.norm(free, axis=1, keepdims=True)

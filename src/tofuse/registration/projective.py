@@ -111,17 +111,17 @@ class ProjectiveOptions:
 
 
 def points_of(view: PreparedView, stride: int) -> Float32:
-    """Every `stride`-th pixel of every `stride`-th row that has a plane, as the kernels take it.
+    """Return every `stride`-th pixel with a plane of every `stride`-th row, for the kernels.
 
-    The points lie on the fitted surface, as the target's do: what smoothing does to a curved
-    surface is then the same on both sides.
+    The points lie on the fitted surface, as the target's do, so that the smoothing of curved
+    surfaces is the same for both.
     """
     return kernels.gather(view.rays, view.planes, view.plane_variance, view.albedo, stride)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A view to align with, and where it is: T_target_world."""
+    """A view to align with and its pose T_target_world (4, 4)."""
 
     view: PreparedView
     T_target_world: Float64
@@ -129,7 +129,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """The outcome of an alignment.
+    """Result of an alignment.
 
     Attributes
     ----------
@@ -143,27 +143,26 @@ class Aligned:
         (6, 6) of the right perturbation, from the noise that the views show.
     cross
         (6, 6) the symmetrised cross-information: like the information, but independent noise in
-        the Jacobians of the two views cancels in it; less what errors that they share can fake.
+        the Jacobians of the two views cancels in it; less spurious information by common errors.
     unobservable
-        (k, 6) unit directions (in units of 1 cm and 1 degree) that the data does not hold.
+        (k, 6) degenerate unit directions, in units of 1 cm and 1 degree.
     points, landed, compared, inliers, in_front
         Counts of source points, summed over the targets.
     rms_m
-        Of the inliers' distances.
+        RMS distance of the inliers, m.
     scale
-        Noise scale of the residuals, in the sigmas that the views claim, as far as it was let grow.
+        Noise scale of the residuals relative to the views' stated sigmas, bounded above.
     noise_scale
-        The same without a limit: from the median of all compared points, outliers included.
+        The same without a bound: from the median of all compared points, outliers included.
     photo_scale
-        The same of the log albedo's, as a standard deviation.
+        Standard deviation of the photometric residuals (log albedo).
     exposure
         Log albedo of the targets minus the source's.
     photometric
-        Whether the albedo took part.
+        Whether photometric residuals were used.
     score
-        How much of the view fits, for comparing alignments of one view: robust weights of both
-        terms, less twice the points in free space, as a share of the points (the mean over
-        targets).
+        Quality of fit, for comparing alignments of one view: robust weights of both terms, less
+        twice the points in free space, as a fraction of the points (the mean over targets).
     """
 
     T_world_source: Float64
@@ -187,32 +186,36 @@ class Aligned:
 
     @cached_property
     def inlier_share(self) -> float:
-        """Inliers among the points that could be compared."""
+        """Inliers as a fraction of the compared points."""
         return self.inliers / self.compared if self.compared else 0.0
 
     @cached_property
     def overlap(self) -> float:
-        """Points that land in a target, as a share of all (the mean over targets)."""
+        """Fraction of the points that project into a target (the mean over targets)."""
         return self.landed / self.points if self.points else 0.0
 
 
 def span(directions: Float64, least: float) -> Float64:
-    """(6, m) orthonormal basis of directions (k, 6), m and rad, in `UNITS`.
+    """Return an orthonormal basis (6, m), in `UNITS`, of directions (k, 6) in m and rad.
 
     Parameters
     ----------
+    directions
+        Spanning set.
     least
-        Directions are different ones above this share of the strongest.
+        Minimum singular value relative to the largest.
     """
     u, s, _ = np.linalg.svd((directions / UNITS).T, full_matrices=False)
     return np.asarray(u[:, s > least * s[0]], np.float64)
 
 
 def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> Registration:
-    """An alignment with one target as a registration.
+    """Return an alignment with one target as a registration.
 
     Parameters
     ----------
+    aligned
+        Alignment.
     T_target_source
         (4, 4).
     C
@@ -247,15 +250,17 @@ def align(
 
     Parameters
     ----------
+    source, targets
+        View to align, and views with known poses.
     T_world_predicted
-        (4, 4) where the source is expected; what the data leaves open stays there.
+        (4, 4) predicted pose of the source; kept along degenerate directions.
     start
-        (4, 4) where the iterations begin; the prediction unless given.
+        (4, 4) initial pose; the prediction unless given.
     exposure
-        Log albedo of the targets minus the source's to begin with; seen at the start unless given.
+        Initial log albedo of the targets minus the source's; estimated at the start unless given.
     usual_scale
-        Noise scale that alignments of this camera usually have, if it is known: sigmas may become
-        three times as large as that, also where this exceeds `max_sigma_m`.
+        Usual noise scale of this camera's alignments, if known: the noise scale is bounded by three
+        times this value, even beyond `max_sigma_m`.
     """
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
@@ -298,7 +303,7 @@ def align(
             level.photometric_inflation,
             options.robust,
             math.cos(options.max_angle),
-            number > 0,  # at the coarsest level the views are not yet where they belong
+            number > 0,  # at the coarsest level the views are not yet aligned
             options.common_tilt,
             options.common_slope,
             options.held,
@@ -335,7 +340,7 @@ def align(
 
 
 def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
-    """Median difference in log albedo, from some of the points, before they are aligned."""
+    """Return the median difference in log albedo over a subset of the points at T (4, 4)."""
     every = max(1, len(points) // steps.SOME_POINTS)
     seen = []
     for target in targets:

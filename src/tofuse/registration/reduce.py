@@ -10,7 +10,7 @@ from tofuse.arrays import Float32, Float64, Intp
 from tofuse.recordings.frames import CloudFrame, Frame
 
 # Cubes that a float64 still tells apart by their number.
-_MOST_CELLS = 2.0**52
+_MAX_CELLS = 2.0**52
 
 
 def extent(points: Float32 | Float64) -> float:
@@ -42,7 +42,7 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
     columns = np.ascontiguousarray(points.T)
     cell = np.floor((columns - columns.min(1)[:, None]) / size)
     count = cell.max(1) + 1
-    if count.prod() < _MOST_CELLS:
+    if count.prod() < _MAX_CELLS:
         # One number for a cube sorts faster than three.
         key = ((cell[0] * count[1] + cell[1]) * count[2] + cell[2]).astype(np.int64)
         order = np.argsort(key, kind="stable")

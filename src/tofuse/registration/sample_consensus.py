@@ -1,13 +1,12 @@
-"""The rigid motion that most of a list of pairs of points agree on, wrong pairs and all.
+"""Robust estimation of a rigid motion from point pairs with outliers.
 
-Two ways to it. RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws three pairs at
-random, again and again, until so many were drawn that one draw without a wrong pair is nearly
-certain. Where one pair in fifty is right that takes for ever; but two right pairs are as far apart
-in one view as in the other, and three right pairs agree about that pairwise. So the pairs that
-have the most agreeing pairs in common are taken together (second-order compatibility: Chen et al.
-2022, "SC2-PCR"), and nothing is random.
+Two methods. RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws random triples
+until one without outliers was drawn with the required confidence. With few inliers, one in fifty
+say, that takes too many samples; but inliers preserve distances, so that they are pairwise
+compatible. The second method groups the pairs that share the most compatible pairs (second-order
+compatibility: Chen et al. 2022, "SC2-PCR"), and is deterministic.
 
-A pair counts as an inlier by its own noise: it may miss by a few of its own standard deviations.
+Residuals are normalised by each pair's own standard deviation.
 """
 
 from __future__ import annotations
@@ -28,43 +27,44 @@ Way = Literal["samples", "compatible"]
 
 _SAMPLE = 3
 _BATCH = 256
-# Triangles that are this thin fix no rotation: second singular value relative to the first.
+# Minimum ratio of a sampled triangle's area to its squared side: thin ones don't constrain the
+# rotation.
 _THINNEST = 0.1
-# A sample's motion is rough: what counts as an inlier in each round of least squares after it, in
-# units of what does in the end.
+# Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
+# motion of a minimal sample is inaccurate.
 _GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
 # Distinct motions that are refined before the best is chosen.
 _POLISHED = 20
-# Sides of a triangle of samples, at least, in standard deviations of their length.
+# Minimum side of a sampled triangle, in standard deviations of its length.
 _SHORTEST = 4.0
-# Pairs that grow a motion together from one that leads (SC2-PCR: nearest in compatibility).
+# Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility).
 _TOGETHER = 20
-# Pairs that are compared with each other, which takes memory by their square.
-_MOST_COMPARED = 2000
-# A direction is held if its sigma is at most 1 cm, or 1 degree.
+# Maximum number of pairs in the compatibility matrix, whose memory is quadratic.
+_MAX_COMPARED = 2000
+# A direction is constrained if its sigma is at most 1 cm, or 1 degree.
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 
 
 @dataclass(frozen=True)
 class ConsensusOptions:
-    """How the motion is found that most pairs agree on.
+    """Options of the consensus search.
 
     Attributes
     ----------
     way
-        "samples": random triples; "compatible": pairs that agree with each other pairwise.
+        "samples": RANSAC; "compatible": second-order compatibility.
     sigmas
-        A pair is an inlier if it misses by at most so many of its standard deviations.
+        Inlier threshold, in standard deviations of the pair.
     inliers
-        Fewest inliers of a motion.
+        Minimum number of inliers of a motion.
     confidence
-        Samples are drawn until one of inliers alone was among them with this probability.
+        Probability that at least one of the drawn samples is free of outliers.
     most_samples
-        But no more than so many.
+        Maximum number of samples.
     leaders
-        Pairs from which compatible ones are gathered, at most.
+        Maximum number of seeds of consensus sets.
     distinct_m, distinct_rad
-        Motions that differ by more are rivals.
+        Motions that differ by more are distinct hypotheses.
     """
 
     way: Way = "samples"
@@ -93,14 +93,14 @@ class ConsensusOptions:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """m pairs of points that may be the same point of the world.
+    """m putative point correspondences.
 
     Attributes
     ----------
     source, target
-        (m, 3) m, each in the frame of its view.
+        (m, 3) points in the frames of the two views, m.
     variance
-        (m,) of their distance along each axis once they are aligned, m^2.
+        (m,) variance of the difference of aligned points along each axis, m^2.
     """
 
     source: Float64
@@ -111,24 +111,24 @@ class Pairs:
         return len(self.source)
 
     def some(self, which: Int64 | Bool) -> Pairs:
-        """Return the pairs of a mask, or at positions."""
+        """Return the pairs selected by a mask (m,) or by positions (k,)."""
         return Pairs(self.source[which], self.target[which], self.variance[which])
 
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """What most pairs agree on.
+    """A motion and its inliers.
 
     Attributes
     ----------
     T_target_source
-        (4, 4) by weighted least squares over the inliers.
+        (4, 4) weighted least squares estimate over the inliers.
     inliers
-        (m,) whether a pair agrees.
+        (m,) inlier mask.
     score
-        Pairs that agree, each counted the more the better it does, at most 1.
+        MSAC score: sum over the pairs of their fit, 0 to 1 each.
     tried
-        Motions that were tried.
+        Number of hypotheses evaluated.
     """
 
     T_target_source: Float64
@@ -143,9 +143,19 @@ class Consensus:
 
 
 def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> list[Consensus]:
-    """Find the rigid motions that most pairs agree on: the best first, then its distinct rivals.
+    """Return the rigid motions with the largest consensus, distinct ones only, the best first.
 
-    Raises RegistrationError where too few pairs agree on any.
+    Parameters
+    ----------
+    pairs
+        Putative correspondences.
+    rng
+        Source of the random samples.
+
+    Raises
+    ------
+    RegistrationError
+        If no motion has enough inliers.
     """
     found: list[Consensus] = []
     if len(pairs) >= options.inliers:
@@ -159,7 +169,7 @@ def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator)
 
 
 def are_distinct(T: Float64, other: Float64, points: Float64, *, metres: float, rad: float) -> bool:
-    """Whether two motions (4, 4) differ in where they put, or turn, the middle of points (n, 3)."""
+    """Whether two motions (4, 4) differ by more than `metres` at the median of points, or `rad`."""
     middle = np.median(points, 0)[None]
     shift = np.linalg.norm(se3.transform(T, middle) - se3.transform(other, middle))
     turned = se3.angle(se3.inverse(T) @ other)
@@ -167,18 +177,18 @@ def are_distinct(T: Float64, other: Float64, points: Float64, *, metres: float, 
 
 
 def motion_of(pairs: Pairs) -> Float64:
-    """(4, 4) the motion with the least weighted squares (Arun et al. 1987, Umeyama 1991).
+    """Return the weighted least squares motion (4, 4) (Arun et al. 1987, Umeyama 1991).
 
-    Pairs weigh by the inverse of their variance.
+    Weights are inverse variances.
     """
     weight = 1 / pairs.variance
     return _motions(pairs.source[None], pairs.target[None], weight[None])[0]
 
 
 def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
-    """(6, 6) ``sum J^T J / v``, ``J = [I, -hat(p)]``: of the right perturbation, source frame.
+    """Return the information ``sum J^T J / v`` (6, 6), ``J = [I, -hat(p)]``: right perturbation.
 
-    The variance is that of the pairs, or what they miss by where that is more.
+    The variance v is that of the pairs, scaled up to that of the residuals if these are larger.
     """
     p = pairs.source
     missed = se3.transform(T_target_source, p) - pairs.target
@@ -194,14 +204,14 @@ def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
 
 
 def loose_directions(information: Float64) -> Float64:
-    """(k, 6) directions that are known worse than to 1 cm and 1 degree, of unit length."""
+    """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
     values, vectors = np.linalg.eigh(information * _UNITS[:, None] * _UNITS)
     loose = vectors[:, values < 1].T * _UNITS
     return np.asarray(loose / np.linalg.norm(loose, axis=1, keepdims=True), np.float64)
 
 
 def registration_of(pairs: Pairs, found: Consensus, margin: float) -> Registration:
-    """The outcome as a registration; its points are the pairs, its correspondences the inliers."""
+    """Return a consensus as a registration: points are pairs, correspondences are inliers."""
     mine = pairs.some(found.inliers)
     T = found.T_target_source
     distance = np.linalg.norm(se3.transform(T, mine.source) - mine.target, axis=1)
@@ -222,7 +232,7 @@ def registration_of(pairs: Pairs, found: Consensus, margin: float) -> Registrati
 
 
 def _sampled(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> Float64:
-    """Motions (k, 4, 4) of triples that are alike in both views, until the best is certain."""
+    """Return the motions (k, 4, 4) of random triples that are congruent in both views."""
     n = len(pairs)
     needed, drawn, most = float(options.most_samples), 0, 0
     motions = []
@@ -245,7 +255,7 @@ def _sampled(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) 
 
 
 def _alike(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
-    """(k,) whether triangles (k, 3) have the same sides in both views, and are not too thin."""
+    """Whether triangles (k, 3) have equal sides in both views and are not degenerate, (k,)."""
     ok = np.ones(len(triples), bool)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         i, j = triples[:, a], triples[:, b]
@@ -261,13 +271,13 @@ def _alike(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
 
 
 def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generator) -> Float64:
-    """Motions (k, 4, 4) of pairs that agree with each other about their distances."""
-    if len(pairs) > _MOST_COMPARED:
-        pairs = pairs.some(np.linspace(0, len(pairs) - 1, _MOST_COMPARED).astype(np.int64))
+    """Return the motions (k, 4, 4) of sets of pairwise compatible pairs."""
+    if len(pairs) > _MAX_COMPARED:
+        pairs = pairs.some(np.linspace(0, len(pairs) - 1, _MAX_COMPARED).astype(np.int64))
     p, q = pairs.source, pairs.target
     one, other = (cdist(x, x) for x in (p, q))
     sigma = np.sqrt(pairs.variance[:, None] + pairs.variance)
-    # Points at one place agree with all that one of them agrees with, and fix no rotation.
+    # Coincident points are compatible with the same pairs and don't constrain the rotation.
     apart = np.minimum(one, other) > 2 * options.sigmas * sigma
     alike = ((np.abs(one - other) < options.sigmas * sigma) & apart).astype(np.float32)
     common = alike * (alike @ alike)
@@ -285,7 +295,7 @@ def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generat
 
 
 def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
-    """(k, 4, 4) least squares motions of k lists of n pairs (k, n, 3), weights (k, n)."""
+    """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n)."""
     share = (weight / weight.sum(1, keepdims=True))[..., None]
     p0, q0 = (share * p).sum(1), (share * q).sum(1)
     H = np.einsum("kni,knj->kij", share * (p - p0[:, None]), q - q0[:, None])
@@ -300,18 +310,18 @@ def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
 
 
 def _missed(pairs: Pairs, motions: Float64) -> Float64:
-    """(k, m) by how much motions (k, 4, 4) miss: squared distances over variances."""
+    """Return the normalised squared residuals (k, m) of motions (k, 4, 4)."""
     moved = np.einsum("kij,mj->kmi", motions[:, :3, :3], pairs.source) + motions[:, None, :3, 3]
     return np.asarray(((moved - pairs.target) ** 2).sum(2) / pairs.variance, np.float64)
 
 
 def _score(missed: Float64, sigmas: float) -> Float64:
-    """(k,) pairs that agree, each the more the better it does (MSAC: Torr and Zisserman 2000)."""
+    """Return the MSAC scores (k,) of squared residuals (k, m) (Torr and Zisserman 2000)."""
     return np.asarray(np.maximum(1 - missed / sigmas**2, 0).sum(-1), np.float64)
 
 
 def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[Consensus]:
-    """Distinct motions, the best first, each refined by its own inliers."""
+    """Return the distinct motions, the best first, each refined on its inliers."""
     free = np.ones(len(motions), bool)
     score = _score(_missed(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
     found: list[Consensus] = []
@@ -336,7 +346,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
 
 
 def _polished(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
-    """The best of several least squares, each over the inliers of the last, widely at first."""
+    """Refine T by iterated least squares over its inliers; return the best motion and its mask."""
     best, most = T, -1.0
     for gate in _GATES:
         missed = _missed(pairs, T[None])[0]
@@ -353,7 +363,7 @@ def _polished(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
 
 
 def _differ(motions: Float64, T: Float64, pairs: Pairs, options: ConsensusOptions) -> Bool:
-    """(k,) whether motions take the middle of the source elsewhere than T, or turn it otherwise."""
+    """Whether motions (k, 4, 4) are distinct from T (4, 4), (k,)."""
     middle = np.median(pairs.source, 0)
     ends = motions[:, :3, :3] @ middle + motions[:, :3, 3]
     end = T[:3, :3] @ middle + T[:3, 3]

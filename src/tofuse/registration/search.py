@@ -1,8 +1,8 @@
-"""Large steps between two range images: an exhaustive search, settled by what both images saw.
+"""Exhaustive pose search between two range images with a wide baseline.
 
 Every pose of a coarse grid is scored on some hundred pixels of both images; the best ones are
-settled by two-way projective ICP, and chosen by `agreement`. Where both views see the floor, the
-grid is yaw and two translations; else it has all six dimensions. There is nothing random in it.
+refined by two-way projective ICP and ranked by `agreement`. Where both views see the floor, the
+grid is yaw and two translations; else it has all six dimensions. The search is deterministic.
 """
 
 from __future__ import annotations
@@ -33,72 +33,73 @@ from tofuse.registration.view_points import ViewPoints
 
 Mode = Literal["auto", "both", "planar", "full"]
 
-# Patient, as albedo reaches no further than it is smooth; open directions are left to it.
+# Many iterations, as the basin of photometric convergence is small; degenerate directions are
+# constrained by albedo alone.
 _PHOTOMETRIC = ProjectiveOptions(
     levels=(Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02)), common_tilt=0.0, common_slope=0.0
 )
-# Best candidates that are settled once more, by so many pixels and as closely as noise allows.
+# Number of best candidates that are refined again down to the noise, and of the pixels used.
 _POLISHED, _POLISH_POINTS = 10, 2500
-# Score that a candidate may lose by being aligned by albedo.
+# Maximum score that a candidate may lose in photometric alignment.
 _GIVEN_UP = 0.05
-# Width over which albedo is averaged before it scores coarse steps, in the plane z = 1, and the
-# deviation in log albedo at which points that support a pose speak against it as much.
+# Sigma of the albedo's low-pass filter for the coarse grid, in the plane z = 1, and difference in
+# log albedo at which a point counts neither for nor against a pose.
 _BLUR, _ALBEDO = 0.04, 0.12
 _NO_BORDER = cv2.BORDER_CONSTANT
-# Nodes of the grid on which an image is looked up, along its wider side.
+# Nodes of the lookup grid of an image, along its wider side.
 _GRID = 128
-# Points without which a view is not searched.
-_LEAST_POINTS = 50
-# Points of a view of which the search takes its samples.
+# Minimum number of points of a view.
+_MIN_POINTS = 50
+# Points of a view from which the search draws its subsets.
 _SEEN = 3000
-# The whole grid is scored on a sixth of the points, and the best so many times the candidates on
-# all.
+# The whole grid is scored on a sixth of the points; the best poses, this many times the number of
+# candidates, on all.
 _COARSE_SHARE, _KEPT = 6, 200
-# Of the grid of six dimensions first the middles of cells of eight translations are scored, with
-# so many times the reach, and only the translations in this share of the cells, the best.
+# In six dimensions the centres of cells of eight translations are scored first, with the reach
+# multiplied by the first number; the best fraction of the cells is then scored in full.
 _WIDER, _PROMISING = 1.5, 0.1
 _CHUNKS = 16
-# Reaches of the two-way ICP, iteration by iteration, in those of the first.
+# Reach of the two-way ICP per iteration, relative to the first.
 _NARROWER = 0.85 ** np.arange(28)
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How far and how finely is searched.
+    """Range and resolution of the search.
 
-    Lengths are shares of the depth of the views (the mean of their medians), so that a room and a
-    box on a table are searched alike.
+    Lengths are relative to the depth of the views (the mean of their medians), so that the search
+    is independent of the scene's scale.
 
     Attributes
     ----------
     mode
         "planar" (yaw, and translation along the floor), "full" (six dimensions), "both" (planar
         where both views see a floor, and full: slow, but the margin counts all rivals), or "auto"
-        (full only where there is no floor, or what the planar search finds does not convince).
+        (full only if there is no floor, or the planar result scores below `convincing`).
     yaw
         Largest rotation about the vertical in the planar search, rad.
     turn, roll
-        Largest rotation in the full search, and largest one about the line of sight, rad.
+        Largest rotation in the full search, and largest one about the optical axis, rad.
     reach
         Largest translation.
     planar_yaw_step, planar_step
-        Steps of the planar grid, rad and share.
+        Steps of the planar grid, rad and relative to the depth.
     full_angle_step, full_step
         Steps of the full grid.
     planar_points, full_points
         Pixels of each image that score the poses of the grid.
     planar_candidates, full_candidates
-        How many of the grid's poses are settled.
+        Number of the grid's poses that are refined by ICP.
     settle_points
-        Pixels of each image that settle a candidate.
+        Pixels of each image used by ICP.
     photo_candidates
-        How many of the best candidates are aligned by albedo too, where both views have it.
+        Number of best candidates with photometric alignment, where both views have albedo.
     convincing
-        Least score with which "auto" leaves it at the planar search.
+        Minimum score at which "auto" skips the full search.
     distinct_m, distinct_rad
-        Poses that differ by more are different answers.
+        Poses that differ by more are distinct hypotheses.
     floor, agreement
-        How the floor is found, and the two images compared.
+        Options of floor detection and of the comparison of the two images.
     """
 
     mode: Mode = "auto"
@@ -148,7 +149,7 @@ class SearchOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
     def differ(self, a: Float64, b: Float64) -> bool:
-        """Whether two poses (4, 4) are different answers."""
+        """Whether two poses (4, 4) are distinct hypotheses."""
         between = se3.inverse(a) @ b
         return bool(
             np.linalg.norm(between[:3, 3]) > self.distinct_m
@@ -158,27 +159,27 @@ class SearchOptions:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose T_target_source (4, 4) and what both images say of it."""
+    """A pose T_target_source (4, 4) and its agreement."""
 
     T_target_source: Float64
     agreement: Agreement
 
     @property
     def score(self) -> float:
-        """Support less twice the free-space violation, as a share of the points."""
+        """Support less twice the free-space violation, as a fraction of the points."""
         return self.agreement.score
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What a search found.
+    """Result of a search.
 
     Attributes
     ----------
     candidates
         Distinct poses, the best first.
     mode
-        Which search was made: "full" where the planar one did not suffice.
+        Kind of search: "full" where the planar one did not suffice.
     """
 
     candidates: tuple[Candidate, ...]
@@ -186,17 +187,17 @@ class Match:
 
     @property
     def T_target_source(self) -> Float64:
-        """(4, 4) the best pose."""
+        """Best pose (4, 4)."""
         return self.candidates[0].T_target_source
 
     @property
     def agreement(self) -> Agreement:
-        """What both images say of the best pose."""
+        """Agreement of the best pose."""
         return self.candidates[0].agreement
 
     @property
     def score(self) -> float:
-        """Of the best pose."""
+        """Score of the best pose."""
         return self.candidates[0].score
 
     @property
@@ -206,16 +207,13 @@ class Match:
 
     @property
     def margin(self) -> float:
-        """By how much the best pose scores better than the runner-up.
-
-        A symmetric scene leaves little of it, whatever the score.
-        """
+        """Lead of the best pose's score over the runner-up's; small in symmetric scenes."""
         return self.score - (max(self.candidates[1].score, 0.0) if self.runner_up else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A view as the search takes it."""
+    """A view resampled to a pinhole grid, with a subset of its points."""
 
     grid: Float32
     frame: Float64
@@ -225,7 +223,7 @@ class _View:
     depth: float
 
     def some(self, count: int, less: Bool | None = None) -> tuple[Float32, Float32, Float32]:
-        """About so many points, their normals and light, of those marked `less` every fourth."""
+        """Subset of `count` points with normals and albedo, one in four of those marked `less`."""
         keep = np.arange(len(self.points))
         if less is not None:
             keep = np.concatenate([keep[~less], keep[less][::4]])
@@ -240,17 +238,19 @@ def search(
     *,
     gravity: tuple[Float64, Float64] | None = None,
 ) -> Match | None:
-    """Find the pose between two views that may be far apart.
+    """Search the pose between two views with a wide baseline.
 
     Parameters
     ----------
+    source, target
+        Prepared views.
     gravity
-        (3,) directions in which things fall in the source's and in the target's frame, if known.
+        (3,) direction of gravity in the source's and in the target's frame, if known.
 
     Returns
     -------
     Match or None
-        None where a view has too few surfaces to be searched with.
+        None if a view has too few planes.
     """
     prepared = Search.of(source, target, options)
     return None if prepared is None else prepared.everywhere(gravity)
@@ -258,14 +258,14 @@ def search(
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Two views, prepared to be searched.
+    """Two views prepared for the search.
 
     Attributes
     ----------
     source, target
-        Their surfaces, with rough planes where there are no others.
+        Views, with rough planes where there are no others.
     compared
-        How they are judged.
+        Comparison that evaluates poses.
     """
 
     source: PreparedView
@@ -279,11 +279,11 @@ class Search:
     def of(
         cls, source: PreparedView, target: PreparedView, options: SearchOptions | None = None
     ) -> Search | None:
-        """Prepare two views; None where one has too few surfaces to be searched with."""
+        """Prepare two views; None if one has too few planes."""
         options = SearchOptions() if options is None else options
         source, target = with_rough_planes(source), with_rough_planes(target)
         s, t = _prepare(source), _prepare(target)
-        if min(len(s.points), len(t.points)) < _LEAST_POINTS:
+        if min(len(s.points), len(t.points)) < _MIN_POINTS:
             return None
         compared = Comparison.of(source, target, options.agreement)
         return cls(source, target, compared, options, s, t)
@@ -303,13 +303,13 @@ class Search:
         return Match(self._ordered(found), "full")
 
     def among(self, poses: Float64, match: Match) -> Match:
-        """Settle other poses T_target_source (N, 4, 4) too, and order them among those found."""
+        """Refine further poses T_target_source (N, 4, 4) and rank them among the candidates."""
         if not len(poses):
             return match
         return replace(match, candidates=self._ordered([*match.candidates, *self._settled(poses)]))
 
     def _settled(self, poses: Float64) -> list[Candidate]:
-        """Settle poses by two-way ICP, and judge them."""
+        """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
         s, t, options = self.s, self.t, self.options
         poses = poses.copy()
         floor = _noise_floor(s, t, options)
@@ -328,7 +328,7 @@ class Search:
         return [Candidate(T, each) for T, each in zip(poses, said, strict=True)]
 
     def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
-        """Order candidates, after albedo has placed the best ones where geometry alone can't."""
+        """Rank candidates after photometric alignment of the best ones."""
         source, target, options = self.source, self.target, self.options
         distinct = _distinct(found, options)
         if not (source.has_albedo and target.has_albedo):
@@ -342,8 +342,8 @@ class Search:
             ]
         )
         placed = self._judged([aligned.T_world_source for aligned in moved])
-        # Where geometry leaves a pose open, it may fit better a little off the place that albedo
-        # knows.
+        # Along degenerate directions the geometric score may decrease slightly with photometric
+        # alignment.
         kept = [
             new if new.score > old.score - _GIVEN_UP else old
             for old, new in zip(best, placed, strict=True)
@@ -352,9 +352,9 @@ class Search:
 
 
 def _prepare(view: PreparedView) -> _View:
-    """Look a view up on a pinhole grid."""
+    """Resample a view to a pinhole grid."""
     rays = view.rays[view.planes[..., 3] > 0]
-    if len(rays) < _LEAST_POINTS:
+    if len(rays) < _MIN_POINTS:
         nothing = np.zeros((0, 3), np.float32)
         none = np.zeros((1, 1, 5), np.float32)
         return _View(none, np.ones(4), nothing, nothing, nothing[:, 0], 1.0)
@@ -396,7 +396,7 @@ def _prepare(view: PreparedView) -> _View:
 
 
 def _around(light: Float64, sigma: float) -> Float32:
-    """Mean of an image around each pixel, NaN where it is: a coarse step must not matter."""
+    """Low-pass filter an image (H, W), ignoring NaN, to match the step of the coarse grid."""
     known = np.isfinite(light)
     size = (0, 0)
     total = cv2.GaussianBlur(np.where(known, light, 0), size, sigma, borderType=_NO_BORDER)
@@ -406,7 +406,7 @@ def _around(light: Float64, sigma: float) -> Float32:
 
 
 def _planar(s: _View, t: _View, floor_s: Floor, floor_t: Floor, options: SearchOptions) -> Float64:
-    """Best poses of the planar grid, (N, 4, 4)."""
+    """Return the best poses (N, 4, 4) of the planar grid."""
     depth = 0.5 * (s.depth + t.depth)
     to_s, to_t = _upright(floor_s.normal), _upright(floor_t.normal)
     n = round(options.yaw / options.planar_yaw_step)
@@ -430,7 +430,7 @@ def _planar(s: _View, t: _View, floor_s: Floor, floor_t: Floor, options: SearchO
 
 
 def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
-    """Best poses of the grid of six dimensions, (N, 4, 4)."""
+    """Return the best poses (N, 4, 4) of the grid of six dimensions."""
     depth = 0.5 * (s.depth + t.depth)
     flat = options.roll / options.turn if options.turn else 1.0
     rotations = se3.so3_exp(_ball(options.full_angle_step, options.turn, (1.0, 1.0, flat)))
@@ -453,7 +453,7 @@ def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
 def _promising(
     scorer: _Scorer, rotations: Float64, moves: Float64, step: float, options: SearchOptions
 ) -> tuple[Intp, Intp]:
-    """Which rotations and which translations go together in the cells that score best."""
+    """Return the indices of rotations and translations in the best-scoring cells."""
     cells, cell = np.unique(np.floor(moves / (2 * step) + 0.25), axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell)
@@ -464,14 +464,14 @@ def _promising(
     best = _highest(scores, max(options.full_candidates, round(_PROMISING * len(scores))))
     turns, at = np.divmod(best, len(cells))
     order, first = np.argsort(cell, kind="stable"), np.cumsum(count) - count
-    # All translations of each of these cells, one after the other.
+    # Concatenate the translations of these cells.
     several = count[at]
     within = np.arange(several.sum()) - np.repeat(np.cumsum(several) - several, several)
     return np.repeat(turns, several), order[np.repeat(first[at], several) + within]
 
 
 def _highest(scores: Float32, count: int) -> Intp:
-    """Positions of the highest scores (n,), at most so many, in order of position."""
+    """Return the positions of the `count` highest scores (n,), ascending."""
     count = min(len(scores), count)
     return np.sort(np.argpartition(-scores, count - 1)[:count])
 
@@ -486,7 +486,7 @@ class _Scorer:
     reach: float
 
     def __call__(self, rotations: Float64, translations: Float64, points: int) -> Float32:
-        """(A, B) scores of each rotation with each translation; (A, 1) if there are as many."""
+        """Scores (A, B) of rotations (A, 3, 3) with translations (1, B, 3), or (A, 1) pairwise."""
         s, t = self.source, self.target
         some = (*s.some(points, self.less[0]), *t.some(points, self.less[1]))
         rotations, translations = (
@@ -518,14 +518,14 @@ class _Scorer:
 def _best(
     scorer: _Scorer, rotations: Float64, translations: Float64, points: int, count: int
 ) -> Float64:
-    """Score a grid and return its `count` best poses, (N, 4, 4); of neighbours only the best."""
+    """Score a grid and return its `count` best poses (N, 4, 4) after non-maximum suppression."""
     scores = scorer(rotations, translations[None], max(1, points // _COARSE_SHARE)).ravel()
     turns, shifts = np.divmod(_highest(scores, _KEPT * count), len(translations))
     return _thinned(scorer, rotations[turns], translations[shifts], points, count)
 
 
 def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -> Float64:
-    """Of poses (N, 3, 3) and (N, 3) the `count` best, (M, 4, 4); of neighbours only the best."""
+    """Return the `count` best of poses R (N, 3, 3), x (N, 3), with non-maximum suppression."""
     finer = scorer(R, x[:, None], points)[:, 0]
     order = np.argsort(-finer, kind="stable")
     R, x = R[order], x[order]
@@ -537,7 +537,7 @@ def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -
 
 
 def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
-    """Distance that errors of the sensor explain at the depth of the views, m."""
+    """Sensor error tolerance at the depth of the views, m."""
     a = options.agreement
     return a.floor_m + a.floor_share * 0.5 * (s.depth + t.depth)
 
@@ -545,7 +545,7 @@ def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
 def _settle(
     s: _View, t: _View, poses: Float64, reaches: Float64, points: int, options: SearchOptions
 ) -> None:
-    """Settle poses (N, 4, 4) in place by two-way ICP."""
+    """Refine poses (N, 4, 4) in place by two-way ICP."""
     some = (*s.some(points)[:2], *t.some(points)[:2])
     cosine = float(np.cos(options.agreement.max_angle))
     depth = 0.5 * (s.depth + t.depth)
@@ -559,10 +559,10 @@ def _settle(
 
 
 def _distinct(found: Sequence[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
-    """Order candidates, the best first, and leave out those that are nearly a better one."""
+    """Return the distinct candidates, the best first."""
     found = sorted(found, key=lambda candidate: -candidate.score)
     poses = np.array([candidate.T_target_source for candidate in found]).reshape(-1, 4, 4)
-    # Of a turn by less than that the cosine is more, and so is the trace.
+    # The trace of a rotation decreases with its angle.
     least = 1 + 2 * np.cos(min(options.distinct_rad, np.pi))
     kept: list[int] = []
     for k, T in enumerate(poses):
@@ -575,7 +575,7 @@ def _distinct(found: Sequence[Candidate], options: SearchOptions) -> tuple[Candi
 
 
 def _upright(down: Float64) -> Float64:
-    """(3, 3) the smallest rotation that turns `down` to +y."""
+    """Return the smallest rotation (3, 3) from `down` (3,) to +y."""
     y = np.array([0.0, 1.0, 0.0])
     axis = np.cross(down, y)
     sine = float(np.linalg.norm(axis))
@@ -585,7 +585,7 @@ def _upright(down: Float64) -> Float64:
 
 
 def _ball(step: float, radius: float, shape: tuple[float, float, float]) -> Float64:
-    """(N, 3) nodes of a cubic grid in a ball that is squeezed by `shape` along each axis."""
+    """Return the nodes (N, 3) of a cubic grid in an ellipsoid of axes `radius` times `shape`."""
     axes = []
     for squeeze in shape:
         n = int(radius * squeeze / step + 1e-9)

@@ -1,17 +1,17 @@
-"""How far an alignment can be trusted: its covariance, and the directions it can't see.
+"""Covariance of an alignment, with the prior along degenerate directions.
 
 The estimate solves g(T) = sum w J r = 0. To first order its error is ``X^-1 g``, g taken at the
-true pose, and its covariance ``X^-1 B X^-1`` with X the slope of g and B its covariance (the
+true pose, and its covariance ``X^-1 B X^-1`` with X the derivative of g and B its covariance (the
 "sandwich" of M-estimation; Huber 1981, ch. 6). Neither is the plain information matrix:
 
-- noise in normals and albedo slopes is in J on both sides of J J^T, and makes information from
-  nothing. In X, the symmetrised product of target's and source's Jacobian, it cancels. The robust
-  weights enter X with the slope of the influence function, not with the weights themselves;
-- B is not the pixels' noise alone. Smoothing makes neighbours share their noise; and light by way
-  of other surfaces, scattering and motion bend whole patches of the range image. What the patches
-  disagree about is seen in the residuals, after allowing for what the fit has taken up; what they
-  have in common the fit takes up wholly, and it is seen in nothing. It is known to grow with how
-  much the view has changed: a bias of the camera alone, seen from one place, moves no pose.
+- noise in normals and albedo gradients enters J J^T twice and causes spurious information. In X,
+  the symmetrised product of the target's and the source's Jacobian, it cancels. The robust weights
+  enter X with the derivative of the influence function, not with the weights themselves;
+- B is not the pixels' noise alone. Smoothing correlates the noise of neighbours; multipath,
+  scattering and motion distort whole patches of the range image. Differences between patches
+  appear in the residuals, less the part absorbed by the fit; errors common to all patches are
+  absorbed wholly and invisible in the residuals. They are modelled as proportional to the change
+  of the view: a constant bias of the camera causes no pose error from the same viewpoint.
 """
 
 from __future__ import annotations
@@ -34,38 +34,38 @@ _UPPER7 = np.triu_indices(7)
 # Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.
 _SCALE = np.append(UNITS, 1.0)
 _SCALES = np.outer(_SCALE, _SCALE)
-# Tiles with fewer compared pixels say nothing about a patch.
-_LEAST_PIXELS = 10
-_LEAST_TILES = 6
-# In units of 1 cm and 1 degree: keeps what a still camera gives invertible.
-_LEAST_SIGMA = 1e-3
-# Pixels that are looked at, about: what more would say is noise that neighbours share.
+# Minimum number of compared pixels of a tile, and of tiles.
+_MIN_PIXELS = 10
+_MIN_TILES = 6
+# Minimum sigma, in units of 1 cm and 1 degree: keeps the covariance of a still camera invertible.
+_MIN_SIGMA = 1e-3
+# Approximate number of pixels used: the noise of denser ones is correlated.
 _PIXELS = 6336
 
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
-    """The constants of the covariance; see docs/uncertainty.md for how they were found.
+    """Constants of the covariance; docs/uncertainty.md describes their calibration.
 
     Attributes
     ----------
     tiles
-        Patches in a row, and rows of patches.
+        Numbers of columns and of rows of patches.
     noise_pixels, photo_noise_pixels
-        How many pixels share one value of noise after smoothing, of distances and of albedo.
+        Number of pixels with fully correlated noise after smoothing, of distances and of albedo.
     reach
-        Errors of patches this far apart are still alike (by 1/e), as a share of the image's width.
+        Correlation length (1/e) of the errors of patches, as a fraction of the image's width.
     hidden
-        Error that neighbouring patches share and the residuals don't show: share of the depth,
-        for each radian by which the view has changed.
+        Correlated error of patches that is invisible in the residuals: fraction of the depth per
+        radian of change of the view.
     offset
-        The part of it that all patches share, relative to the rest.
+        Component of it common to all patches, relative to the rest.
     floor
-        Least error of the pose, as a share of the change of the view.
+        Minimum error of the pose, as a fraction of the change of the view.
     loosest
-        Largest sigma that the data itself is trusted to give, in units of 1 cm and 1 degree.
+        Largest sigma from the data alone, in units of 1 cm and 1 degree.
     steepness
-        Least slope of the gradient, as a share of the weighed information.
+        Lower limit of X, as a fraction of the weighted information.
     """
 
     tiles: tuple[int, int] = (8, 6)
@@ -91,7 +91,7 @@ class UncertaintyOptions:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """What the patches of a view say at the final pose, in units of 1 cm and 1 degree.
+    """Sums over the patches of a view at the final pose, in units of 1 cm and 1 degree.
 
     Attributes
     ----------
@@ -99,21 +99,21 @@ class Patches:
         (7, 7) sums of w J J^T; the seventh unknown is the exposure.
     weighed, cross
         (7, 7) sums of w times the symmetrised product of target's and source's Jacobian; and X, the
-        slope of the gradient, which has the slope of the influence function for w.
+        derivative of the gradient, which has the derivative of the influence function for w.
     places
-        (n, 2) of the patches with distances: column and row, as a share of the image's width.
+        (n, 2) column and row of the patches with distances, as fractions of the image's width.
     weights
         (n,) sums of w, 1/m^2.
     means
         (n,) weighted mean distances, m.
     responses
-        (n, 7) sums of w J: what an error common to the patch does to the gradient.
+        (n, 7) sums of w J: the response of the gradient to an error common to the patch.
     change
-        How much the view has changed: the angle in rad, and the way as a share of the depth.
+        Change of the view: angle in rad plus distance relative to the depth.
     depth
         Median depth, m.
     stride
-        Every how manieth pixel, along either axis, took part.
+        Spacing of the pixels used, along either axis.
     """
 
     geometry: Float64
@@ -136,7 +136,13 @@ def patches(
     alignment: ProjectiveOptions,
     options: UncertaintyOptions,
 ) -> Patches:
-    """Sum up what the patches of an aligned view say about its pose."""
+    """Return the sums over the patches of an aligned view.
+
+    Parameters
+    ----------
+    source, targets, alignment
+        As given to `align`, which returned `aligned`.
+    """
     rows, columns = source.z.shape
     stride = max(1, round(float(np.sqrt(rows * columns / _PIXELS))))
     across, down = options.tiles
@@ -175,9 +181,9 @@ def patches(
         distances.append(of_tiles)
         upper += of_image
     total = np.concatenate(distances)
-    told = total[:, kernels.COUNT] >= _LEAST_PIXELS
-    places = np.tile(_places(rows, columns, across, down), (len(targets), 1))[told]
-    total = total[told]
+    valid = total[:, kernels.COUNT] >= _MIN_PIXELS
+    places = np.tile(_places(rows, columns, across, down), (len(targets), 1))[valid]
+    total = total[valid]
     weights = total[:, kernels.WEIGHT]
     return Patches(
         _matrix(upper[kernels.GEOMETRY]),
@@ -196,18 +202,18 @@ def patches(
 
 @cache
 def _places(rows: int, columns: int, across: int, down: int) -> Float64:
-    """(down * across, 2) column and row of the tiles, as a share of the image's width."""
+    """Return column and row (down * across, 2) of the tiles, as fractions of the image's width."""
     v, u = np.mgrid[:down, :across]
     return np.stack([u / across, v * rows / (down * columns)], -1).reshape(-1, 2)
 
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
-    """(6, 6) covariance in m and rad of the right perturbation, from what the patches say."""
+    """Return the covariance (6, 6) of the right perturbation in m and rad, without a prior."""
     bread = _bounded_inverse(_slope(found, options), options.loosest)
     per_pixel = found.stride**2
     B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
     B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
-    if len(found.weights) >= _LEAST_TILES:
+    if len(found.weights) >= _MIN_TILES:
         x, y = found.places.T
         apart = np.hypot(x[:, None] - x, y[:, None] - y)
         alike = np.exp(-apart / options.reach)
@@ -217,7 +223,7 @@ def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float6
         B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
     C = (bread @ B @ bread)[:6, :6]
     floor = options.floor * found.change * np.array([found.depth] * 3 + [1.0] * 3) / UNITS
-    C += np.diag(np.maximum(floor, _LEAST_SIGMA) ** 2)
+    C += np.diag(np.maximum(floor, _MIN_SIGMA) ** 2)
     return 0.5 * (C + C.T) * np.outer(UNITS, UNITS)
 
 
@@ -228,17 +234,16 @@ def covariance(
     alignment: ProjectiveOptions,
     options: UncertaintyOptions | None = None,
 ) -> Float64:
-    """(6, 6) covariance of an alignment: m and rad, right perturbation in the source's frame.
+    """Return the covariance (6, 6) of an alignment: m and rad, right perturbation, source's frame.
 
-    Directions that the data does not hold have the uncertainty of the prediction, and none is less
-    certain than that.
+    Degenerate directions have the covariance of the prediction, which also bounds the others.
 
     Parameters
     ----------
     source, targets, alignment
         As given to `align`, which returned `aligned`.
     options
-        The calibrated ones unless given.
+        Constants of the covariance; the calibrated ones unless given.
     """
     chosen = options or UncertaintyOptions()
     C = covariance_of_patches(patches(source, targets, aligned, alignment, chosen), chosen)
@@ -247,7 +252,7 @@ def covariance(
 
 
 def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
-    """Give the unobservable directions the uncertainty of the prediction.
+    """Set the covariance of unobservable directions to that of the prediction.
 
     Parameters
     ----------
@@ -268,10 +273,9 @@ def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
 
 
 def no_worse_than(C: Float64, prior: Float64) -> Float64:
-    """Cut the covariance (6, 6) to that of the prediction, sigma (6,), where it is larger.
+    """Bound the covariance C (6, 6) by that of the prediction, sigma `prior` (6,).
 
-    Where surfaces disagree, so that the robust loss has no minimum along a direction, X^-1 B X^-1
-    is a number of any size.
+    X^-1 B X^-1 is unbounded along directions in which the robust loss has no minimum.
     """
     values, vectors = np.linalg.eigh(C / np.outer(prior, prior))
     if values[-1] <= 1:
@@ -283,10 +287,10 @@ def no_worse_than(C: Float64, prior: Float64) -> Float64:
 def _seen_variance(
     found: Patches, bread: Float64, alike: Float64, options: UncertaintyOptions
 ) -> float:
-    """Variance in m^2 of what patches have in common with their neighbours, from the residuals.
+    """Estimate the variance in m^2 of the correlated errors of patches from the residuals.
 
-    By moments, corrected for what the fit has taken up: residuals are (1 - P) times the errors,
-    P the projection of the fit (as in restricted maximum likelihood).
+    Method of moments, corrected for the degrees of freedom of the fit: residuals are (1 - P) times
+    the errors, P the projection of the fit (as in restricted maximum likelihood).
     """
     n = len(found.weights)
     M = np.eye(n) - (found.responses / found.weights[:, None]) @ bread @ found.responses.T
@@ -299,10 +303,10 @@ def _seen_variance(
 
 
 def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
-    """X (7, 7), but along no direction less than `steepness` of what it is without robust weights.
+    """Return X (7, 7), bounded below by `steepness` times its value without robust weights.
 
-    Normal errors make it two thirds of that. Where many residuals are near the limit, the slope is
-    the difference of large numbers, and may be anything, even negative.
+    For normal errors the ratio is two thirds. With many residuals near the limit of the loss, X is
+    a difference of large numbers and may even be negative.
     """
     values, vectors = np.linalg.eigh(found.weighed)
     root = vectors / np.sqrt(np.maximum(values, options.loosest**-2))
@@ -313,7 +317,7 @@ def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
 
 
 def _bounded_inverse(X: Float64, loosest: float) -> Float64:
-    """Inverse of X whose eigenvalues stay below the square of `loosest`."""
+    """Return the inverse of X (7, 7) with eigenvalues bounded by the square of `loosest`."""
     X = X.copy()
     if X[6, 6] <= 0:
         X[6, :] = X[:, 6] = 0.0

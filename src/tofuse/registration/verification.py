@@ -1,10 +1,9 @@
-"""Whether an alignment fits as views of this camera usually do.
+"""Verification of alignments against the fit statistics of the camera.
 
-How well two images fit at the right pose depends on the camera: of a smoothing phone 92 % of the
-compared pixels are inliers, of a stereo camera two thirds. So no fixed limit decides. `UsualFit`
-learns the distribution of a few statistics from the alignments that were accepted, beginning with a
-wide prior. What deviates from it by more than `UsualFit.sigmas` is not refused, but doubted: it
-then has to beat its rivals.
+The quality of fit at the right pose depends on the camera: 92 % of the compared pixels are inliers
+for a smoothing phone, two thirds for a stereo camera. Instead of a fixed limit, `UsualFit`
+estimates the distribution of a few statistics from accepted alignments, starting with a wide prior.
+Outliers by more than `UsualFit.sigmas` are not rejected, but have to be compared with rival poses.
 """
 
 from __future__ import annotations
@@ -25,33 +24,33 @@ _NOISE = 2
 _NAMES = ("outliers", "free-space violations", "noise", "albedo differences")
 # Fractions below these are never evidence: mixed pixels at edges, and quantisation.
 _ODDS_FLOOR = np.array([0.02, 0.01])
-# What is expected of a camera that is not known yet: mean and standard deviation of the statistics
-# (15 % outliers, 2 % in free space, four times the stated sigmas, 5 % of the albedo), and how many
-# alignments this counts for; from how many on the camera is known.
+# Prior for an unknown camera: mean and standard deviation of the statistics (15 % outliers, 2 % in
+# free space, four times the stated sigmas, 5 % of the albedo), and its weight in alignments; number
+# of alignments from which on the camera is known.
 _PRIOR_MEAN = np.array([np.log(0.17 / 0.87), np.log(0.03 / 0.98), np.log(4.0), np.log(0.05)])
 _PRIOR_SIGMA = np.array([0.6, 0.9, 1.5, 0.45])
 _PRIOR_COUNT, _KNOWN = 2.0, 10
-# Of what views of this camera usually differ by, this many standard deviations are no conflict.
+# Differences within this many usual standard deviations of the camera are no conflict.
 _NO_CONFLICT = 2.0
-# However alike the views of a recording, the next one may be of another kind.
-_LEAST_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
+# Lower limit of the spread, as the next view may differ from all so far.
+_MIN_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
-# Once a camera is known, what is usual is computed anew after so many alignments.
+# Once a camera is known, the distribution is updated every n-th alignment.
 _RELEARN_EVERY = 10
 _MEDIAN_OF_NORMAL = 0.6745
 # Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
 IN_SIGHT = 1.2
-# Six unknowns, and neighbouring pixels that share their noise.
-_LEAST_INLIERS = 40
+# For six unknowns, with noise that is correlated between neighbouring pixels.
+_MIN_INLIERS = 40
 # Registrations without a prediction need more iterations than tracking does.
 PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
-# A guess may be off by more than tracking's: a first stage with more slack.
+# A guess may be less accurate than tracking's prediction: start with more noise inflation.
 COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """How an alignment compares with those of this camera.
+    """Comparison of an alignment with those of this camera.
 
     Attributes
     ----------
@@ -60,9 +59,9 @@ class Assessment:
     excess
         Sum of the logarithms by which statistics exceed their usual value; 0 for a usual fit.
     reason
-        Which statistic is out of range, and what is usual; empty for a usual fit.
+        Statistic that is out of range, with its usual value; empty for a usual fit.
     conflict
-        Whether it is one that says that the views conflict, and not only that they are noisier.
+        Whether the views conflict, rather than being noisier only.
     """
 
     usual: bool
@@ -72,7 +71,7 @@ class Assessment:
 
 
 class UsualFit:
-    """How well views of this camera fit where they were aligned correctly.
+    """Distribution of the fit statistics of correct alignments of this camera.
 
     Location and spread of each statistic are the median and the scaled median absolute deviation
     over the last alignments, shrunk to the prior while there are few.
@@ -80,7 +79,7 @@ class UsualFit:
     Parameters
     ----------
     sigmas
-        Statistics within so many standard deviations above the median are usual.
+        Limit of the usual range above the median, in standard deviations.
     """
 
     def __init__(self, sigmas: float = 3.0) -> None:
@@ -92,12 +91,12 @@ class UsualFit:
 
     @property
     def noise_scale(self) -> float:
-        """Usual noise scale, in the sigmas that views claim; 0 while it is not known."""
+        """Usual noise scale relative to the views' stated sigmas; 0 while it is unknown."""
         return float(np.exp(self._mean[_NOISE])) if self.is_known else 0.0
 
     @property
     def is_known(self) -> bool:
-        """Whether enough alignments were seen to say what is usual."""
+        """Whether there were enough alignments to estimate the distribution."""
         return len(self._seen) >= _KNOWN
 
     @property
@@ -111,7 +110,7 @@ class UsualFit:
         return float(np.median(self._rms)) if self._rms else 0.0
 
     def learn(self, aligned: Aligned, depth: float) -> None:
-        """Take note of an alignment that was accepted, of a view with this median depth in m."""
+        """Add an accepted alignment of a view with this median depth in m."""
         self._seen.append(_statistics(aligned))
         if np.isfinite(aligned.rms_m) and depth > 0:
             self._rms.append(aligned.rms_m / depth)
@@ -131,11 +130,11 @@ class UsualFit:
                 weight = n / (n + _PRIOR_COUNT)
                 mean[k] += weight * (middle - mean[k])
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])
-        self._mean, self._sigma = mean, np.maximum(sigma, _LEAST_SIGMA)
+        self._mean, self._sigma = mean, np.maximum(sigma, _MIN_SIGMA)
 
     def assess(self, aligned: Aligned) -> Assessment:
-        """Compare an alignment with what is usual."""
-        if aligned.inliers < _LEAST_INLIERS:
+        """Compare an alignment with the distribution."""
+        if aligned.inliers < _MIN_INLIERS:
             words = f"{aligned.inliers} inliers are too few to determine a pose"
             return Assessment(False, np.inf, words, True)
         found = _statistics(aligned)
@@ -170,13 +169,13 @@ def _in_words(k: int, found: float, usual: float) -> str:
 def both_ways_agree(
     T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
 ) -> bool:
-    """Whether an alignment (4, 4), and the one back, end at the same pose."""
+    """Whether forward and backward alignments (4, 4) are consistent within `metres`, `radians`."""
     gap = T_target_source @ T_source_target
     return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
 
 
 def self_scaled(usual: UsualFit, plain: AgreementOptions | None = None) -> AgreementOptions:
-    """How images of this camera are compared: distances that it usually errs by are no conflict."""
+    """Return options that tolerate the usual errors of this camera, based on `plain` ones."""
     plain = plain or AgreementOptions()
     return replace(
         plain,
@@ -186,7 +185,7 @@ def self_scaled(usual: UsualFit, plain: AgreementOptions | None = None) -> Agree
 
 
 def finely_scaled(usual: UsualFit) -> AgreementOptions:
-    """How rival poses for one image are compared: errors beyond the usual ones tell them apart."""
+    """Return options that distinguish rival poses of one image by errors beyond the usual ones."""
     coarse = self_scaled(usual)
     if not usual.is_known:
         return coarse
@@ -194,15 +193,15 @@ def finely_scaled(usual: UsualFit) -> AgreementOptions:
         coarse,
         floor_m=0.0,
         floor_share=_NO_CONFLICT * usual.rms_share,
-        # Twice as much is where an albedo begins to count against a pose.
+        # An albedo difference counts against a pose beyond twice the usual one.
         albedo=2 * _NO_CONFLICT * usual.albedo,
     )
 
 
-# From one place no view is so many times deeper than another of the same scene.
+# Maximum ratio of the median depths of two views from nearby viewpoints.
 _RESCALED = 4.0
 
 
 def comparable(depth: float, other: float) -> bool:
-    """Whether two views of such median depths can show the same from near the same place."""
+    """Whether views of these median depths can show the same scene from nearby viewpoints."""
     return 1 / _RESCALED < depth / other < _RESCALED

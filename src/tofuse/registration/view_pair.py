@@ -1,8 +1,8 @@
-"""Two range images that may be far apart: where one is seen from the other, and what is believed.
+"""Registration of two range images with a wide baseline, with a probability of being right.
 
-The pose is followed from the guess. Where both views then agree so well that it is as good as
-certain, that is the answer. Else all poses are searched (`registration.search`), the best one is
-aligned, and judged by what both images saw of it and by its lead over its rivals.
+The views are first aligned from the guess. If their agreement makes that pose practically certain,
+it is returned. Else all poses are searched (`registration.search`); the best one is aligned and
+evaluated by the agreement of both images and by its lead over rival poses.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from tofuse.registration.verification import (
     self_scaled,
 )
 
-# Near a guess few iterations do; else as many as a step of a third of the view needs.
+# Few iterations near a guess; else enough for a step of a third of the view.
 _NEAR = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 _PATIENT = replace(_NEAR, levels=PATIENT)
 _FAR = replace(_NEAR, levels=COARSE)
-# Errors that the search leaves, m and rad, at depths of a metre and more.
+# Residual error of the search, m and rad, at depths of a metre and more.
 _AFTER_SEARCH = 0.03
-# Both ways of an alignment end no further apart: share of the depth, and rad.
+# Maximum inconsistency of forward and backward alignment: relative to the depth, and rad.
 _BOTH_WAYS = 0.03
-# Score that is lost by noise alone when a pose is aligned, and lead that is no evidence.
+# Loss of score by noise when a pose is aligned, and lead that is not significant.
 _GIVEN_UP, _TIE = 0.05, 0.025
-# Rival poses are further apart than this share of the depth, and lengths that are given for rooms
-# shrink with depths below a metre.
+# Minimum distance of rival poses relative to the depth, and depth in m below which tolerances are
+# reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """A pose T_target_source, how it was aligned, and what both views say of it."""
+    """A pose T_target_source with its alignment and agreement."""
 
     T_target_source: Float64
     aligned: Aligned
@@ -67,15 +67,15 @@ class _Pose:
 
     @property
     def evidence(self) -> Evidence:
-        """Without rivals to compare with."""
+        """Evidence without a comparison with rivals."""
         return Evidence.of(self.agreement, degenerate=self.degenerate)
 
     @property
     def is_certain(self) -> bool:
         """Whether it needs no search."""
         found = self.evidence
-        held = not self.degenerate and found.contradiction <= CONTRADICTION
-        return held and found.probability >= CERTAIN
+        agrees = not self.degenerate and found.contradiction <= CONTRADICTION
+        return agrees and found.probability >= CERTAIN
 
 
 def register_pair(
@@ -93,25 +93,26 @@ def register_pair(
 
     Parameters
     ----------
+    source, target
+        Prepared views.
     guess
         (4, 4) T_target_source; the identity unless given.
     usual
-        How views of this camera usually fit, if something is known of it.
+        Fit statistics of this camera, if known.
     options
-        How far and how finely is searched, at a depth of some metres.
+        Range and resolution of the search, at a depth of some metres.
     always_search
-        Whether to search even if the pose that was followed from the guess is as good as certain.
+        Whether to search even if the pose aligned from the guess is practically certain.
     proposals
-        Gives poses (N, 4, 4) beyond the reach of the search, which are tried where what it finds is
-        not believed.
+        Returns poses (N, 4, 4) beyond the reach of the search, evaluated if its result is not
+        believed.
     uncertainty
-        The constants of the covariance; those of views without multipath unless given.
+        Constants of the covariance; those of views without multipath unless given.
 
     Returns
     -------
     Registration or None
-        None where a view has too few surfaces to be searched with, or the depths of the views are
-        of different scale.
+        None if a view has too few planes, or the depths of the views differ in scale.
     """
     if not comparable(source.depth, target.depth):
         return None
@@ -137,10 +138,9 @@ def follow(
     usual: UsualFit | None = None,
     uncertainty: UncertaintyOptions | None = None,
 ) -> Registration | None:
-    """Register two prepared views from a guess (4, 4) alone; None where they don't fit there.
+    """Register two prepared views from a guess (4, 4) without a search; None if they don't fit.
 
-    `usual` is how views of this camera usually fit, if something is known of it; for `uncertainty`
-    see `register_pair`.
+    For `usual` and `uncertainty` see `register_pair`.
     """
     if not comparable(source.depth, target.depth):
         return None
@@ -151,7 +151,7 @@ def follow(
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two views, and how they are compared."""
+    """Two views and the options of their comparison."""
 
     source: PreparedView
     target: PreparedView
@@ -168,7 +168,7 @@ class _Pair:
         options: SearchOptions | None,
         uncertainty: UncertaintyOptions | None,
     ) -> _Pair:
-        """With lengths that suit the depth of the views, and errors that the camera usually has."""
+        """Adapt the options to the depth of the views and the usual errors of the camera."""
         usual = usual or UsualFit()
         # Both searches, so that the margin counts all rivals.
         options = options or SearchOptions(mode="both")
@@ -180,7 +180,7 @@ class _Pair:
         return cls(source, target, usual, options, uncertainty)
 
     def followed(self, guess: Float64) -> _Pose | None:
-        """Align from a guess, first with few iterations; None where the views don't fit there."""
+        """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
         found = self._fitting(guess, _NEAR)
         if found is None or not found.is_certain:
             coarse = self._there(guess, _FAR)
@@ -192,7 +192,7 @@ class _Pair:
         return align(self.source, _at(self.target), guess, options, usual_scale=scale)
 
     def _fitting(self, guess: Float64, options: ProjectiveOptions) -> _Pose | None:
-        """Align both ways; None where they end apart, or don't fit as views usually do."""
+        """Align forwards and backwards; None if inconsistent, or if the fit is unusual."""
         there = self._there(guess, options)
         if not there.converged or not self.usual.assess(there).usual:
             return None
@@ -208,9 +208,9 @@ class _Pair:
     def chosen(
         self, near: _Pose | None, match: Match, prepared: Search, guessed: bool
     ) -> Registration:
-        """Choose among the poses of a search and the one that was followed from the start.
+        """Select between the poses of a search and the pose aligned from the start.
 
-        If that is where somebody guessed it to be, it is preferred.
+        The latter is preferred if `guessed`, that is if the start was given by the caller.
         """
         best = self.settled(match, prepared)
         confirmed = near is not None and not near.degenerate and self.same(near, best)
@@ -222,9 +222,9 @@ class _Pair:
         return replace(self.registration(best, evidence, rival), confirmed=confirmed)
 
     def settled(self, match: Match, prepared: Search) -> _Pose:
-        """Align the best pose of a search, unless the views agree clearly less with that."""
-        slack = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
-        options = replace(_PATIENT, prior_m=slack, prior_rad=_AFTER_SEARCH)
+        """Align the best pose of a search, unless its agreement decreases significantly."""
+        error_m = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
+        options = replace(_PATIENT, prior_m=error_m, prior_rad=_AFTER_SEARCH)
         aligned = self._there(match.T_target_source, options)
         said = prepared.compared.at(aligned.T_world_source)
         if said.score >= match.score - _GIVEN_UP:
@@ -232,10 +232,10 @@ class _Pair:
         return _Pose(match.T_target_source, aligned, options, match.agreement)
 
     def nearer(self, near: _Pose, best: _Pose, prepared: Search) -> _Pose:
-        """Of the pose that was followed from the guess and the best one, the one to take.
+        """Select between the pose aligned from the guess and the best one.
 
-        A lead that is no evidence does not outweigh the guess, and neither does one along
-        directions that are degenerate for both: there the pose with the largest overlap leads.
+        An insignificant lead does not outweigh the guess, and neither does one along directions
+        that are degenerate for both: there the pose with the largest overlap leads.
         """
         said = prepared.compared.at(near.T_target_source)
         near = replace(near, agreement=said)
@@ -248,11 +248,11 @@ class _Pair:
         return near if near.degenerate and best.degenerate and same else best
 
     def same(self, a: _Pose, b: _Pose) -> bool:
-        """Whether two poses are one answer."""
+        """Whether two poses are the same hypothesis."""
         return not self.options.differ(a.T_target_source, b.T_target_source)
 
     def rival(self, pose: _Pose, match: Match) -> Candidate | None:
-        """The best pose of a search that is not this one."""
+        """Return the best candidate of a search that is distinct from `pose`."""
         T, differ = pose.T_target_source, self.options.differ
         others = (c for c in match.candidates if differ(T, c.T_target_source))
         return next(others, None)
@@ -260,7 +260,7 @@ class _Pair:
     def registration(
         self, pose: _Pose, evidence: Evidence, rival: Candidate | None
     ) -> Registration:
-        """What is told of a pose."""
+        """Return a pose as a registration."""
         reason = evidence.objection()
         found = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
         return replace(
@@ -277,11 +277,11 @@ class _Pair:
         )
 
     def _covariance(self, pose: _Pose) -> Float64:
-        # Where the search left it bounds no direction that the views don't hold.
+        # The search result constrains no degenerate direction.
         loose = replace(pose.options, prior_m=_NEAR.prior_m, prior_rad=_NEAR.prior_rad)
         C = covariance(self.source, _at(self.target), pose.aligned, loose, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
-            # It is known as well as the search leaves it.
+            # Not aligned: add the residual error of the search.
             o = pose.options
             C = C + np.diag(np.array([o.prior_m] * 3 + [o.prior_rad] * 3) ** 2)
         return C

@@ -1,7 +1,7 @@
-"""The viewpoint of a cloud: whether it is the origin, and the image seen from there.
+"""Detection of a cloud's viewpoint at its origin, and the range image seen from there.
 
-From a sensor's position each direction shows one surface, and the points are spaced more evenly in
-direction than over the surfaces. A cloud with a known viewpoint also shows free space, and can be
+From the sensor's position each direction has a single range, and the points are spaced more evenly
+in direction than over the surfaces. A cloud with a known viewpoint defines free space, and can be
 compared like an image.
 """
 
@@ -18,44 +18,44 @@ from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 
-# Points that are looked at, and neighbours whose distance shows how dense points are.
+# Maximum number of points, of samples among them, and of neighbours for the local density.
 _LOOKED_AT, _SAMPLE, _NEIGHBOURS = 50_000, 2000, 8
-# Spread of the logarithm of that distance, as a standard deviation: points of an image that are
-# chosen at random have about 0.2, those of a scanner's grid with its poles 0.3. Surfaces that are
-# seen from elsewhere mostly have more; this share of the spread along the surfaces is the most.
+# Maximum standard deviation of the log distance to the last neighbour in direction, for images and
+# for spheres: random pixels of an image have about 0.2, a scanner's grid with its poles 0.3, other
+# viewpoints mostly more. The last number limits it relative to the spread over the surfaces.
 _EVEN_IMAGE, _EVEN_SPHERE, _MORE_EVEN = 0.25, 0.35, 0.55
-# Length of the mean direction of what surrounds the viewpoint.
+# Maximum length of the mean direction of points all around the viewpoint.
 _ALL_AROUND = 0.5
-# Neighbours in direction that differ by this share of the range are on different surfaces, and the
-# share of points where that may be: outlines.
+# Relative range difference of neighbours in direction on different surfaces, and maximum fraction
+# of such points: outlines.
 _JUMP, _OUTLINES = 0.1, 0.12
 _QUARTILES = 1.349  # of a normal distribution, in standard deviations
-# Half the angle of a cone that an image can show, rad, and the share of points outside at most.
+# Half the maximum field of view of an image, rad, and maximum fraction of the points outside.
 _WIDEST, _OUTSIDE = 0.9, 0.01
-# Pixels of an image made of a cloud, in spacings of the points, and along a side at most.
-_PIXEL, _MOST_PIXELS = 1.25, 640
-# Points of one pixel that differ by less than this share are on the same surface; slopes are
-# measured between pixels so many steps to either side, in so many rounds.
+# Pixel size of a cloud's image in spacings of the points, and maximum pixels along a side.
+_PIXEL, _MAX_PIXELS = 1.25, 640
+# Relative depth difference of points on the same surface; half the baseline in pixels of the
+# slopes, and number of their iterations.
 _SAME, _BESIDE, _ROUNDS = 0.03, 2, 3
-# Cells of a sphere in spacings of the points, and at least, rad.
+# Cell size of a range sphere in spacings of the points, and its minimum, rad.
 _CELL, _FINEST = 2.0, 0.006
 _AROUND = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """That a view was seen from its origin, with a spacing of directions in rad."""
+    """Sensor position `origin` (3,) in m, and the angular spacing of the points in rad."""
 
     origin: Float64
     spacing: float
 
 
-# A view is registered to several others, as an image and as a cloud.
+# Cache: a view is registered to several others, as an image and as a cloud.
 _known: WeakKeyDictionary[Frame, Viewpoint | None] = WeakKeyDictionary()
 
 
 def viewpoint_of(view: Frame) -> Viewpoint | None:
-    """Return where a view was seen from, None where nothing shows that it was its origin."""
+    """Return the viewpoint of a view; None for a cloud not seen from its origin."""
     if isinstance(view, RangeFrame):
         return Viewpoint(np.zeros(3), _angle_of_pixel(view.camera))
     if view not in _known:
@@ -64,7 +64,7 @@ def viewpoint_of(view: Frame) -> Viewpoint | None:
 
 
 def _found(view: CloudFrame) -> Viewpoint | None:
-    """The viewpoint of a cloud, from how its points are spread."""
+    """Detect the viewpoint of a cloud from the distribution of its points."""
     origin = np.asarray(view.origin, np.float64)
     points = view.points[:: max(1, len(view) // _LOOKED_AT)].astype(np.float64) - origin
     ranges = np.linalg.norm(points, axis=1)
@@ -83,21 +83,21 @@ def _found(view: CloudFrame) -> Viewpoint | None:
     most = _EVEN_SPHERE if around else _EVEN_IMAGE
     if jumps.mean() > _OUTLINES or even > min(most, _MORE_EVEN * over):
         return None
-    # So many points share the circle around one; all points of the view are closer together.
+    # Spacing from the neighbours' density, corrected for the subsampling of the view.
     thinned = np.sqrt(len(points) / max(len(view), 1))
     spacing = float(np.median(apart)) * np.sqrt(np.pi / _NEIGHBOURS) * thinned
     return Viewpoint(origin, spacing) if spacing > 0 else None
 
 
 def _angle_of_pixel(camera: Camera) -> float:
-    """In rad, in the middle of the image."""
+    """Return the angle between pixels at the image centre, rad."""
     steps = np.abs(np.diff(camera.rays()[camera.height // 2, :, 0]))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     return float(np.median(steps)) if len(steps) else _FINEST
 
 
 def _spread(distances: Float64) -> float:
-    """Robust standard deviation of the logarithm; inf where half of them are 0."""
+    """Return the robust standard deviation of log distances; inf if the lower quartile is 0."""
     if not np.percentile(distances, 25) > 0:
         return np.inf
     low, high = np.log(np.percentile(distances, [25, 75]))
@@ -106,10 +106,10 @@ def _spread(distances: Float64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RangeSphere:
-    """The nearest range in m of each direction around a viewpoint, NaN where nothing was seen.
+    """Nearest range in m per direction around a viewpoint, NaN in unobserved directions.
 
-    Rows are elevations about the y axis, columns azimuths. Poles lie where cells are smaller than
-    the spacing of the points, so that some of them are empty: these say nothing.
+    Rows are elevations about the y axis, columns azimuths. Near the poles cells are smaller than
+    the spacing of the points, so that some of them are empty.
     """
 
     origin: Float64
@@ -118,7 +118,7 @@ class RangeSphere:
 
     @classmethod
     def of(cls, view: Frame, viewpoint: Viewpoint) -> RangeSphere:
-        """Take the nearest range in each cell and those beside it."""
+        """Take the nearest range in each cell and its neighbours."""
         cell = max(_CELL * viewpoint.spacing, _FINEST)
         shape = int(np.ceil(np.pi / cell)), int(np.ceil(2 * np.pi / cell))
         points = view.points.astype(np.float64) - viewpoint.origin
@@ -131,9 +131,10 @@ class RangeSphere:
         return cls(viewpoint.origin, cell, np.where(np.isfinite(nearest), least, np.nan))
 
     def before(self, points: Float64) -> Float64:
-        """(n,) how far in m points (n, 3) lie in front of what was seen; NaN in unseen directions.
+        """Return the distance (n,) in m of points (n, 3) in front of the observed range.
 
-        Relative to the nearest surface of the cell and of those beside it.
+        Relative to the nearest surface of the cell and its neighbours; NaN in unobserved
+        directions.
         """
         points = points - self.origin
         ranges = np.linalg.norm(points, axis=1)
@@ -152,15 +153,17 @@ def _cells(points: Float64, ranges: Float64, cell: float, shape: tuple[int, ...]
 def as_image(
     view: Frame, viewpoint: Viewpoint, camera: Pinhole | None = None
 ) -> tuple[RangeFrame, Float64] | None:
-    """Return the image that a camera at the viewpoint sees, and its pose T_view_camera (4, 4).
+    """Render a view from its viewpoint; return the image and its pose T_view_camera (4, 4).
 
-    None where the view is wider than an image can be. The axes of the camera are those of the
-    view where it looks along its z axis, as cameras do; else y points down the view's z axis.
+    None if the field of view is too wide for an image. The camera has the axes of the view if that
+    looks along its z axis; else the camera's y axis points down the view's z axis.
 
     Parameters
     ----------
+    view, viewpoint
+        View and its viewpoint; range images are returned unchanged.
     camera
-        One that suits the view unless given; points outside its image are left out.
+        Adapted to the view unless given; points outside its image are left out.
     """
     if isinstance(view, RangeFrame):
         return view, np.eye(4)
@@ -176,7 +179,7 @@ def as_image(
 
 
 def rendered(view: CloudFrame, camera: Pinhole) -> RangeFrame:
-    """Return the image of a cloud in the camera's frame: the nearest surface in each pixel."""
+    """Render a cloud given in the camera's frame: the nearest surface in each pixel."""
     depth, nearest = _rendered(view.points.astype(np.float64), camera)
     color, amplitude, seen = None, None, nearest >= 0
     if view.color is not None:
@@ -192,24 +195,24 @@ def rendered(view: CloudFrame, camera: Pinhole) -> RangeFrame:
         depth,
         color_image=color,
         amplitude_image=amplitude,
-        # Files don't say how it was made of the light that came back.
+        # The relation to the received signal is unknown.
         amplitude_kind="ir",
     )
 
 
 def _camera_of(points: Float64, spacing: float) -> Pinhole | None:
-    """A camera that sees nearly all points (n, 3) of its frame, with pixels that hold them."""
+    """Return a camera that sees nearly all points (n, 3), at their spacing in rad; None if wide."""
     wide = np.arctan2(np.abs(points[:, :2]), points[:, 2:])
     if np.mean(wide.max(1) > _WIDEST) > _OUTSIDE:
         return None
     reach = np.tan(np.minimum(np.percentile(wide, 100 * (1 - _OUTSIDE), axis=0), _WIDEST))
-    pixel = max(_PIXEL * spacing, 2 * float(reach.max()) / _MOST_PIXELS)
+    pixel = max(_PIXEL * spacing, 2 * float(reach.max()) / _MAX_PIXELS)
     width, height = (max(int(2 * r / pixel), 16) for r in reach)
     return Pinhole(width, height, 1 / pixel, 1 / pixel, (width - 1) / 2, (height - 1) / 2)
 
 
 def _axes(points: Float64) -> Float64:
-    """(3, 3) axes of a camera that sees the points: columns x right, y down, z forward."""
+    """Return the axes (3, 3) of a camera facing the points (n, 3): columns right, down, forward."""
     forward = points.mean(0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
     if forward[2] > np.cos(_WIDEST / 2):
@@ -221,7 +224,7 @@ def _axes(points: Float64) -> Float64:
 
 
 def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, Intp]:
-    """(H, W) depth of the nearest surface in each pixel, 0 without, and its nearest point."""
+    """Return depth (H, W) of the nearest surface, 0 if none, and its nearest point, -1 if none."""
     shape = camera.height, camera.width
     at_pixel = camera.project(points)
     pixel = np.round(at_pixel)
@@ -250,10 +253,10 @@ def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, Intp]:
 
 
 def _at_centres(inverse: Float64, u: Float64, v: Float64) -> Float64:
-    """Inverse depth (H, W) at the centres of pixels, of points that are off by (u, v) pixels.
+    """Return inverse depth (H, W) at the pixel centres, for points offset by (u, v) pixels.
 
-    Over a plane it is linear in the image. Its slopes are those between the pixels beside, where
-    these are on the same surface; each round measures them again where the last one left them.
+    Inverse depth of a plane is linear in the image. Slopes are central differences where both
+    neighbours are on the same surface, recomputed in each iteration.
     """
     near = (1 + _SAME) ** (2 * _BESIDE)
     out = inverse
