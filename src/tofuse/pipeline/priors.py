@@ -62,7 +62,7 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
 
 @dataclass
 class _WithOdometry:
-    """A source with other odometry."""
+    """A source with its odometry replaced."""
 
     source: Source
     odometry: Float64 | None

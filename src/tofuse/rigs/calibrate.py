@@ -1,4 +1,4 @@
-"""Calibrating a rig from whatever its cameras recorded."""
+"""Extrinsic calibration of a rig from recordings of any scene."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Motion = Literal["auto", "still", "moving"]
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig as calibrated.
+    """The result of a rig calibration.
 
     Attributes
     ----------
     rig
         The placed cameras; those that could not be placed are in its `unplaced`.
     how
-        "one instant", so many "instants", or "a walk".
+        "one instant", "n instants", or "a walk".
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     rig: Rig
@@ -49,12 +49,25 @@ def calibrate(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Say where the cameras of a rig are, from one recording of each.
+    """Estimate the poses of the cameras of a rig, from one recording of each.
+
+    Parameters
+    ----------
+    recordings
+        One recording for each camera; the first camera defines the frame of the rig.
+    motion
+        Whether the rig moves; "auto" detects it.
+    format
+        Format of the recordings; detected by default.
+    threads
+        Number of threads; None: all cores.
+    progress
+        Receives the stages.
 
     Raises
     ------
     InputError
-        If a recording can't be used, or no camera can be placed against the first one.
+        If a recording can't be used, or no camera can be placed relative to the first one.
     """
     with using_threads(threads), threadpool_limits(1):
         cameras = open_cameras(recordings, format)
@@ -84,12 +97,12 @@ def check(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Calibration, list[Moved]]:
-    """Calibrate a rig anew, from one recording of each camera in the rig's order, and compare.
+    """Recalibrate a rig, from one recording of each camera in the rig's order, and compare.
 
     Raises
     ------
     InputError
-        If a recording can't be used, or there are not as many as cameras.
+        If a recording can't be used, or their number differs from that of the cameras.
     """
     with using_threads(threads), threadpool_limits(1):
         cameras = cameras_of(rig, recordings, format)
@@ -102,12 +115,12 @@ def cameras_of(
     recordings: Sequence[str | Path],
     format: str | None = None,  # noqa: A002
 ) -> list[Camera]:
-    """Open recordings of a rig's cameras, given in its order.
+    """Open the recordings of a rig's cameras, given in the rig's order.
 
     Raises
     ------
     InputError
-        If there are not as many as cameras, or one can't be opened.
+        If their number differs from that of the cameras, or one can't be opened.
     """
     if len(recordings) != len(rig.cameras):
         names = ", ".join(camera.name for camera in rig.cameras)
@@ -129,7 +142,7 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
     Raises
     ------
     InputError
-        If some cameras move and others don't: then they are not fixed to each other.
+        If only some cameras move: then they are not rigidly connected.
     """
     if motion != "auto":
         return motion == "moving"
@@ -188,7 +201,7 @@ def _of_moving(
 
 
 def loosest(camera: RigCamera) -> tuple[float, float]:
-    """Standard deviations of a camera's position in m and its rotation in rad, where largest."""
+    """Return the largest standard deviations of a camera's position, m, and rotation, rad."""
     C = camera.covariance
     both = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))
     position, rotation = both

@@ -43,12 +43,12 @@ _REGION = 0.1
 
 @dataclass(frozen=True)
 class JointOptions:
-    """How the cameras of a rig are refined together.
+    """Options of the joint refinement of a rig's cameras.
 
     Attributes
     ----------
     rounds
-        Coarse and wide to fine.
+        Coarse to fine, with decreasing noise inflation.
     robust, max_angle
         As in `ProjectiveOptions`.
     overlap
@@ -60,7 +60,7 @@ class JointOptions:
     steepness
         As in `registration.uncertainty`.
     convergence
-        Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
+        Iterations stop when no unknown changes by more, in units of 1 cm and 1 degree.
     """
 
     rounds: tuple[Round, ...] = (Round(6, 0.03, 0.0), Round(6, 0.01, 0.0), Round(12, 0.0, 0.0))
@@ -75,7 +75,7 @@ class JointOptions:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera of a rig saw at an instant."""
+    """A view of a rig's camera at an instant."""
 
     camera: int
     instant: int
@@ -84,24 +84,23 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where the cameras are.
+    """Refined poses and depth offsets of the cameras.
 
     Attributes
     ----------
     poses
         (K, 4, 4) T_rig_camera; the first is the identity.
     offsets
-        (K,) by how much each camera's ranges are too short against the first one's, m.
+        (K,) amount by which each camera's ranges are too short relative to the first one's, m.
     covariance
-        (K, 7, 7) of the right perturbation of the pose, and of the offset; that of all cameras
-        together is `whole`.
+        (K, 7, 7) marginal covariances of the right perturbation of the pose, and of the offset.
     whole
-        (7 (K - 1), 7 (K - 1)).
+        (7 (K - 1), 7 (K - 1)) joint covariance of all cameras but the first.
     rms_m
         Robust root mean square distance between surfaces.
     disagreement
-        By pair of cameras (a, b), a < b: median distance between their surfaces in m, and how many
-        pixels were compared.
+        By pair of cameras (a, b), a < b: median distance between their surfaces in m, and number of
+        compared pixels.
     """
 
     poses: Float64
@@ -124,7 +123,7 @@ def refine_together(
     poses
         (K, 4, 4) initial T_rig_camera; the first is fixed.
     options
-        How they are refined.
+        Options of the refinement.
     """
     system = _System(views, poses, options or JointOptions())
     for stage in system.options.rounds:
@@ -137,7 +136,7 @@ def refine_together(
 def disagreements(
     views: Sequence[View], poses: Float64, offsets: Float64 | None = None
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Median distance between the surfaces of each two cameras in m, and the pixels compared."""
+    """Return, by pair of cameras, the median distance of surfaces in m, and compared pixels."""
     system = _System(views, poses, JointOptions())
     if offsets is not None:
         system.offsets = np.asarray(offsets, float)
@@ -147,7 +146,7 @@ def disagreements(
 def disagreements_of(
     views: Sequence[KeptView], camera: Intp, poses: Float64, pairs: Intp
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """As `disagreements`, of pairs (M, 2) of views of any time, whose poses are (N, 4, 4)."""
+    """As `disagreements`, for pairs (M, 2) of views at any time with poses (N, 4, 4)."""
     found: dict[tuple[int, int], list[Float64]] = {}
     for i, j in pairs:
         a, b = sorted((int(camera[i]), int(camera[j])))
@@ -159,7 +158,7 @@ def disagreements_of(
 
 
 def distances_between(target: KeptView, source: KeptView, T_target_source: Float64) -> Float64:
-    """(N,) distances in m between the surfaces of two views, where both see the same."""
+    """Return the (N,) distances in m between the surfaces that both views see."""
     rows = np.empty((len(source.points), kernels.ROW))
     surface, options = target.surface, JointOptions()
     kernels.residuals(
@@ -179,7 +178,7 @@ def distances_between(target: KeptView, source: KeptView, T_target_source: Float
 
 
 class _System:
-    """The unknowns, and the pairs of views that are compared."""
+    """The unknowns, and the compared pairs of views."""
 
     def __init__(self, views: Sequence[View], poses: Float64, options: JointOptions) -> None:
         self.options = options
@@ -196,7 +195,7 @@ class _System:
         self.depth = float(np.median(depths)) if depths else 1.0
 
     def compare(self) -> list[Float64]:
-        """Rows of each pair (target, source) of views: what has a partner, and is near it."""
+        """Return the residual rows of each pair (target, source): near correspondences only."""
         rows: list[Float64] = [np.zeros((0, kernels.ROW))] * len(self.pairs)
         cosine = float(np.cos(self.options.max_angle))
         inverse = se3.inverse(self.poses)
@@ -217,7 +216,7 @@ class _System:
                     cosine,
                     out,
                 )
-                # What is further off than surfaces can be is another surface.
+                # Larger distances are between different surfaces.
                 near = (out[:, kernels.OWN] > 0) & (
                     np.abs(out[:, kernels.RESIDUAL]) < _OTHER_SURFACE * self.depth
                 )
@@ -228,7 +227,7 @@ class _System:
         return rows
 
     def rescale(self, rows: Sequence[Float64]) -> None:
-        """Take the scale of the noise between two cameras from how far their surfaces are apart."""
+        """Estimate the noise scale of each two cameras from the distances of their surfaces."""
         count = len(self.poses)
         ratios: dict[tuple[int, int], list[Float64]] = {}
         for (i, j), row in zip(self.pairs, rows, strict=True):
@@ -242,8 +241,10 @@ class _System:
                     self.scale[a, b] = np.clip(scale, _MIN_SCALE, _MAX_SCALE)
 
     def jacobian(self, k: int, row: Float64) -> tuple[Float64, Float64]:
-        """(N, 14) derivatives by the source's and the target's unknowns, and half the difference
-        of those by the normals of the two."""
+        """Return the (N, 14) derivatives by the source's and the target's unknowns.
+
+        Also half the difference between those with the normals of the two.
+        """
         target, source = (self.views[i].camera for i in self.pairs[k])
         p = row[:, kernels.MOVED : kernels.MOVED + 3]
         m = row[:, kernels.TARGET_NORMAL : kernels.TARGET_NORMAL + 3]
@@ -262,14 +263,14 @@ class _System:
         return both * np.tile(_UNITS, 2), half * np.tile(_UNITS, 2)
 
     def unknowns(self, k: int) -> Intp:
-        """(14,) places of the unknowns of a pair's cameras."""
+        """Return the (14,) indices of the unknowns of a pair's cameras."""
         target, source = (self.views[i].camera for i in self.pairs[k])
         return np.concatenate(
             [_SIZE * source + np.arange(_SIZE), _SIZE * target + np.arange(_SIZE)]
         )
 
-    def step(self, slack: float) -> float:
-        """Make one Gauss-Newton step; returns by how much anything moved."""
+    def step(self, inflation_m: float) -> float:
+        """Make one Gauss-Newton step, and return the largest change, in units."""
         rows = self.compare()
         self.rescale(rows)
         size = _SIZE * len(self.poses)
@@ -278,7 +279,7 @@ class _System:
             if not len(row):
                 continue
             J, _ = self.jacobian(k, row)
-            w, _ = self.weights(k, row, slack)
+            w, _ = self.weights(k, row, inflation_m)
             at = self.unknowns(k)
             H[np.ix_(at, at)] += (J * w[:, None]).T @ J
             g[at] += J.T @ (w * row[:, kernels.RESIDUAL])
@@ -294,10 +295,10 @@ class _System:
         self.offsets[1:] += change[:, 6]
         return float(np.abs(step).max())
 
-    def weights(self, k: int, row: Float64, slack: float) -> tuple[Float64, Float64]:
-        """Weights of Tukey's biweight over the variance, and the slope of its influence."""
+    def weights(self, k: int, row: Float64, inflation_m: float) -> tuple[Float64, Float64]:
+        """Return Tukey's weights over the variance, and the derivative of the influence."""
         target, source = (self.views[i].camera for i in self.pairs[k])
-        variance = row[:, kernels.OWN] * self.scale[target, source] ** 2 + slack**2
+        variance = row[:, kernels.OWN] * self.scale[target, source] ** 2 + inflation_m**2
         e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * self.options.robust**2)
         f = np.maximum(1 - e2, 0)
         return f * f / variance, f * (1 - 5 * e2) / variance
@@ -397,7 +398,7 @@ class _System:
 
 
 def _by_region(where: Float64, rows: Float64, size: float) -> tuple[Float64, Float64]:
-    """Sum rows (N, n) over cubes of space: the cubes (R, 3), and their sums (R, n)."""
+    """Sum rows (N, n) over cubes of space; returns the cubes (R, 3), and their sums (R, n)."""
     cube = np.floor(where / size)
     regions, inverse = np.unique(cube, axis=0, return_inverse=True)
     out = np.zeros((len(regions), rows.shape[1]))
@@ -406,7 +407,7 @@ def _by_region(where: Float64, rows: Float64, size: float) -> tuple[Float64, Flo
 
 
 def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
-    """Return the slope of the gradient, at least a fraction of that without robust weights."""
+    """Return the Hessian, bounded below by a fraction of that without robust weights."""
     values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
     root = vectors / np.sqrt(np.maximum(values, _MAX_SIGMA**-2))
     values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)

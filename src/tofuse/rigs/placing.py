@@ -34,13 +34,13 @@ from tofuse.rigs.joint import JointOptions, View, refine_together
 V = TypeVar("V")
 
 # Numbers of instants that are searched, scored and refined; more of a moving scene are better.
-_SEARCHED, _JUDGED, _SETTLED = 2, 4, 2
+_SEARCHED, _SCORED, _REFINED = 2, 4, 2
 # Proposals of each pair; width of the beam, and number of sets in it that are refined.
 _PROPOSALS, _BEAM, _POLISHED = 24, 12, 6
 # Number of rivals from which the distribution of leads is estimated, and its significance level.
 _RIVALS, _CHANCE = 10, 0.01
-# Cameras around an object are on opposite sides of it, with any yaw; those side by side overlap
-# much, and may be tilted.
+# Cameras around an object are on opposite sides of it, with any yaw; adjacent ones have large
+# overlap, and may be tilted.
 _AROUND = SearchOptions(mode="planar", yaw=float(np.pi), reach=1.8, planar_candidates=40)
 _SIDE_BY_SIDE = SearchOptions(mode="full")
 # Minimum difference of distinct places, as a fraction of the depth.
@@ -51,14 +51,14 @@ _REFINING = JointOptions(offset_sigma_m=1e-4)
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where the cameras are, as far as they can be placed.
+    """Poses of the cameras that can be placed.
 
     Attributes
     ----------
     poses
         T_first_camera (4, 4) by camera; the first one's is the identity.
     probability
-        By camera, that its place is right, 0 to 1; of the others as well, but the first.
+        By camera but the first, placed or not: probability that its pose is correct.
     reasons
         By camera that is not placed: why not.
     """
@@ -69,7 +69,7 @@ class Placement:
 
 
 def place(cameras: Sequence[Sequence[PreparedView | None]]) -> Placement:
-    """Place cameras that stand still against each other.
+    """Estimate the relative poses of static cameras.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def place(cameras: Sequence[Sequence[PreparedView | None]]) -> Placement:
 
 
 @dataclass(frozen=True)
-class _Said:
-    """What the views of two cameras say of a pose: means over instants, see `Agreement`."""
+class _PairAgreement:
+    """Agreement of the views of two cameras at a pose: means over instants, see `Agreement`."""
 
     score: float = 0.0
     support: float = 0.0
@@ -91,7 +91,7 @@ class _Said:
 
 @dataclass(frozen=True, eq=False)
 class _Set:
-    """Places for some cameras, and how well all their pairs agree there."""
+    """Poses T_first_camera of some cameras, and the score of all their pairs."""
 
     poses: dict[int, Float64]
     score: float
@@ -113,14 +113,14 @@ class _Placer:
         )
         self._compared: dict[tuple[int, int], list[Comparison]] = {}
         self._proposals: dict[tuple[int, int], Float64] = {}
-        self._kept = self._settling_views()
+        self._kept = self._views_to_refine()
         for a, b in itertools.combinations(sorted(self._depth), 2):
             self._search(a, b)
 
-    def _settling_views(self) -> list[View]:
+    def _views_to_refine(self) -> list[View]:
         instants = range(max(map(len, self._views), default=0))
         full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
-        some = _evenly(full or list(instants), _SETTLED)
+        some = _evenly(full or list(instants), _REFINED)
         return [
             View(c, m, KeptView.of(view, _POINTS))
             for m in some
@@ -136,7 +136,7 @@ class _Placer:
             if first is not None and second is not None and comparable(first.depth, second.depth)
         ]
         self._compared[a, b] = [
-            Comparison.of(s, t, self._options.agreement) for t, s in _evenly(both, _JUDGED)
+            Comparison.of(s, t, self._options.agreement) for t, s in _evenly(both, _SCORED)
         ]
         found = [self._found(t, s) for t, s in _evenly(both, _SEARCHED)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *found])
@@ -148,7 +148,7 @@ class _Placer:
         self._proposals[a, b] = np.array(kept[:_PROPOSALS]).reshape(-1, 4, 4)
 
     def _found(self, target: PreparedView, source: PreparedView) -> Float64:
-        """Poses T_target_source (N, 4, 4) that a pair of views proposes."""
+        """Return the poses T_target_source (N, 4, 4) that a pair of views proposes."""
         near = register_pair(source, target)
         poses = [] if near is None else [near.T_target_source]
         for options in (self._options, _SIDE_BY_SIDE):
@@ -158,18 +158,18 @@ class _Placer:
                 poses += [candidate.T_target_source for candidate in match.candidates]
         return np.array(poses).reshape(-1, 4, 4)
 
-    def _at(self, a: int, b: int, T_a_b: Float64) -> _Said:
-        """What all instants say of the pose of b in the frame of a."""
+    def _at(self, a: int, b: int, T_a_b: Float64) -> _PairAgreement:
+        """Return the mean agreement over instants at the pose of b in the frame of a."""
         if (a, b) not in self._compared:
             a, b, T_a_b = b, a, se3.inverse(T_a_b)
-        all_said = [compared.at(T_a_b) for compared in self._compared[a, b]]
-        if not all_said:
-            return _Said()
-        rows = [(s.score, s.support, s.overlap, s.violation + s.clash) for s in all_said]
-        return _Said(*(float(mean) for mean in np.mean(rows, axis=0)))
+        agreements = [compared.at(T_a_b) for compared in self._compared[a, b]]
+        if not agreements:
+            return _PairAgreement()
+        rows = [(s.score, s.support, s.overlap, s.violation + s.clash) for s in agreements]
+        return _PairAgreement(*(float(mean) for mean in np.mean(rows, axis=0)))
 
     def _proposed(self, a: int, b: int) -> Float64:
-        """Poses (N, 4, 4) of b in the frame of a."""
+        """Return the proposed poses (N, 4, 4) of b in the frame of a."""
         if a < b:
             return self._proposals[a, b]
         return np.asarray(se3.inverse(self._proposals[b, a]), np.float64)
@@ -236,7 +236,7 @@ class _Placer:
         )
 
     def placement(self) -> Placement:
-        """Search sets of poses, and keep the cameras of the best one that have no other place."""
+        """Search sets of poses, and keep the unambiguous poses of the best one."""
         sets = [_Set({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
         probability: dict[int, float] = {}
         reasons: dict[int, str] = {}
@@ -282,7 +282,7 @@ class _Placer:
     def _belief(
         self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Set]
     ) -> tuple[float, str]:
-        """Return the probability that a camera's place is right, and why it is not believed, if so.
+        """Return the probability that a camera's pose is correct, and why it is rejected, if it is.
 
         Pairs see different surfaces, so that support and lead add up over pairs. The significance
         of a lead follows from the rivals: among wrong places the i-th best leads the next by an

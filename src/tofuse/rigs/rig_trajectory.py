@@ -1,7 +1,7 @@
 """The trajectory of a moving rig: one pose for each instant.
 
-Each camera is tracked separately. The mean of their poses of the rig, weighted by covariances, is
-refined: views of all cameras are compared, and those of one instant move as one body.
+Each camera is tracked separately. The mean of their estimates of the rig's pose, weighted by
+covariances, is refined: views of all cameras are compared, those of one instant as one rigid body.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Apart = dict[tuple[int, int], tuple[float, int]]
 # Spacing of views, as for a single camera, and their points.
 _SPACING = Spacing()
 _POINTS = 1500
-# Variances, m and rad, of a pose without a covariance; and the fraction of them that is added to
-# each pose, as even the first one of a track has an error.
+# Variances, m^2 and rad^2, of a pose without a covariance; and the fraction of them that is added
+# to each pose, as even the first one of a track has an error.
 _UNKNOWN, _AT_LEAST = np.array([0.1**2] * 6), 1e-4
-# Each camera sees the places of all others.
+# More neighbours than for one camera, as each camera sees the places of all others.
 _OPTIONS = RefineOptions(neighbours=16)
 
 
@@ -52,14 +52,14 @@ class RigTrajectory:
     poses
         (N, 4, 4) T_world_rig of the instants; NaN where no camera has a pose.
     T_rig_frame
-        (F, 4, 4) pose of each frame in the rig's frame at its instant: that of its camera, and the
+        (F, 4, 4) pose of each image in the rig's frame at its instant: that of its camera, and the
         motion since, as free-running cameras take images at different times.
     disagreement
         See `MovingRig`.
     measured
         Measurements of pairs of views, by the index of their frames.
     tracked
-        Measurements of the cameras' own trajectories, for instants that were not refined.
+        Measurements from the cameras' own trajectories, for instants that were not refined.
     """
 
     poses: Float64
@@ -82,10 +82,13 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
     _, first, at = np.unique(
         source.instant[recording.indices], return_index=True, return_inverse=True
     )
-    said = [s.at(recording.timestamps) for s in _tracks(cameras, source, progress)]
-    mean = _mean_path([s.some(first) for s in said])
-    # What moves in an instant is not for the worlds of the cameras to say.
-    since = [_Said(se3.inverse(s.poses[first][at]) @ s.poses, s.information) for s in said]
+    rig_estimates = [s.at(recording.timestamps) for s in _tracks(cameras, source, progress)]
+    mean = _mean_path([s.some(first) for s in rig_estimates])
+    # Motion within an instant, independent of the cameras' world frames.
+    since = [
+        _RigEstimate(se3.inverse(s.poses[first][at]) @ s.poses, s.information)
+        for s in rig_estimates
+    ]
     moved = _means(since)
     moved = np.where(np.isfinite(moved[:, :1, :1]), moved, np.eye(4))
     T_rig_frame = moved @ source.T_rig_camera[recording.indices]
@@ -98,25 +101,25 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
     progress.stage("refining the rig")
     found = refined(cameras, recording, mean, T_rig_frame, at)
     used = {index for edge in found.measured for index in (edge.i, edge.j)}
-    more = _of_tracking(source, recording, said, found.poses, at, used)
+    more = _of_tracking(source, recording, rig_estimates, found.poses, at, used)
     return replace(found, tracked=tuple(more))
 
 
 def _of_tracking(
     source: RigSource,
     recording: Recording,
-    said: Sequence[_Said],
+    rig_estimates: Sequence[_RigEstimate],
     poses: Float64,
     instant: Intp,
     used: set[int],
 ) -> list[Measured]:
-    """How sure the pose of the rig is at instants that took no part in the refinement.
+    """Return edges from the first pose to instants that were not refined.
 
-    As sure as all cameras' own trajectories are of it, seen from the first pose.
+    Their information is the sum of that of the cameras' own trajectories.
     """
     known = np.flatnonzero(np.isfinite(poses[instant][:, 0, 0]))
     taken = {int(instant[k]) for k in known if int(recording.indices[k]) in used}
-    information = sum(s.information * np.isfinite(s.poses[:, :1, :1]) for s in said)
+    information = sum(s.information * np.isfinite(s.poses[:, :1, :1]) for s in rig_estimates)
     found = []
     for k in known[1:]:
         here = int(instant[k])
@@ -129,8 +132,8 @@ def _of_tracking(
 
 
 @dataclass(frozen=True, eq=False)
-class _Said:
-    """What a camera says of the rig: poses (N, 4, 4), NaN where nothing, and their information.
+class _RigEstimate:
+    """One camera's estimate of the rig: T_world_rig (N, 4, 4), NaN where unknown, and information.
 
     `information` is (N, 6, 6), of right perturbations.
     """
@@ -138,9 +141,9 @@ class _Said:
     poses: Float64
     information: Float64
 
-    def some(self, rows: Intp) -> _Said:
-        """Only some of it."""
-        return _Said(self.poses[rows], self.information[rows])
+    def some(self, rows: Intp) -> _RigEstimate:
+        """Return only some rows."""
+        return _RigEstimate(self.poses[rows], self.information[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,19 +167,19 @@ class _Tracked:
             ]
             or [unknown]
         )
-        # That of the rig, which the camera is fixed to.
+        # Covariance of the rig's pose, from that of the camera's.
         A = se3.adjoint(stated.T_rig_camera)
         return cls(track, np.linalg.inv(A @ C @ A.T), stated.T_rig_camera)
 
-    def at(self, times: Float64) -> _Said:
+    def at(self, times: Float64) -> _RigEstimate:
         T, known = self.track.at(times)
         T = T @ se3.inverse(self.T_rig_camera)
         near = np.abs(self.track.times[None] - times[:, None]).argmin(1)
-        return _Said(np.where(known[:, None, None], T, np.nan), self.information[near])
+        return _RigEstimate(np.where(known[:, None, None], T, np.nan), self.information[near])
 
 
 def _tracks(cameras: Sequence[Camera], source: RigSource, progress: Progress) -> list[_Tracked]:
-    """The cameras that have a trajectory, each in a world of its own."""
+    """Return the cameras that have a trajectory, each in a world frame of its own."""
     found = []
     for stated, camera in zip(source.rig.cameras, cameras, strict=True):
         progress.stage(f"tracking {camera.name}")
@@ -191,14 +194,14 @@ def _tracks(cameras: Sequence[Camera], source: RigSource, progress: Progress) ->
     return found
 
 
-def _mean_path(said: Sequence[_Said]) -> Float64:
-    """(N, 4, 4) T_world_rig, the mean of what the cameras say, in the world of the first one."""
-    first, stacked = said[0], [said[0]]
-    for other in said[1:]:
+def _mean_path(rig_estimates: Sequence[_RigEstimate]) -> Float64:
+    """Return (N, 4, 4) T_world_rig, the mean of the estimates in the first one's world frame."""
+    first, stacked = rig_estimates[0], [rig_estimates[0]]
+    for other in rig_estimates[1:]:
         both = np.isfinite(first.poses[:, 0, 0]) & np.isfinite(other.poses[:, 0, 0])
         if both.any():
-            T = _middle(first.poses[both] @ se3.inverse(other.poses[both]))
-            stacked.append(_Said(T @ other.poses, other.information))
+            T = _median_pose(first.poses[both] @ se3.inverse(other.poses[both]))
+            stacked.append(_RigEstimate(T @ other.poses, other.information))
     mean = _means(stacked)
     rows = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
     return np.asarray(se3.inverse(mean[rows[0]]) @ mean, np.float64) if len(rows) else mean
@@ -211,9 +214,9 @@ def refined(
     T_rig_frame: Float64,
     instant: Intp,
 ) -> RigTrajectory:
-    """Refine poses (N, 4, 4) of the instants with views of all cameras.
+    """Refine T_world_rig poses (N, 4, 4) of the instants with views of all cameras.
 
-    Only if the views then support each other at least as well. `instant` is that of each frame.
+    They stay unchanged if the support of the views would fall. `instant` (F,) is by frame.
     """
     source = recording.source
     assert isinstance(source, RigSource)
@@ -247,7 +250,7 @@ def refined(
 
 
 def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp) -> Intp:
-    """Instants spaced by the motion of the rig, of no more views than are refined together."""
+    """Return instants spaced by the motion of the rig, with at most as many views as refined."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     frame = _image(recording, int(np.flatnonzero(instant == known[0])[0]))
     depth = 1.0
@@ -268,7 +271,7 @@ def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, ins
 
 
 def _image(recording: Recording, k: int) -> RangeFrame | None:
-    """Image `k` of the recording; None if it can't be read, or is empty."""
+    """Return image `k` of the recording; None if it can't be read, or is empty."""
     try:
         frame = recording[k]
     except UnreadableFrameError:
@@ -276,19 +279,19 @@ def _image(recording: Recording, k: int) -> RangeFrame | None:
     return frame if isinstance(frame, RangeFrame) and len(frame) else None
 
 
-def _middle(poses: Float64) -> Float64:
-    """Mean of poses that are near each other, by medians."""
-    middle = poses[len(poses) // 2]
+def _median_pose(poses: Float64) -> Float64:
+    """Return the component-wise median of nearby poses, in their tangent space."""
+    centre = poses[len(poses) // 2]
     for _ in range(10):
-        middle = middle @ se3.exp(np.median(se3.log(se3.inverse(middle) @ poses), axis=0))
-    return np.asarray(se3.orthonormalise(middle), np.float64)
+        centre = centre @ se3.exp(np.median(se3.log(se3.inverse(centre) @ poses), axis=0))
+    return np.asarray(se3.orthonormalise(centre), np.float64)
 
 
-def _means(said: Sequence[_Said]) -> Float64:
-    """(N, 4, 4) mean over cameras, by what they know; NaN where none says anything."""
-    poses = np.stack([s.poses for s in said])
+def _means(rig_estimates: Sequence[_RigEstimate]) -> Float64:
+    """Return the (N, 4, 4) information-weighted mean over cameras; NaN where all are unknown."""
+    poses = np.stack([s.poses for s in rig_estimates])
     known = np.isfinite(poses[..., 0, 0])
-    information = np.stack([s.information for s in said]) * known[..., None, None]
+    information = np.stack([s.information for s in rig_estimates]) * known[..., None, None]
     rows = np.flatnonzero(known.any(0))
     at = poses[known.argmax(0)[rows], rows]
     away = se3.log(se3.inverse(at) @ np.where(known[:, rows, None, None], poses[:, rows], at))

@@ -1,4 +1,4 @@
-"""One model, and one pose for each instant, from all cameras of a rig."""
+"""Reconstruction with a rig: one model, and one rig pose for each instant."""
 
 from __future__ import annotations
 
@@ -38,29 +38,29 @@ from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import View, disagreements, refine_together
 from tofuse.rigs.rig_trajectory import track_rig
 
-# No place is looked for again: poses of the rig are final.
+# No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
 TRAJECTORY = "rig_trajectory.txt"
-# What the images of a single camera, one after the other, would say.
+# Reason codes that concern only the tracking of a single camera.
 _OF_TRACKING = frozenset({"jumped", "weak_registration", "not_converged", "repeated_images"})
-# No camera is known better than this: variances in m and rad, 0.1 mm and 0.005 degrees.
+# Minimum variances of a camera's pose, m^2 and rad^2: 0.1 mm and 0.005 degrees.
 _AT_LEAST = np.array([1e-4**2] * 3 + [np.radians(0.005) ** 2] * 3)
-# Of a view that tells whether its camera is where the rig says.
+# Number of points of a view when the calibration is checked.
 _POINTS = 6000
 
 
 @dataclass(frozen=True, eq=False)
 class RigResult:
-    """What a rig recorded.
+    """Reconstruction of a rig's recordings.
 
     Attributes
     ----------
     result
-        The model of all cameras; its frames are instant by instant, camera by camera.
+        The model of all cameras; its frames are ordered by instant, then by camera.
     times, poses
-        (N,) of the instants, and (N, 4, 4) T_world_rig; NaN where no camera has a pose.
+        (N,) times of the instants in s, and (N, 4, 4) T_world_rig; NaN where no camera has a pose.
     rig
-        The rig, with how far surfaces of its cameras are apart in these images.
+        The rig, with the distances between the surfaces of its cameras in these images.
     """
 
     result: Reconstruction
@@ -77,12 +77,14 @@ def run_rig(
     motion: Motion = "auto",
     progress: Progress | None = None,
 ) -> RigResult:
-    """Reconstruct what the cameras of a rig recorded, and write the output folder.
+    """Reconstruct the recordings of a rig's cameras, and write the output folder.
 
     Raises
     ------
-    InputError, OutputError
-        If nothing could be written.
+    InputError
+        If the rig or a recording can't be used.
+    OutputError
+        If the result can't be written.
     """
     progress = progress or Silent()
     rig = read_rig(rig_file)
@@ -104,7 +106,7 @@ def run_rig(
 
 
 def _selected(whole: Recording, source: RigSource, options: Options) -> Recording:
-    """The instants that the options select."""
+    """Return the recording of the instants that the options select."""
     count = int(source.instant[-1]) + 1
     chosen = np.arange(count)[slice(options.start, options.end, options.every)]
     if not len(chosen):
@@ -126,12 +128,18 @@ def reconstruct_rig(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> RigResult:
-    """Give each instant a pose, and fuse the images of all cameras.
+    """Estimate a rig pose for each instant, and fuse the images of all cameras.
 
     Parameters
     ----------
+    rig, cameras
+        The calibrated rig, and its opened cameras in the same order.
     recording
         Of a `RigSource`.
+    config, seed
+        As in `reconstruct`.
+    motion
+        Whether the rig moves; "auto" detects it.
     """
     progress = progress or Silent()
     source = recording.source
@@ -184,10 +192,10 @@ def _fixed(
     *,
     follow: bool,
 ) -> list[Measured]:
-    """How sure the rig is where the frames of an instant are against that of its first camera.
+    """Return the edges of an instant's frames to that of the first camera, with their covariance.
 
-    Where a camera is wrong it is so at all instants: if the rig stands still, later frames `follow`
-    the first ones of their cameras.
+    Calibration errors are equal at all instants: if the rig is static (`follow`), later frames are
+    tied to the first ones of their cameras.
     """
     covariances = [camera.covariance + np.diag(_AT_LEAST) for camera in rig.cameras]
     covariances[0] = np.diag(_AT_LEAST)
@@ -211,7 +219,7 @@ def _fixed(
 
 
 def _as_rig(result: Reconstruction) -> Reconstruction:
-    """The result without what is only said of a single camera that is tracked."""
+    """Return the result without diagnostics that concern only single-camera tracking."""
     d = result.diagnostics
     reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
     d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
@@ -221,9 +229,9 @@ def _as_rig(result: Reconstruction) -> Reconstruction:
 def _checked(
     rig: Rig, cameras: Sequence[Camera], recording: Recording
 ) -> tuple[list[Moved], dict[tuple[int, int], tuple[float, int]]]:
-    """Cameras that are not where the rig says, as far as their views can be aligned from there.
+    """Return the cameras that differ from the calibration, by aligning their views from there.
 
-    Also how far surfaces of each two are apart where the rig says that they are, see `Placed`.
+    Also the distances between the surfaces of each two at the calibrated poses, see `Placed`.
     """
     source = recording.source
     assert isinstance(source, RigSource)
@@ -245,15 +253,15 @@ def _checked(
 
 
 def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
-    """The result with what the images say against the rig."""
+    """Return the result with a reason for the cameras that differ from the calibration."""
     if not knocked:
         return result
     d = result.diagnostics
-    said = ", ".join(
+    changes = ", ".join(
         f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
         for m in knocked
     )
-    text = f"Cameras are not where the rig says: {said}."
+    text = f"Cameras are not where the rig says: {changes}."
     everything = ((d.frames[0].index, d.frames[-1].index),)
     reasons = ranked((*d.reasons, Reason("rig_changed", everything, text)))
     verdict = verdict_of(reasons)

@@ -1,7 +1,7 @@
-"""Cameras that stand still: which of their images belong to one instant, and where the cameras are.
+"""Calibration of static cameras: synchronisation of their images, and poses.
 
-Where nothing moves, all images of a camera become one with less noise. Where something does, each
-instant shows it from all sides at once, and all instants count together.
+In a static scene the images of each camera are averaged. In a dynamic scene each instant shows the
+moving objects from all sides at once, and all instants are used jointly.
 """
 
 from __future__ import annotations
@@ -26,40 +26,40 @@ from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import Placed, View, distances_between, refine_together
 from tofuse.rigs.placing import Placement, place
 
-# Frames that tell whether a camera stands still, and the share of its pixels that then do, in so
-# many of them.
-_LOOKED_AT, _STILL_PIXELS, _STILL_FRAMES = 12, 0.5, 0.75
-# Instants of a moving scene, and images that are averaged of a still one.
+# A camera is static if this fraction of its pixels see the same surface in this fraction of the
+# sampled frames.
+_SAMPLED, _STILL_PIXELS, _STILL_FRAMES = 12, 0.5, 0.75
+# Maximum number of instants of a dynamic scene, and of averaged images of a static one.
 _INSTANTS, _AVERAGED = 60, 48
-# Points of a view: all instants together have about so many.
-_POINTS, _LEAST_POINTS, _ALL_POINTS = 6000, 1500, 60_000
-# Images of an instant are no further apart than this share of the time between images.
+# Maximum and minimum number of points of a view, and target number over all instants.
+_POINTS, _MIN_POINTS, _ALL_POINTS = 6000, 1500, 60_000
+# Maximum time between images of an instant, as a fraction of the frame interval.
 _SAME_INSTANT = 0.6
 # Standard deviation of a clock, in frames: images are paired to within half of one.
 _CLOCK = 0.3
-# Lags that are tried to either side, in images; instants at which; and the distance, as a share of
-# the depth, beyond which surfaces are different ones.
-_LAGS, _ASKED, _FAR = 6, 10, 0.03
+# Maximum lag to either side, in images; number of instants at which lags are compared; and the
+# truncation of distances, as a fraction of the depth.
+_LAGS, _COMPARED, _FAR = 6, 10, 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class StillRig:
-    """What cameras that stand still tell of each other.
+    """The calibration of static cameras.
 
     Attributes
     ----------
     placement
         Which cameras could be placed.
     placed
-        The refined poses of those, in the order of `cameras`.
+        Their refined poses, in the order of `cameras`.
     cameras
         (M,) the placed cameras, ascending.
     time_offsets
         (K,) of all cameras, s.
     instants
-        How many there were.
+        Number of instants.
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     placement: Placement
@@ -72,7 +72,7 @@ class StillRig:
 
 def stands_still(camera: Camera) -> bool:
     """Whether a camera does not move: most pixels see the same surface repeatedly."""
-    frames = camera.images(_LOOKED_AT)
+    frames = camera.images(_SAMPLED)
     if len(frames) < 3:
         model = noise_model_for(camera.recording)
         return len(frames) < 2 or change_between(frames[0], frames[1], model).still
@@ -135,7 +135,7 @@ def _with_clock_errors(
 def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]) -> list[View]:
     """Return the views of the placed cameras, numbered in their order."""
     count = max((len(row) for row in instants), default=1)
-    points = int(np.clip(_ALL_POINTS / count, _LEAST_POINTS, _POINTS))
+    points = int(np.clip(_ALL_POINTS / count, _MIN_POINTS, _POINTS))
     return [
         View(k, m, KeptView.of(view, points))
         for k, c in enumerate(order)
@@ -151,15 +151,14 @@ def _finer_offsets(
     offsets: Float64,
     notes: list[str],
 ) -> Float64:
-    """Time offsets (K,) with which what moves is at the same place for all placed cameras.
+    """Return time offsets (K,) at which moving surfaces of all placed cameras coincide.
 
-    Camera by camera, its images are compared with those of the first one and of those before it at
-    several lags, a frame apart; the distance between surfaces is least where the lag is right, and
-    grows with its square nearby.
+    The images of each camera are compared with those of the cameras before it at several lags, a
+    frame apart; the distance between surfaces is minimal at the correct lag, and quadratic nearby.
     """
     out = offsets.copy()
     at = _common_times(cameras, offsets)
-    at = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _ASKED)).round().astype(int))]
+    at = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _COMPARED)).round().astype(int))]
     known = {0: [_kept(v) for v in _at_times(cameras[order[0]], out[order[0]], at)]}
     for k, c in enumerate(order):
         if k == 0:
@@ -187,9 +186,9 @@ def _finer_offsets(
                         found.append(np.minimum(far, _FAR * target.surface.depth))
                         apart.append(float(times[row] + out[c] - t))
             every = np.concatenate([np.zeros(0), *found])
-            costs.append(float(every.mean()) if len(every) >= _LEAST_POINTS else np.nan)
+            costs.append(float(every.mean()) if len(every) >= _MIN_POINTS else np.nan)
             lags.append(float(np.mean(apart)) if apart else np.nan)
-        lag = _least(np.array(lags), np.array(costs))
+        lag = _minimum(np.array(lags), np.array(costs))
         if lag is None:
             notes.append(f"{cameras[c].name}: what moves does not tell its clock")
         elif abs(lag) > 0.02 * interval:
@@ -199,10 +198,10 @@ def _finer_offsets(
 
 
 def _kept(surface: PreparedView | None) -> KeptView | None:
-    return None if surface is None else KeptView.of(surface, _LEAST_POINTS)
+    return None if surface is None else KeptView.of(surface, _MIN_POINTS)
 
 
-def _least(lags: Float64, costs: Float64) -> float | None:
+def _minimum(lags: Float64, costs: Float64) -> float | None:
     """Return the interpolated minimum of costs; None at an end, or if it is not distinct."""
     good = np.isfinite(costs)
     if good.sum() < 5:
@@ -228,7 +227,7 @@ def _instants(
 ) -> tuple[Float64, list[list[PreparedView | None]]]:
     """Return time offsets (K,), and the views of all instants by camera."""
     offsets = np.zeros(len(cameras))
-    sampled = [camera.images(_LOOKED_AT) for camera in cameras]
+    sampled = [camera.images(_SAMPLED) for camera in cameras]
     if all(len(frames) == 1 for frames in sampled) or not any(map(_something_moves, cameras)):
         averaged = [[camera.surface(_average(camera))] for camera in cameras]
         return offsets, [list(row) for row in averaged]
@@ -252,7 +251,7 @@ def _at_times(camera: Camera, offset: float, at: Float64) -> list[PreparedView |
 
 def _something_moves(camera: Camera) -> bool:
     """Whether the scene changes by more than noise."""
-    frames = camera.images(_LOOKED_AT)
+    frames = camera.images(_SAMPLED)
     model = noise_model_for(camera.recording)
     return any(not change_between(frames[0], f, model).still for f in frames[1:])
 
@@ -265,7 +264,7 @@ def _average(camera: Camera) -> RangeFrame:
 
 
 def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
-    """Return the times of the instants: frames of the first camera that all others have too."""
+    """Return the times of the instants: those of the first camera that all recordings cover."""
     begin = max(c.recording.timestamps[0] + o for c, o in zip(cameras, offsets, strict=True))
     end = min(c.recording.timestamps[-1] + o for c, o in zip(cameras, offsets, strict=True))
     times = cameras[0].recording.timestamps
@@ -278,15 +277,15 @@ def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
 
 
 def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
-    """What to add to each camera's timestamps, to begin with.
+    """Return the initial (K,) offset to add to each camera's timestamps, s.
 
-    Timestamps that overlap are believed as far as that; others are compared by when how much of
-    each view changes.
+    It is 0 if the timestamps overlap; otherwise the fractions of pixels that change over time are
+    correlated.
 
     Raises
     ------
     InputError
-        If neither tells.
+        If the offset can't be determined.
     """
     offsets = np.zeros(len(cameras))
     first = cameras[0].recording.timestamps
@@ -315,7 +314,7 @@ def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
 
 def _activity(camera: Camera) -> tuple[Float64, Float64]:
     """Return times (N,) and the fraction of pixels that changed since the frame before."""
-    times, shares = [], []
+    times, fractions = [], []
     before: RangeFrame | None = None
     for frame in camera.every_image():
         if before is not None:
@@ -324,6 +323,6 @@ def _activity(camera: Camera) -> tuple[Float64, Float64]:
             noise = float(np.median(change)) / 0.6745 if len(change) else 0.0
             limit = np.maximum(5 * noise, 0.01 * before.z[both])
             times.append(0.5 * (before.timestamp + frame.timestamp))
-            shares.append(float((change > limit).mean()) if len(change) else 0.0)
+            fractions.append(float((change > limit).mean()) if len(change) else 0.0)
         before = frame
-    return np.array(times), np.array(shares)
+    return np.array(times), np.array(fractions)
