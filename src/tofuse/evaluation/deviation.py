@@ -150,13 +150,13 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
         poses = found.poses
         left = square * float((found.weights**2 * found.chi2).sum())
         square = (_STATED + left) / (_STATED + spare)
-    share = (n - 1) / m
-    counted = (found.weights * share / square)[:, None, None] * information
+    per_pair = (n - 1) / m
+    weighted = (found.weights * per_pair / square)[:, None, None] * information
     return Fit(
-        replace(graph, poses=poses, information=counted),
+        replace(graph, poses=poses, information=weighted),
         float(np.sqrt(square)),
-        share * measured,
-        _STATED + share * spare,
+        per_pair * measured,
+        _STATED + per_pair * spare,
         depth_m,
     )
 
@@ -177,12 +177,12 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
     problem = _Corrections(graph, fit.depth_m)
     chance = float(f_distribution.ppf(_LEVEL, fit.unknowns, fit.spare))
     estimate = problem.smallest(x, _USUAL * fit.unknowns)
-    least = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
+    bound = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
     known = accuracy_of(graph, Shown(), 0.0)
     own = float(np.hypot(known.position_m, fit.depth_m * known.rotation_rad))
     return Deviation(
         problem.norm(estimate),
-        problem.norm(least),
+        problem.norm(bound),
         problem.norm(x) + own,
         problem.norm(x),
         graph.ids,
@@ -246,8 +246,8 @@ def _steps(graph: PoseGraph, poses: Float64) -> Intp:
     """Return consecutive views between which the motion of poses (V, 4, 4) is inconsistent."""
     i, j = graph.edges.T
     row = np.flatnonzero(j == i + 1)
-    share = (len(graph.ids) - 1) / len(graph.edges)
-    squares = _squares(replace(graph, poses=poses))[row] / share
+    per_pair = (len(graph.ids) - 1) / len(graph.edges)
+    squares = _squares(replace(graph, poses=poses))[row] / per_pair
     rare = float(chi_squared.ppf(1 - (1 - _LEVEL) / max(len(row), 1), 6))
     return graph.edges[row[squares > _AT_WORST * rare]]
 

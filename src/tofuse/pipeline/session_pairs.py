@@ -123,7 +123,7 @@ def _pair(
     """Return the links and the overlap of two sessions in one model."""
     seen = model.seen(ours, theirs)
     overlap = np.isfinite(seen.support_of_views())
-    share = seen.support()
+    supporting = seen.support()
     return SessionPair(
         a,
         b,
@@ -132,7 +132,7 @@ def _pair(
         len(model.links(one, other)),
         model.sure(one, other),
         float(min(overlap[: len(ours)].mean(), overlap[len(ours) :].mean())),
-        float(share) if np.isfinite(share) else None,
+        float(supporting) if np.isfinite(supporting) else None,
     )
 
 

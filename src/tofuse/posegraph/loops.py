@@ -94,7 +94,7 @@ class Loops(Protocol):
 
     @property
     def many(self) -> bool:
-        """Whether there are so many views that a second detection is worthwhile."""
+        """Whether there are enough views for a second detection to be worthwhile."""
         return False
 
     def look_again(self, poses: Mapping[int, Float64]) -> bool:

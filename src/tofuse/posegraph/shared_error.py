@@ -41,9 +41,9 @@ def patches_of(points: Float32, surface: PreparedView) -> Int64:
     """Return the (N,) patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
     low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))
-    share = (rays - low) / np.maximum(high - low, 1e-9)
-    most = np.array([ACROSS, DOWN])
-    u, v = np.clip((share * most).astype(np.int64), 0, most - 1).T
+    relative = (rays - low) / np.maximum(high - low, 1e-9)
+    shape = np.array([ACROSS, DOWN])
+    u, v = np.clip((relative * shape).astype(np.int64), 0, shape - 1).T
     return np.asarray(v * ACROSS + u, np.int64)
 
 
@@ -107,13 +107,13 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     J *= _UNITS
     taken = per_weight[..., None] * J @ np.linalg.inv(normal) @ np.swapaxes(J, 1, 2)
     left = (np.eye(PATCHES) - taken) * known[:, :, None] * known[:, None, :]
-    share = np.where(known, weight, 0.0)
-    share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
+    normalised = np.where(known, weight, 0.0)
+    normalised /= np.maximum(normalised.sum(1, keepdims=True), 1e-12)
     means = sums[..., patch_kernels.RESIDUAL] * per_weight
     return Disagreement(
-        (share * means**2).sum(1),
-        (share * (left**2 * np.where(known, per_weight, 0.0)[:, None]).sum(2)).sum(1),
-        (share * ((left @ correlation) * left).sum(2)).sum(1),
+        (normalised * means**2).sum(1),
+        (normalised * (left**2 * np.where(known, per_weight, 0.0)[:, None]).sum(2)).sum(1),
+        (normalised * ((left @ correlation) * left).sum(2)).sum(1),
     )
 
 

@@ -217,9 +217,9 @@ class _Placer:
 
     def _refined(self, one: _Set) -> _Set:
         """Refine all cameras of a set jointly, if that improves its score."""
-        moved = self._aligned(one.poses)
-        score = self._score(moved)
-        return _Set(moved, score) if score > one.score else one
+        refined = self._aligned(one.poses)
+        score = self._score(refined)
+        return _Set(refined, score) if score > one.score else one
 
     def _aligned(self, poses: Mapping[int, Float64]) -> dict[int, Float64]:
         """Return the jointly refined poses."""

@@ -250,13 +250,13 @@ def refined(
 
 
 def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp) -> Intp:
-    """Return instants spaced by the motion of the rig, with at most as many views as refined."""
+    """Return instants spaced by the motion of the rig, with no more views than are refined."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     frame = _image(recording, int(np.flatnonzero(instant == known[0])[0]))
     depth = 1.0
     if frame is not None:
         depth = float(np.median(frame.z[frame.valid]))
-    stretch, most = 1.0, max(2, _SPACING.most // len(cameras))
+    stretch, max_instants = 1.0, max(2, _SPACING.most // len(cameras))
     while True:
         chosen = [known[0]]
         for k in known[1:]:
@@ -265,7 +265,7 @@ def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, ins
             far = np.linalg.norm(motion[:3, 3]) >= _SPACING.distance * stretch * depth
             if turned or far:
                 chosen.append(k)
-        if len(chosen) <= most:
+        if len(chosen) <= max_instants:
             return np.array(chosen, np.intp)
         stretch *= 2
 

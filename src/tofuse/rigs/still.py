@@ -125,9 +125,9 @@ def _with_clock_errors(
         interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
         late = list(instants)
         late[c] = _at_times(cameras[c], offsets[c] + interval, at)
-        moved = refine_together(_views(late, order), placed.poses).poses
+        shifted = refine_together(_views(late, order), placed.poses).poses
         for k in range(1, len(order)):
-            xi = _CLOCK * se3.log(se3.inverse(placed.poses[k]) @ moved[k])
+            xi = _CLOCK * se3.log(se3.inverse(placed.poses[k]) @ shifted[k])
             blocks[k, :6, :6] += np.outer(xi, xi)
     return replace(placed, covariance=blocks)
 
