@@ -1,4 +1,4 @@
-"""What two images say of a pose between them: support, and space that one of them saw through."""
+"""Agreement of two range images at a pose: support and free-space violations."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 @dataclass(frozen=True)
 class AgreementOptions:
-    """How two images are compared.
+    """Options of the comparison of two images.
 
     Attributes
     ----------
     points
-        About how many points of each image are moved into the other.
+        Approximate number of points of each image that are projected into the other.
     sigmas, floor_m, floor_share
-        A point supports the pose within so many sigmas of both images, plus metres, plus a share
-        of its depth: errors of the sensor that its noise does not show.
+        Distance tolerance of a supporting point: standard deviations of both images, plus metres,
+        plus a fraction of its depth, for systematic errors of the sensor.
     max_angle
         Largest angle between the normals of surfaces that support each other, rad.
     albedo
-        Difference in log albedo, exposure apart, with which a point on the surface counts neither
-        for nor against the pose; one that differs more than twice as much does not support it.
+        Difference in log albedo, less the exposure, at which a point on the surface counts neither
+        for nor against the pose; beyond twice this value it is a clash.
     violation_weight, clash_weight
-        How many supporting points are outweighed by a point in free space, and at most by one
-        that lies on a surface of another albedo.
+        Weight of a point in free space, and maximum weight of one on a surface of another albedo,
+        relative to a supporting point.
     """
 
     points: int = 2500
@@ -68,27 +68,26 @@ class AgreementOptions:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What both images say of a pose, both ways taken together.
+    """Agreement of two images at a pose, over both directions.
 
     Attributes
     ----------
     overlap
-        Share of the points that land on a surface of the other image.
+        Fraction of the points that project onto a surface of the other image.
     support
-        Share of the points that lie on the other image's surface, and reflect as it does.
+        Fraction of the points on the other image's surface with the same albedo.
     violation
-        Share of the points that lie in front of it: where the other camera saw through.
+        Fraction of the points in front of it, in the other camera's free space.
     clash
-        Share of the points that lie on the surface, but reflect otherwise: no support.
+        Fraction of the points on the surface with another albedo: no support.
     rms_m
-        Distance from the surface of the points that lie on it; inf without any.
+        RMS distance from the surface of the points that lie on it, m; inf without any.
     points
-        How many were compared, of both images.
+        Number of compared points of both images.
     score
-        Points on the surface, each by how alike it reflects: 1 - (difference / `albedo`)^2, and
-        no less than the negative clash weight; less twice the violation. Of poses that geometry
-        can't tell apart the right one makes the albedo agree. Points that are hidden, or out of
-        view, say nothing.
+        Mean over the points of 1 - (albedo difference / `albedo`)^2, at least the negative clash
+        weight, on the surface, and of the negative violation weight in free space. Albedo
+        distinguishes geometrically ambiguous poses. Occluded points and points out of view count 0.
     """
 
     overlap: float
@@ -101,7 +100,7 @@ class Agreement:
 
     @property
     def contradiction(self) -> float:
-        """Violations and clashes, as a share of the points that land on a surface."""
+        """Violations and clashes, as a fraction of the points that project onto a surface."""
         return (self.violation + self.clash) / max(self.overlap, 1e-9)
 
 
@@ -111,10 +110,12 @@ def agreement(
     T_target_source: Float64,
     options: AgreementOptions | None = None,
 ) -> Agreement:
-    """Judge a pose by what both images saw.
+    """Return the agreement of two images at a pose.
 
     Parameters
     ----------
+    source, target
+        Prepared views.
     T_target_source
         (4, 4) maps points of the source into the target.
     """
@@ -123,13 +124,13 @@ def agreement(
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two views, prepared to be judged at many poses.
+    """Two views prepared for evaluation at many poses.
 
     Attributes
     ----------
     ways
-        Points of one view, and the view that they are looked up in with its `nearest_depth`: from
-        the source to the target, and back.
+        Points of one view, the view that they are projected into and its `nearest_depth`: from
+        source to target, and from target to source.
     """
 
     ways: tuple[tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]]
@@ -146,7 +147,7 @@ class Comparison:
         return cls((there, back), options)
 
     def at(self, T_target_source: Float64) -> Agreement:
-        """Judge a pose (4, 4); see `agreement`."""
+        """Return the agreement at a pose (4, 4); see `agreement`."""
         options = self.options
         T = np.ascontiguousarray(T_target_source, np.float64)
         total = np.zeros(kernels.AGREEMENT_SIZE)
@@ -158,7 +159,7 @@ class Comparison:
             pose = np.ascontiguousarray(pose)
             total += _one_way(points, by, nearest, pose, options, differences[-1])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
-        # Exposure is what most of them differ by; the way back sees its negative.
+        # Exposure is the median difference; its sign changes with the direction.
         lighter = np.concatenate([differences[0], -differences[1]])
         lighter = lighter[np.isfinite(lighter)]
         clash, alike = 0, float(on_surface)
@@ -179,9 +180,9 @@ class Comparison:
 
 
 def nearest_depth(view: PreparedView) -> Float32:
-    """(H, W) least z in m among the neighbours of a pixel, 0 where it is invalid itself.
+    """Return the minimum z (H, W) in m over the neighbours of each valid pixel, else 0.
 
-    Pixels without a plane are often at edges, where they mix the depths of both sides.
+    It allows for mixed pixels, which are common among pixels without a plane.
     """
     least = cv2.erode(np.where(view.z > 0, view.z, np.float32(np.inf)), _NEIGHBOURS)
     return np.where(view.z > 0, least, np.float32(0)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The registration that `tofuse.register` makes, as a part of configurations."""
+"""Default method of `tofuse.register`, as a part of configurations."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
 
 FEWEST_POINTS = 10
-# Views as they were recorded, far apart: multipath is in them, and bends each
-# of them otherwise. See docs/uncertainty.md for how these were found.
+# For recorded views with a wide baseline, which multipath distorts individually.
+# docs/uncertainty.md describes the calibration.
 _AS_RECORDED = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
-# Poses that shapes propose, at most, and points of a view whose shapes are described for it.
+# Maximum number of poses proposed by feature matching, and of described points of a view.
 _PROPOSALS, _DESCRIBED = 8, 1500
 
 
 @part("registration", "any-pair")
 @dataclass(frozen=True)
 class AnyPair(Registrar):
-    """Two views that may be far apart: the pose, and whether it is to be believed.
+    """Registration of two views with a wide baseline, with verification of the pose.
 
-    Images, and clouds that were seen from their origin, are registered by what both cameras saw
-    (`registration.view_pair`). Other clouds, those for which that pose is not believed, and images
-    with too little surface for it are registered as clouds (`registration.cloud_pair`).
+    Images, and clouds seen from their origin, are registered as images (`registration.view_pair`).
+    Other clouds, clouds whose image registration is not believed, and images with too few planes
+    are registered as clouds (`registration.cloud_pair`).
 
     Attributes
     ----------
     search
-        Whether poses are searched where the one that the guess leads to is not certain. Else that
-        one is judged by itself.
+        Whether poses are searched if the one aligned from the guess is not certain. Else that one
+        is evaluated without rivals.
     """
 
     search: bool = True
@@ -55,14 +55,14 @@ class AnyPair(Registrar):
     ) -> Registration:
         """See `Registrar.register`; without a guess the identity is tried first.
 
-        Of poses that can't be told apart the one at the guess is taken.
+        Of ambiguous poses the one at the guess is returned.
         """
         for view in (source, target):
             if len(view) < FEWEST_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
-        # Of other clouds the shapes are compared below.
+        # Other clouds are matched by features below.
         proposals = partial(_alike, source, target, rng) if are_images else None
         seen = _registered_as_images(source, target, guess, proposals, search=searches)
         if seen is not None and are_images:
@@ -75,7 +75,7 @@ class AnyPair(Registrar):
 
 
 def _alike(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
-    """Poses (N, 4, 4), under any rotation, that shapes which are alike propose."""
+    """Return the poses (N, 4, 4) proposed by feature matching, under any rotation."""
     try:
         found = Fpfh(points=_DESCRIBED, signed=True).candidates(source, target, rng)
     except RegistrationError:
@@ -91,7 +91,7 @@ def _registered_as_images(
     *,
     search: bool,
 ) -> Registration | None:
-    """Register what both cameras saw; None where a view is no image, or has too little surface.
+    """Register two views as images; None if one is not an image, or has too few planes.
 
     Raises
     ------
@@ -103,8 +103,8 @@ def _registered_as_images(
         return None
     (data, T_source_camera), (model, T_target_camera) = first, second
     T_camera_source, T_camera_target = se3.inverse(T_source_camera), se3.inverse(T_target_camera)
-    # Views of one recording are near each other more often than not: of poses that can't be told
-    # apart the one at the identity is taken, unless something else was guessed.
+    # Views of one recording are mostly close to each other: of ambiguous poses the one at the
+    # identity is returned, unless a guess is given.
     start = T_camera_target @ (np.eye(4) if guess is None else guess) @ T_source_camera
     if not comparable(data.depth, model.depth):
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
@@ -114,7 +114,7 @@ def _registered_as_images(
                 where=f"frame {source.index}",
                 remedy="check the unit of depth",
             )
-        return None  # as clouds, the unit of one of them may be found to be wrong
+        return None  # registration as clouds may detect a wrong unit
     if search:
         found = register_pair(data, model, start, proposals=proposals, uncertainty=_AS_RECORDED)
     else:
@@ -123,7 +123,7 @@ def _registered_as_images(
 
 
 def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
-    """A view as its camera saw it, and T_view_camera (4, 4); None for clouds from no viewpoint."""
+    """Return a view's image and T_view_camera (4, 4); None for clouds without a viewpoint."""
     options = SurfaceOptions()
     if isinstance(view, RangeFrame):
         return prepare_view(view, options), np.eye(4)

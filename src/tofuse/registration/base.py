@@ -11,7 +11,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame
 
-# Of a pose that is more probable than not other evidence may say that it is right.
+# Minimum probability of a pose that other evidence may confirm.
 PROBABLE = 0.5
 
 

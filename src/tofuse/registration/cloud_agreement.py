@@ -1,8 +1,8 @@
-"""How well two clouds agree at a pose: surfaces that coincide, and free space.
+"""Agreement of two clouds at a pose: coincident surfaces and free-space violations.
 
-As `agreement`, for views without a camera. How close surfaces have to lie follows from how rough
-they are at the resolution that they are compared at. Free space is known only for views with a
-known viewpoint.
+As `agreement`, for views without a camera. The distance tolerance follows from the roughness of
+the surfaces at the resolution of the comparison. Free space is known only for views with a known
+viewpoint.
 """
 
 from __future__ import annotations
@@ -22,23 +22,22 @@ from tofuse.registration.viewpoint import RangeSphere, Viewpoint, viewpoint_of
 
 # Points of each plane fit.
 NEIGHBOURS = 12
-# Points of each view that are compared, and that may contradict a pose.
+# Maximum numbers of points of each view that are compared, and tested for free-space violations.
 _COMPARED, _CONTRADICTING = 2500, 5000
-# Cosine of the angle between a line of sight and a surface's normal, below which the surface is
-# grazed.
+# Cosine of the incidence angle below which a surface is at grazing incidence.
 _GRAZED = 0.25
-# Surfaces lie on each other within so many standard deviations of their points, plus a share of the
-# resolution: planes that are fitted to curved surfaces miss them.
+# Surfaces coincide within this many standard deviations of their points, plus a fraction of the
+# resolution for the error of plane fits at curved surfaces.
 _SIGMAS, _BENT = 3.0, 0.25
-# How far a point may be from the nearest one of its surface, in resolutions.
+# Maximum distance of corresponding points, in resolutions.
 _NEAR = 2.0
 # Cosine of the largest angle between normals of surfaces that support each other.
 _ALIKE = 0.75
-# A point is in free space where it lies in front by more than this share of the range, on top of
-# what surfaces may differ by.
+# A point is in free space if it lies in front of the surface by more than this fraction of the
+# range plus the tolerance.
 _IN_FRONT = 0.02
-# How many supporting points one in free space outweighs: most points of a wrong pose lie on some
-# surface, as walls are alike, but hardly one of the right pose lies in free space.
+# Weight of a point in free space relative to a supporting one: at a wrong pose most points lie on
+# some surface, as walls are similar, but at the right pose hardly any lies in free space.
 _VIOLATION_WEIGHT = 20.0
 
 
@@ -51,17 +50,17 @@ class CloudMap:
     view
         The averaged points.
     normals
-        (n, 3) NaN where points lie on no surface.
+        (n, 3) unit normals, NaN where points lie on no surface.
     sigma
         Typical distance of points from their planes, m.
     size
         Resolution, m.
     clear
-        (m, 3) those of its points that may contradict a pose, m. Where a surface ends or is grazed
-        a pixel mixes depths: such points lie in front of surfaces even under the right pose, of a
-        torso 2 % of all points; of the others hardly any does. None without a viewpoint.
+        (m, 3) points that are tested for free-space violations, m; m = 0 without a viewpoint.
+        Mixed pixels at edges and at grazing incidence are excluded, as they violate free space
+        even at the right pose (2 % of the points of a torso).
     viewpoint, sphere
-        Where it was seen from, and how far in each direction; None where that is not known.
+        Viewpoint, and range in each direction; None if unknown.
     """
 
     view: CloudFrame
@@ -85,7 +84,7 @@ class CloudMap:
 
     @property
     def tree(self) -> KdTree:
-        """Over the averaged points."""
+        """k-d tree over the averaged points."""
         return tree_of(self.view)
 
     @cached_property
@@ -97,7 +96,7 @@ class CloudMap:
 
 
 def _clear(view: CloudFrame, shape: Shape, viewpoint: Float64) -> Float64:
-    """Points (m, 3) on surfaces that neither end there nor are grazed from the viewpoint (3,)."""
+    """Return points (m, 3) on surfaces, except at edges and grazing incidence."""
     points = view.points.astype(np.float64)
     rays = points - viewpoint
     facing = np.abs((shape.normals * rays).sum(1)) > _GRAZED * np.linalg.norm(rays, axis=1)
@@ -106,16 +105,16 @@ def _clear(view: CloudFrame, shape: Shape, viewpoint: Float64) -> Float64:
 
 
 def tolerance(source: CloudMap, target: CloudMap) -> float:
-    """Distance in m within which surfaces of two views lie on each other."""
+    """Return the distance in m within which surfaces of two views coincide."""
     noise = float(np.hypot(source.sigma, target.sigma))
     return _SIGMAS * noise + _BENT * max(source.size, target.size)
 
 
 def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Agreement:
-    """Judge a pose (4, 4) by what both views saw.
+    """Return the agreement of both views at a pose (4, 4).
 
     `overlap` counts points that are near a surface or in free space. Without a known viewpoint
-    free space is unknown.
+    there are no violations.
     """
     within = tolerance(source, target)
     ways = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
@@ -135,7 +134,7 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
 def _one_way(
     seen: CloudMap, by: CloudMap, T: Float64, within: float
 ) -> tuple[float, float, float, float]:
-    """Shares of the points near a surface, on one and in free space; mean square distance, m^2."""
+    """Return fractions near a surface, on one, in free space; and mean square distance, m^2."""
     points, normals = seen.compared
     if not len(points):
         return 0.0, 0.0, 0.0, 0.0
@@ -147,7 +146,7 @@ def _one_way(
 
 
 def _in_free_space(seen: CloudMap, by: CloudMap, T: Float64, within: float) -> float:
-    """Share of the clear points that lie where the other view saw through."""
+    """Return the fraction of the clear points in the other view's free space."""
     if by.sphere is None or not len(seen.clear):
         return 0.0
     points = se3.transform(T, seen.clear)
@@ -160,9 +159,9 @@ def _in_free_space(seen: CloudMap, by: CloudMap, T: Float64, within: float) -> f
 def _surface_at(
     view: CloudMap, points: Float64, normals: Float64 | None, size: float
 ) -> tuple[Bool, Float64, Bool]:
-    """Whether points (n, 3) are near a surface, their distance from its plane, and whether alike.
+    """Return whether points (n, 3) are near a surface, and their distance (n,) from its plane.
 
-    Alike is what has normals (n, 3) like those of the surface.
+    The third result is whether their normals (n, 3), if given, agree with those of the surface.
     """
     nearest, _ = view.tree.nearest(points, _NEAR * size)
     near = nearest >= 0

@@ -1,4 +1,4 @@
-"""Registration of two clouds with nothing to set up: from coarse to fine."""
+"""Coarse-to-fine registration of two clouds with automatic parameters."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from tofuse.registration.surface_metrics import PlaneToPlane
 _SPACING_SAMPLE = 5000
 _SMALLEST_LEVEL = 60
 _EXTENT_SHARE = 10
-# Median roughness of surfaces above which normals say little, and of how many points it is taken.
+# Median roughness above which normals are unreliable, and number of points of the estimate.
 _ROUGHEST, _ROUGHNESS_SAMPLE = 0.25, 1500
 _COARSER = 1.5
-# The finest level has at least this many resolutions along the scene.
+# Minimum extent of the scene, in resolutions of the finest level.
 _FINEST = 10
 
 
 @part("registration", "in-turn")
 @dataclass(frozen=True)
 class InTurn(Registrar):
-    """Registrations one after the other, each from where the one before ended.
+    """A sequence of registrations, each starting from the result of the previous one.
 
     Attributes
     ----------
@@ -71,30 +71,30 @@ class InTurn(Registrar):
 @part("registration", "coarse-to-fine", label="validated")
 @dataclass(frozen=True)
 class CoarseToFine(Registrar):
-    """ICP on ever finer versions of both views, each starting from the last.
+    """ICP on a pyramid of both views, from coarse to fine.
 
-    A version has one mean point in each cube with edges of its resolution, which halves from
-    level to level: coarse levels reach far, and average the noise away. Directions that the
-    finest level doesn't hold are put back to where the guess had them.
+    A level is a voxel-grid average, whose resolution halves from level to level: coarse levels
+    have a large basin of convergence and little noise. Degenerate directions of the finest level
+    keep the guess.
 
     Attributes
     ----------
     resolution
-        Of the finest level, m; None: the spacing of 5000 points of each view, more if that leaves
-        more than `points` points, or if the noise makes plane fits as thick as they are wide.
+        Voxel size of the finest level, m. None: the spacing of 5000 points of each view, more if
+        that leaves more than `points` points, or if noise makes plane fits as thick as wide.
     points
-        Of the finest level of either view, at most; only where `resolution` is None.
+        Maximum number of points of the finest level of each view; only if `resolution` is None.
     metric
-        Of every level.
+        Error metric of every level.
     reach
         Largest distance of a pair, in resolutions of the level.
     neighbours
         Points of each plane fit.
     max_iterations
-        Of each level.
+        Maximum number of iterations of each level.
     coarsest
-        Resolution of the coarsest level, m, at most: for guesses that are that good. None: a tenth
-        of the scene.
+        Upper limit of the coarsest level's resolution, m, for accurate guesses. None: a tenth of
+        the scene.
     """
 
     resolution: float | None = None
@@ -165,9 +165,9 @@ class CoarseToFine(Registrar):
         T_start: Float64,
         guess: Float64,
     ) -> Registration:
-        """Register two clouds that were averaged to a resolution in m, from a start (4, 4).
+        """Register two clouds averaged to a resolution in m, from a start (4, 4).
 
-        Directions that they don't constrain stay as they are in the guess (4, 4).
+        Degenerate directions keep the guess (4, 4).
         """
         icp, rng = self._icp(resolution, 1e-3), np.random.default_rng(0)  # nothing is drawn
         return _kept(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
@@ -175,7 +175,7 @@ class CoarseToFine(Registrar):
     def roughly(
         self, resolution: float, data: CloudFrame, model: CloudFrame, T_start: Float64, points: int
     ) -> Float64:
-        """Where about so many points lead to, as `at`, from a start (4, 4): a pose (4, 4).
+        """Register about `points` points as `at` does, less accurately; return the pose (4, 4).
 
         Raises
         ------
@@ -200,14 +200,14 @@ class CoarseToFine(Registrar):
     def finest(
         self, source: Frame, target: Frame, size: float
     ) -> tuple[float, CloudFrame, CloudFrame]:
-        """Average both views to `size` m, or more: until there are few points, with little noise.
+        """Average both views to `size` m, or coarser to limit the number of points and the noise.
 
         Returns
         -------
         The resolution in m, and both averaged views.
         """
         size, data, model = reduced(source, target, size, self.points)
-        # Averaging thins noise, but not what is rough in itself: that keeps its first size.
+        # Averaging reduces noise, but not true roughness, which keeps the first size.
         first = size, data, model
         while max(self._roughness(data), self._roughness(model)) > _ROUGHEST:
             size *= _COARSER
@@ -232,7 +232,7 @@ def _kept(
     guess: Float64,
     rng: np.random.Generator,
 ) -> Registration:
-    """The registration with degenerate directions as they are in the guess."""
+    """Return the registration with degenerate directions fixed to the guess (4, 4)."""
     if len(found.unobservable) == 0:
         return found
     hold = Hold.of(found.unobservable, data.points.astype(np.float64))

@@ -1,11 +1,10 @@
-"""How probable it is that the pose between two views is right.
+"""Probability that the pose between two views is right.
 
-Logistic models of the same few regressors, one fitted to simulated pairs of images
+Logistic models with the same regressors, one fitted to simulated pairs of images
 (``benchmarks/pairs.py fit``), one to clouds (``benchmarks/cloud_pairs.py fit``). Both commands also
-print the calibration on pairs that took no part. The regressors are shares, free of units and of
-the camera's noise, so that they carry over to other cameras. A pose counts as right within 5 % of
-the depth and 4 degrees: what a camera's systematic errors leave at large steps is not another
-place.
+print the calibration on held-out pairs. The regressors are dimensionless fractions, independent of
+the camera's noise, so that they transfer to other cameras. A pose is right within 5 % of the depth
+and 4 degrees, which allows for systematic errors of the camera at large baselines.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.registration.agreement import Agreement
 
-# What counts as right: share of the depth, and rad.
+# Tolerances of a right pose: fraction of the depth, and rad.
 RIGHT_SHARE, RIGHT_RAD = 0.05, float(np.radians(4.0))
-# Of poses that are just believed one in ten is wrong, of all that are believed far fewer.
+# Minimum probability of a believed pose; the mean probability of believed poses is much higher.
 BELIEVED = 0.9
-# Poses that were followed from a guess are believed without a search only if they are as good as
-# certain, as nothing was compared with them.
+# Minimum probability at which a pose aligned from a guess is accepted without a search, as it was
+# not compared with rivals.
 CERTAIN = 0.98
-# Less support, a smaller lead and a larger contradiction than right poses have as a rule.
+# Usual limits of right poses: minimum support, minimum lead and maximum contradiction.
 _LITTLE_SUPPORT, _SMALL_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 
 
@@ -36,29 +35,29 @@ class Model:
     followed: tuple[float, ...]
 
 
-# Of images: 351 poses that were searched, 370 that were followed. On scenes that took no part in
-# the fit the area under the ROC curve is 0.99 and 0.91.
+# Fitted to images: 351 searched poses, 370 poses aligned from a guess. On held-out scenes the area
+# under the ROC curve is 0.99 and 0.91.
 IMAGES = Model(searched=(0.34, 6.17, -6.40, -4.21), followed=(0.55, 7.01, -6.02))
-# Of clouds: 146 poses that were searched. On 226 of other frames and places, some of which share
-# nothing, the area is 0.98; of 90 that were believed 2 were wrong, one by 0.13 m, one a room of
-# the same size where no viewpoint is known.
+# Fitted to clouds: 146 searched poses. On 226 held-out pairs, some without overlap, the area is
+# 0.98; of 90 believed poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
+# known viewpoint.
 CLOUDS = Model(searched=(-1.82, 6.08, -4.78, -0.69), followed=(-2.29, 9.96, -5.5))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for a pose and against it.
+    """Evidence for and against a pose.
 
     Attributes
     ----------
     support, contradiction
-        See `Agreement`. Without free space nothing can contradict a pose.
+        See `Agreement`. Without known free space the contradiction is 0.
     margin
-        Lead over the best other pose, a share of the points; None if no other was looked for.
+        Lead over the best rival, a fraction of the points; None without a search.
     degenerate
         Number of degenerate directions.
     model
-        That of the kind of views.
+        Model of the kind of views.
     """
 
     support: float
@@ -75,16 +74,16 @@ class Evidence:
         degenerate: int = 0,
         model: Model = IMAGES,
     ) -> Evidence:
-        """What both views say of a pose, and its rivals."""
+        """Make the evidence from the agreement of both views."""
         return cls(said.support, said.contradiction, margin, degenerate, model)
 
     @property
     def searched(self) -> Float64:
-        """(4,) regressors of a pose that was compared with others.
+        """Regressors (4,) of a pose that was compared with rivals.
 
-        Roots of the margin and of the contradiction: from 0 to 2 % they tell more than from 20 to
-        40 %. Degenerate directions count the less the more the pose leads: poses along them would
-        fit as well. What supports the pose is in its lead.
+        Square roots of margin and contradiction, as the step from 0 to 2 % is more informative than
+        that from 20 to 40 %. Degenerate directions count less with a larger lead, as poses along
+        them would fit as well. Support enters by the lead.
         """
         lead = max(self.margin or 0.0, 0.0)
         loose = max(1 - lead / _SMALL_LEAD, 0.0) if self.degenerate else 0.0
@@ -92,21 +91,21 @@ class Evidence:
 
     @property
     def followed(self) -> Float64:
-        """(3,) regressors of a pose that was followed from a guess, with nothing to compare.
+        """Regressors (3,) of a pose aligned from a guess, without rivals.
 
-        Not how many directions are degenerate: along these it stays where the guess is.
+        Degenerate directions don't count, as they keep the guess.
         """
         return np.array([1, self.support, np.sqrt(self.contradiction)])
 
     @property
     def probability(self) -> float:
-        """That the pose is right, 0 to 1."""
+        """Probability that the pose is right, 0 to 1."""
         if self.margin is None:
             return logistic(float(self.followed @ self.model.followed))
         return logistic(float(self.searched @ self.model.searched))
 
     def objection(self) -> str:
-        """Why the pose is not believed; empty if it is."""
+        """Return the reason why the pose is not believed; empty if it is."""
         if self.probability >= BELIEVED:
             return ""
         said = []

@@ -1,4 +1,4 @@
-"""The floor in a range image, or what else is horizontal and has nothing below it."""
+"""Detection of the floor in a range image: the lowest horizontal plane."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tofuse.registration.view_points import ViewPoints
 
 @dataclass(frozen=True)
 class FloorOptions:
-    """When a plane is taken for the floor.
+    """Options of floor detection.
 
     Attributes
     ----------
     max_tilt
         Largest angle between its normal and down, rad.
     angle, band_m, band_share
-        How near to the plane a point and its normal must be: rad, m, and share of the depth.
+        Inlier tolerances: angle of the normals in rad, distance in m plus a fraction of the depth.
     min_share
-        Least share of the view's points on it.
+        Minimum fraction of the view's points on it.
     below
-        Largest share of the view's points that may lie below it.
+        Largest fraction of the view's points below it.
     """
 
     max_tilt: float = 0.9
@@ -43,20 +43,20 @@ class FloorOptions:
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """A plane n . p = height with n (3,) pointing down; the share of the view's points on it."""
+    """A plane n . p = height in m, n (3,) pointing down; fraction of the view's points on it."""
 
     normal: Float64
     height: float
     share: float
 
 
-# Points that take part, and of them the planes that are tried.
+# Number of sampled points, and of plane hypotheses.
 _POINTS, _TRIED = 1200, 200
 # Bands below a plane from which on a point counts as below it.
 _BELOW = 3.0
 
 
-# Where down may be in an image of an unknown camera: below, or at a side of one mounted upright.
+# Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
 _DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 _KNOWN_TILT = np.radians(10.0)
 
@@ -70,9 +70,11 @@ def find_floors(
 
     Parameters
     ----------
+    views
+        Prepared views.
     gravity
-        (3,) directions in which things fall in the frames of the two views, where they are known;
-        the planes' normals must then be within 10 degrees of them.
+        (3,) direction of gravity in the frames of the two views, if known; the planes' normals
+        must then be within 10 degrees of it.
     """
     options = FloorOptions() if options is None else options
     if gravity is not None:
@@ -86,7 +88,7 @@ def find_floors(
 
 
 def find_floor(view: PreparedView, down: Float64, options: FloorOptions) -> Floor | None:
-    """Find the largest plane across `down` (3,) that has nothing below it, or None."""
+    """Find the largest plane perpendicular to `down` (3,) without points below it, or None."""
     seen = ViewPoints.of(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)
     if len(p) < 20:
@@ -98,12 +100,12 @@ def find_floor(view: PreparedView, down: Float64, options: FloorOptions) -> Floo
         return None
     tried = facing[:: max(1, len(facing) // _TRIED)]
     band = options.band_m + options.band_share * p[:, 2]
-    # A table is larger than what is seen of the floor, but there is something below it.
+    # A table may be larger than the visible floor, but has points below it.
     cosine, most = float(np.cos(options.angle)), options.below * len(p)
     best = kernels.lowest_plane(p, n, band, tried, cosine, most, _BELOW)
     normal, height = n[best], float(p[best] @ n[best])
     mine = _on(p, n, band, normal, height, cosine)
-    for _ in range(3):  # the mean of what lies on it is better than one pixel
+    for _ in range(3):  # least squares over the inliers
         normal, height = _fit(p[mine], seen.sigma[mine])
         mine = _on(p, n, band, normal, height, cosine)
         if mine.sum() < max(20, options.min_share * len(p)):
@@ -117,7 +119,7 @@ def find_floor(view: PreparedView, down: Float64, options: FloorOptions) -> Floo
 def _on(
     p: Float64, n: Float64, band: Float64, normal: Float64, height: float, cosine: float
 ) -> Bool:
-    """(N,) which points lie on a plane."""
+    """Whether points p (N, 3) with normals n (N, 3) lie on a plane, (N,)."""
     return np.asarray((np.abs(p @ normal - height) < band) & (n @ normal > cosine))
 
 

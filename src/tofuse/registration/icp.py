@@ -1,4 +1,4 @@
-"""The Iterative Closest Point algorithm (Besl and McKay 1992), put together from parts."""
+"""The Iterative Closest Point algorithm (Besl and McKay 1992), composed of exchangeable parts."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Icp(Registrar):
     Attributes
     ----------
     resolution
-        Typical distance between neighbouring points in m (res of the thesis). Distances and the
-        error E are measured by it.
+        Typical distance between neighbouring points in m (res of the thesis): the unit of distances
+        and of the error E.
     source, target
         Choose the points of each view, once for all iterations; the source's are drawn first.
     matcher
@@ -52,12 +52,12 @@ class Icp(Registrar):
     rejectors
         Drop pairs, in this order.
     metric
-        Turns pairs into a motion.
+        Computes the motion from the pairs.
     stopping
         Ends the iterations.
     neighbours
         Points of each plane fit, where a part needs normals, curvature or boundaries that the
-        view doesn't bring.
+        view doesn't have.
     """
 
     resolution: float = 0.01
@@ -92,13 +92,13 @@ class Icp(Registrar):
 
         Number of correspondences, E and rms are those of the last matching, just before the last
         motion. If the iterations run out before the stopping rule is met, the result is the
-        estimate so far with `converged` False. Along the directions of `hold` it doesn't move.
+        estimate so far with `converged` False. The directions of `hold` are fixed.
 
         Raises
         ------
         RegistrationError
             If a view has fewer than three points, or if at some iteration the corresponding
-            points fix no motion (for `PointToPoint`: fewer than three, or on a line).
+            points don't determine a motion (for `PointToPoint`: fewer than three, or collinear).
         """
         data = self._select(self.source, source, rng)
         model = self._select(self.target, target, rng)
@@ -123,8 +123,8 @@ class Icp(Registrar):
             before = moved
             motion = self.metric.motion(matches, alignment)
             T = motion @ T if hold is None else T @ hold.across(se3.inverse(T) @ motion @ T)
-            # Motions are turned from frame to frame by R and R^T: unless these are inverse to each
-            # other, the difference grows with every iteration.
+            # R^T is used as the inverse of R: without this, rounding errors grow with every
+            # iteration.
             T = se3.orthonormalise(T)
             moved = transform_points(T, data.points)
             history.correspondences.append(len(matches))

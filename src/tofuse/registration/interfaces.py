@@ -1,8 +1,8 @@
-"""The parts of an ICP, and what they hand to each other.
+"""Interfaces of the parts of ICP, and the data passed between them.
 
-One iteration goes: the *matcher* pairs points, the *rejectors* drop pairs, the error *metric*
-turns the pairs into a motion, the *stopping* rule looks at the history. Before the first, a
-*selector* chooses the points of each view that take part.
+In each iteration the *matcher* pairs points, the *rejectors* drop pairs, the error *metric*
+computes a motion from the pairs, and the *stopping* rule checks the history. Before the first
+iteration a *selector* chooses the points of each view.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from tofuse.registration.shape import NEIGHBOURS, Shape, normals_at, shape_at
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The points of a view that take part in a registration.
+    """The selected points of a view.
 
     Attributes
     ----------
     view
-        The view; a part that needs normals, sigma or amplitude finds them there.
+        The view, with its normals, sigma and amplitude.
     index
         (n,) positions of the points in ``view.points``.
     points
         (n, 3) m, in the view's frame.
     neighbours
-        Points of the view that each plane fit takes, where normals or curvature are needed.
+        Number of points of each plane fit, if normals or curvature are needed.
     """
 
     view: Frame
@@ -88,16 +88,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where the source lies in the target's frame, at one moment of a registration.
+    """State of a registration at one iteration.
 
     Attributes
     ----------
     source, target
-        The points that take part.
+        The selected points.
     resolution
         Typical distance between neighbouring points in m (res of the thesis).
     T_target_source
-        (4, 4) the estimate so far.
+        (4, 4) current estimate.
     moved
         (n, 3) the source's points in the target's frame, m.
     """
@@ -117,11 +117,11 @@ class Matches:
     ----------
     source, target
         (m,) positions in ``Alignment.source.points`` and ``Alignment.target.points``; `source`
-        rises.
+        ascending.
     distance
         (m,) distance of the points of each pair, m.
     weight
-        (m,) how much each pair counts; None where all count the same.
+        (m,) weights of the pairs; None for equal weights.
     """
 
     source: Int64
@@ -146,7 +146,7 @@ class Matches:
 
 @dataclass
 class History:
-    """What the iterations so far gave, one for each.
+    """Statistics of the iterations so far.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class History:
     errors
         E.
     steps
-        How far the last motion took the source's points, rms, in resolutions.
+        RMS displacement of the source's points by the motion, in resolutions.
     """
 
     correspondences: list[int] = field(default_factory=list)
@@ -167,21 +167,18 @@ class History:
 
 
 class Selector(Protocol):
-    """Chooses the points of a view that take part (section 2.9.2).
-
-    Once for all iterations, unless `each_iteration` says that it wants to choose anew.
-    """
+    """Selects points of a view (section 2.9.2), anew at every iteration if `each_iteration`."""
 
     part_kind: ClassVar[str] = "selector"
     each_iteration: ClassVar[bool] = False
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
-        """Return rising positions (n,) in ``view.points``."""
+        """Return ascending positions (n,) in ``view.points``."""
         ...
 
 
 class Search(Protocol):
-    """A matcher made ready for one target."""
+    """A matcher prepared for one target."""
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
         """Pair points of the source with points of the target.
@@ -198,7 +195,7 @@ class Matcher(Protocol):
     takes: ClassVar[frozenset[str]]
 
     def prepare(self, target: Points) -> Search:
-        """Do what needs doing once for each target (build a tree, say)."""
+        """Precompute what depends on the target only, a k-d tree for example."""
         ...
 
 
@@ -208,16 +205,16 @@ class Rejector(Protocol):
     part_kind: ClassVar[str] = "rejector"
 
     def reach(self, resolution: float) -> float:
-        """Return the distance in m beyond which it drops every pair; infinity if there is none."""
+        """Return the distance in m beyond which all pairs are dropped; infinity if unlimited."""
         return math.inf
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """Return the pairs that stay, in the same order."""
+        """Return the remaining pairs, in the same order."""
         ...
 
 
 class Metric(Protocol):
-    """The error that the motion makes small, and how well it fixes that motion."""
+    """The error that the motion minimises, and the information it provides."""
 
     part_kind: ClassVar[str] = "metric"
 
@@ -229,7 +226,7 @@ class Metric(Protocol):
         Raises
         ------
         RegistrationError
-            If the pairs don't fix a motion.
+            If the pairs don't determine a motion.
         """
         ...
 
@@ -238,23 +235,20 @@ class Metric(Protocol):
         ...
 
     def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
-        """Return the directions (k, 6) that the pairs don't hold, as in `Registration`.
-
-        None, where the metric can't tell.
-        """
+        """Return the degenerate directions (k, 6), as in `Registration`; k = 0 if unknown."""
         return np.zeros((0, 6))
 
 
 class Stopping(Protocol):
-    """Says when the iterations are over."""
+    """Termination criterion of the iterations."""
 
     part_kind: ClassVar[str] = "stopping"
 
     @property
     def max_iterations(self) -> int:
-        """Iterations after which it ends in any case."""
+        """Maximum number of iterations."""
         ...
 
     def met(self, history: History) -> bool:
-        """Say whether the estimate has converged."""
+        """Whether the estimate has converged."""
         ...

@@ -1,4 +1,4 @@
-"""The error that a motion makes small (section 2.9.1)."""
+"""The point-to-point error metric (section 2.9.1)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tofuse.kernels.icp import point_information, weighted_moments
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Metric
 
-# Second singular values this small, relatively, are rounding errors: the points lie on a line.
+# Relative second singular values below this are rounding errors: the points are collinear.
 _RANK_TOLERANCE = 1e-12
 _ROUNDING = 1e-14
-# Residuals below this share of the resolution say nothing about the true error of the points.
+# Lower limit of the residuals' sigma, as a fraction of the resolution.
 _SMALLEST_SIGMA = 1e-3
 
 
@@ -66,12 +66,12 @@ class PointToPoint(Metric):
         """Return ``sum w J^T J / sigma^2`` with ``J = R [I, -hat(p)]``, p in the source's frame.
 
         ``J`` is the derivative of ``T exp(xi) p``; R cancels. sigma is estimated from the
-        residuals, ``sigma^2 = sum w |r|^2 / (3 m - 6)`` (m^2, along each axis), and is taken for
-        at least a thousandth of the resolution.
+        residuals, ``sigma^2 = sum w |r|^2 / (3 m - 6)`` (m^2, along each axis), and is at least a
+        thousandth of the resolution.
 
-        It speaks of the pairs as if each were the same point of the world seen twice. Closest
-        points are not, so it is optimistic, above all along a surface: a flat wall's looks as well
-        known as any other.
+        It assumes that the points of each pair are the same point of the scene. Closest points are
+        not, so it is optimistic, above all along a surface: it does not reveal that a flat wall is
+        degenerate.
         """
         weight = matches.weights()
         r = alignment.moved[matches.source] - alignment.target.points[matches.target]

@@ -90,7 +90,7 @@ def detect_planes(
 
 
 def _on(p: Float64, n: Float64, within: Float64, normals: Float64, offsets: Float64) -> Bool:
-    """(K, N) which points lie on each of K planes."""
+    """Whether each point lies on each of K planes, (K, N)."""
     near = np.abs(normals @ p.T - offsets[:, None]) < within
     return near & (normals @ n.T > np.cos(_MAX_ANGLE))
 

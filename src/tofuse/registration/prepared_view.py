@@ -100,7 +100,7 @@ class Smoothed:
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How a view is prepared.
+    """Options of the preparation of a view.
 
     Attributes
     ----------
@@ -279,7 +279,7 @@ class PreparedView:
     has_albedo
         Whether `albedo` is known anywhere.
     pixel_variance
-        (H, W) `plane_variance` with correlated errors contained once; None without such errors.
+        (H, W) `plane_variance` with correlated errors counted once; None without such errors.
     """
 
     index: int

@@ -1,4 +1,4 @@
-"""Views with fewer points, for the coarse levels of a registration."""
+"""Voxel-grid downsampling, for the coarse levels of a registration."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64, Intp
 from tofuse.recordings.frames import CloudFrame, Frame
 
-# Cubes that a float64 still tells apart by their number.
+# Maximum number of cubes with a unique index in float64.
 _MAX_CELLS = 2.0**52
 
 
@@ -43,7 +43,7 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
     cell = np.floor((columns - columns.min(1)[:, None]) / size)
     count = cell.max(1) + 1
     if count.prod() < _MAX_CELLS:
-        # One number for a cube sorts faster than three.
+        # A single key sorts faster than three.
         key = ((cell[0] * count[1] + cell[1]) * count[2] + cell[2]).astype(np.int64)
         order = np.argsort(key, kind="stable")
         key = key[order]
@@ -56,9 +56,9 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
 def reduced(
     source: Frame, target: Frame, size: float, most: int
 ) -> tuple[float, CloudFrame, CloudFrame]:
-    """Return both views averaged alike, with at most so many points each, and the cubes' edges.
+    """Return the voxel size in m and both averaged views, with at most `most` points each.
 
-    The edges are of `size` m, or longer where that leaves too many points.
+    The voxel size is `size` m, or larger if that leaves too many points.
     """
     while True:
         data, model = averaged(source, size), averaged(target, size)

@@ -1,4 +1,4 @@
-"""``tofuse.register``: one pair of views or clouds, with nothing to set up."""
+"""``tofuse.register``: registration of one pair of views or clouds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tofuse.registration.any_pair import FEWEST_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
 
 _FURTHEST_M = 1e9
-# Clouds that are further apart have different frames.
+# Clouds with a larger distance are in different frames.
 _OTHER_FRAME_M = 1e4
 
 
@@ -28,35 +28,34 @@ def register(
 ) -> Registration:
     """Register two views, or two (N, 3) clouds in m.
 
-    The pose is followed from the guess. Where both views then agree so well that it is as good as
-    certain, that is the answer, within milliseconds for images. Else poses are searched, and the
-    best one is aligned and judged by what both views say of it and by its lead over the best other
-    pose. Two images, and clouds whose points show that they were seen from their origin, are
-    searched exhaustively (`registration.search`: turns up to 63 degrees about the vertical and 52
-    about any axis, translations up to 0.6 of the median depth). Clouds are also searched by shapes
-    that are alike (`registration.fpfh`), under any rotation.
+    The views are first aligned from the guess. If their agreement makes that pose practically
+    certain, it is returned, within milliseconds for images. Else poses are searched; the best one
+    is aligned and evaluated by the agreement of both views and by its lead over the best rival. Two
+    images, and clouds detected to be seen from their origin, are searched exhaustively
+    (`registration.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
+    translations up to 0.6 of the median depth). Clouds are also registered by feature matching
+    (`registration.fpfh`), under any rotation.
 
     Parameters
     ----------
     source, target
         Frames of a recording, or arrays; non-finite points are dropped.
     guess
-        (4, 4) T_target_source to start from; the identity unless given. Of poses of two images
-        that can't be told apart the one at the guess is taken.
+        (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
+        images the one at the guess is returned.
     method
-        What registers, instead of the above.
+        Registration method; the above unless given.
     seed
-        Of the random choice of points, for methods that choose.
+        Seed of the random selection of points, for methods that use one.
 
     Returns
     -------
-    The `T_target_source` maps points of the source into the target's frame, m. `believed` says
-    whether it is to be believed, `probability` how probably it is right (images: within 5 % of the
+    `T_target_source` maps points of the source into the target's frame, m. `believed` states
+    whether the pose is verified, `probability` how probably it is right (images: within 5 % of the
     depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is not believed: too
     little support or too little lead over `runner_up`, contradiction, degenerate directions.
-    `converged` says none of that. Directions along which the views could slide (three on a flat
-    wall) are in `unobservable`, and stay as they are in the guess. A `method` that says nothing of
-    its pose leaves `believed` None.
+    `converged` implies none of that. Degenerate directions (three on a flat wall) are in
+    `unobservable`, and keep the guess. A `method` without verification leaves `believed` None.
 
     Raises
     ------
@@ -94,9 +93,9 @@ def _register_arrays(
     method: Registrar | None,
     rng: np.random.Generator,
 ) -> Registration:
-    """Register about the middle of the target: map coordinates are too long for float32.
+    """Register about the target's median: map coordinates exceed the precision of float32.
 
-    A source that is far from there, as in a frame of its own, is moved to its own middle.
+    A distant source, in a frame of its own, is shifted to its own median.
     """
     there, here = np.median(source, 0), np.median(target, 0)
     there = there if np.linalg.norm(there - here) > _OTHER_FRAME_M else here

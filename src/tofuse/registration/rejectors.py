@@ -1,4 +1,4 @@
-"""Which pairs of points are likely to be wrong (section 2.9.4)."""
+"""Rejection of outlier pairs (section 2.9.4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rough surfaces where a view is too noisy for the tracker's: enough to find the way by."""
+"""Planes with a looser tolerance for views too noisy for tracking, for use in a search."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.registration.prepared_view import PreparedView
 
 _CHUNKS = 4
-# Share of the depth by which a surface may be off its plane, and half width of a plane as a share
-# of the image.
+# Deviation from a plane as a fraction of the depth, and half width of a plane's window as a
+# fraction of the image.
 _ROUGH, _WINDOW = 0.01, 0.016
 
 
 def with_rough_planes(view: PreparedView) -> PreparedView:
-    """Return the view with wide planes, of median depths, where it has none of its own.
+    """Return the view with wide planes, fitted to median depths, where it has none.
 
-    The tracker wants planes that are as good as the noise of the view says. A grazed floor is
-    noisier than that, and yet it tells a search where the camera stands.
+    Tracking uses only planes that match the view's noise. A floor at grazing incidence is noisier,
+    but constrains a search.
     """
     z = cv2.medianBlur(view.z, 5)
     z[(view.z <= 0) | (np.abs(z - view.z) > 5 * _ROUGH * view.z)] = 0

@@ -1,4 +1,4 @@
-"""Which points of a view take part (section 2.9.2)."""
+"""Selection of a view's points (section 2.9.2)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Random(Selector):
     Attributes
     ----------
     points
-        How many; a view with fewer gives all it has.
+        Number of points; all points of a view with fewer.
     """
 
     points: int = 1000
@@ -49,7 +49,7 @@ class Random(Selector):
 
 
 def at_most(points: int | None) -> Selector:
-    """Return what chooses so many random points, or all for None."""
+    """Return the selector of `points` random points, or of all points for None."""
     return All() if points is None else Random(points)
 
 

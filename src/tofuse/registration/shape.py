@@ -18,10 +18,10 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import Frame
 
 NEIGHBOURS = 20
-# Twenty neighbours spread by chance leave a gap this wide once in 300 inner points; at a straight
-# edge half of the circle is empty.
+# Twenty random neighbours leave a gap this wide at one of 300 inner points; at a straight edge the
+# gap is 180 degrees.
 _BOUNDARY_GAP = np.deg2rad(135)
-# Where fewer than this share of a view's points are asked for, only those are worked out.
+# Below this fraction of a view's points only the requested ones are computed.
 _FEW = 0.25
 
 

@@ -1,4 +1,4 @@
-"""When the iterations are over."""
+"""Termination criteria of the iterations."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class TwoLoops(Stopping):
     Attributes
     ----------
     epsilon
-        Smallest change of E that counts; E has no unit.
+        Threshold of the change of E; dimensionless.
     k
-        In how many iterations in a row.
+        Number of consecutive iterations below the threshold.
     max_iterations
-        Of both loops together.
+        Maximum number of iterations of both loops together.
     """
 
     epsilon: float = 1e-4
@@ -58,16 +58,16 @@ class TwoLoops(Stopping):
 @part("stopping", "small-step", label="validated")
 @dataclass(frozen=True)
 class SmallStep(Stopping):
-    """Ends when a motion takes the points less far than a share of the resolution.
+    """Ends when the displacement of the points is below a fraction of the resolution.
 
-    Or when the iterations repeat: near the end they can go to and fro between two matchings.
+    It also ends when the iterations oscillate between two sets of matches.
 
     Attributes
     ----------
     epsilon
-        In resolutions, root mean square over the source's points.
+        Threshold of the RMS displacement of the source's points, in resolutions.
     max_iterations
-        Iterations after which it ends in any case.
+        Maximum number of iterations.
     """
 
     epsilon: float = 1e-3

@@ -1,4 +1,4 @@
-"""Error metrics that know the surfaces: point-to-plane, plane-to-plane."""
+"""Error metrics with normals: point-to-plane, plane-to-plane."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tofuse.registration.pairs import (
 
 
 class SurfaceMetric(Metric, Protocol):
-    """What the metrics with normals have in common."""
+    """Base of the metrics with normals."""
 
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
         """Return the information (6, 6) about the pairs' centre, and the variance in m^2."""
@@ -47,7 +47,7 @@ class SurfaceMetric(Metric, Protocol):
         """Return the information (6, 6) in which independent noise of the normals cancels.
 
         Of the right perturbation in the source's frame, as `information`; not positive definite
-        where the noise is larger than what the surface tells.
+        where noise exceeds the information of the surface.
         """
         pairs = _measurements(matches, alignment)
         return pairs.to_origin(cross_information(pairs, self.fit(pairs)[1]))
@@ -64,17 +64,17 @@ def _measurements(matches: Matches, alignment: Alignment) -> SurfacePairs:
 
 
 class TangentPlanes(SurfaceMetric, Protocol):
-    """Squared distances to the target's tangent planes, with weights of a metric's own.
+    """Squared distances to the target's tangent planes, with weights defined by the metric.
 
     One Gauss-Newton step on SE(3) is made for each matching.
     """
 
     def weights(self, residual: Float64, resolution: float) -> Float64:
-        """Return how much residuals (m,) in m count."""
+        """Return the weights (m,) of residuals (m,) in m."""
         ...
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.motion`; no motion along directions that no plane holds."""
+        """See `Metric.motion`; no motion along directions that no plane constrains."""
         pairs = surface_pairs(matches, alignment)
         r, weight = self._weigh(pairs)
         n = pairs.target_normals
@@ -153,7 +153,7 @@ class PlaneToPlane(SurfaceMetric):
         return H / variance, variance
 
     def _weigh(self, pairs: SurfacePairs) -> tuple[Float64, Float64]:
-        """W in units in which a residual across two parallel discs counts as it is, in m."""
+        """Return W (m, 3, 3), normalised to 1 across two parallel discs, and the weights (m,)."""
         W = (
             2
             * self.epsilon

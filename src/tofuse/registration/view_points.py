@@ -1,4 +1,4 @@
-"""Pixels of a view, one property an array, as what compares whole views takes them."""
+"""Sampled pixels of a view as a structure of arrays."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ViewPoints:
 
 
 def landing_pixels(view: PreparedView, points: Float64) -> Intp:
-    """(N, 2) column and row of the pixels that points (N, 3) land on; -1 outside."""
+    """Return column and row (N, 2) of the pixels that points (N, 3) project to; -1 outside."""
     lookup, (x0, y0, per_x, per_y) = view.projection.lookup, view.projection.frame
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
     a, b = (points[:, 0] / z - x0) * per_x, (points[:, 1] / z - y0) * per_y
