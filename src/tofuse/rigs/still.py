@@ -190,7 +190,7 @@ def _finer_offsets(
             lags.append(float(np.mean(apart)) if apart else np.nan)
         lag = _minimum(np.array(lags), np.array(costs))
         if lag is None:
-            notes.append(f"{cameras[c].name}: what moves does not tell its clock")
+            notes.append(f"{cameras[c].name}: its clock can't be estimated from what moves")
         elif abs(lag) > 0.02 * interval:
             out[c] -= lag
         known[k] = [_kept(v) for v in _at_times(cameras[c], out[c], at)]
@@ -300,7 +300,7 @@ def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
         if lag is None or not lag.certain:
             raise InputError(
                 f"begins {own[0] - first[0]:+.1f} s after {cameras[0].name} by its clock, when "
-                f"that had ended, and nothing that both see move tells what the clocks differ by",
+                f"that had ended, and no motion that both see determines the offset of the clocks",
                 where=cameras[k].recording.path,
                 remedy="give recordings of the same time",
             )
