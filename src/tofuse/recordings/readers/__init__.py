@@ -1,1 +1,1 @@
-"""The readers, one file each; every module in here is imported when a recording is opened."""
+"""The readers, one file each; all modules here are imported when a recording is opened."""

@@ -34,16 +34,16 @@ DEPTH_UNIT_M = 0.001
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the calibrated image that a mode uses, all (x, y) in pixels.
+    """The crop of the calibrated image that a mode uses; all (x, y) in pixels.
 
     Attributes
     ----------
     whole
         The calibrated image at the mode's resolution.
     corner
-        Where the mode's image begins in it.
+        Top left corner of the mode's image in it.
     size
-        Of the mode's image.
+        Size of the mode's image.
     """
 
     whole: tuple[int, int]
@@ -76,7 +76,7 @@ _MODELS = {
 
 @dataclass(frozen=True)
 class KinectLens(Rational):
-    """The calibration's lens: rational, and unknown beyond a radius on the plane z = 1.
+    """The calibration's lens: rational, undefined beyond a radius on the plane z = 1.
 
     In the older of its two forms, Rational6KT, the mixed tangential terms count once, not twice.
     """
@@ -99,7 +99,7 @@ class KinectLens(Rational):
 
 @lru_cache(maxsize=8)
 def depth_camera(lens: KinectLens) -> Camera:
-    """Return the camera of depth images: the lens model if it is OpenCV's, else its rays."""
+    """Return the depth camera: the lens model if it is OpenCV's, else a ray table."""
     rays = lens.rays()
     seen = np.hypot(rays[..., 0], rays[..., 1]) <= lens.metric_radius
     if seen.all() and lens.mixed == 2.0:
@@ -223,7 +223,7 @@ class AzureKinectSource(FileSource):
         if options.camera is None:
             self._read_own_cameras(color)
         else:
-            with suppress(InputError):  # that may be why another camera is given
+            with suppress(InputError):  # possibly the reason for a user-given camera
                 self._read_own_cameras(color)
             about, self.camera = load_camera(options.camera, self.size)
             self.unit, self.kind = about.depth_unit_m, about.depth_kind
@@ -279,7 +279,7 @@ def _image_size(track: Track, path: Path) -> tuple[int, int]:
 
 
 def _mode(tags: dict[str, str], size: tuple[int, int], path: Path) -> str:
-    """The depth mode by the size of the images, which is unique."""
+    """The depth mode, identified by its unique image size."""
     named = tags.get("K4A_DEPTH_MODE", "")
     if named in DEPTH_MODES and DEPTH_MODES[named].size == size:
         return named

@@ -1,4 +1,4 @@
-"""Reader of Android's DEPTH16: 13 bits of depth and 3 of confidence, as ARCore and others give."""
+"""Reader of Android's DEPTH16: 13 bits of depth and 3 of confidence (ARCore and others)."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Depth16Source(FileSource):
         samples = np.frombuffer(data, "<u2").reshape(height, width)
         counts = samples & ((1 << _BITS) - 1)
         depth = counts.astype(np.float32) * np.float32(self.description.depth_unit_m)
-        # 0 means unknown, and counts as full confidence; 1 is 0 %, 7 is six sevenths.
+        # 0 means unknown and counts as full confidence; 1 is 0 %, 7 is 6/7.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
         color = self.color[index]

@@ -1,4 +1,4 @@
-"""Reader of one depth image as PNG."""
+"""Reader of a single depth image as PNG."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class DepthPng:
 
 
 def _remedy(path: Path) -> str:
-    """The remedy; names the frame if the image is of a native folder, which has more channels."""
+    """The remedy; for an image of a native folder, to open the folder's frame instead."""
     folder = path.parent.parent
     if path.parent.name == "depth" and is_file(folder / "camera.json"):
         number = files_with(path.parent, ".png").index(path)

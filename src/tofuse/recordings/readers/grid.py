@@ -1,4 +1,4 @@
-"""Reader of clouds with one point per pixel, as exported by viewers of ToF cameras."""
+"""Reader of organised clouds (one point per pixel), as exported by ToF viewers."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _AMPLITUDES = ("intensity", "amplitude", "i")
 MAX_POINTS = 1 << 22
 # Mean distances of ToF cameras are below 50 m and above 50 mm.
 MM_FROM = 50.0
-# Points without a grid are within this fraction of a pixel of its ray, this fraction of them.
+# Unorganised points: largest distance from the pixel's ray (px), and min fraction within it.
 _OFF_RAY, _ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
 @dataclass(frozen=True)
 class Grid:
-    """A folder of .ply, .csv or .pcd files with one point per pixel, row by row; m or mm."""
+    """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
 
     joinable: ClassVar[bool] = False
 
@@ -101,7 +101,7 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and the width if stated."""
+    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and the width, if stated."""
 
     points: Float32
     amplitude: Float32 | None = None
@@ -183,7 +183,7 @@ class _Frames:
         )
 
     def _placed(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
-        """Assign the points (n, 3) of a file without invalid ones to the pixels with their rays."""
+        """Assign points (n, 3), of a file without invalid ones, to pixels by their rays."""
         from scipy.spatial import cKDTree
 
         rays = self.camera.rays().reshape(-1, 2)
@@ -216,7 +216,7 @@ class _Frames:
 
 
 def _moved(points: Float32, behind: float) -> Float32:
-    """Points (..., 3) relative to an origin `behind` metres farther back; invalid ones are kept."""
+    """Points (..., 3) relative to an origin `behind` metres farther back; keeps invalid ones."""
     z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(behind), points[..., 2])
     return np.concatenate([points[..., :2], z[..., None]], axis=-1)
 

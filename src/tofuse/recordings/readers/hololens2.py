@@ -1,4 +1,4 @@
-"""Reader of HoloLens 2 research mode, as Microsoft's sample StreamRecorder writes it."""
+"""Reader of HoloLens 2 research mode recordings by Microsoft's sample StreamRecorder."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from tofuse.recordings.phones import POSES_BY, refuse_replacement
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, read_matrix_pose
 
-# The streams in order of preference, with their ambiguity range in m.
+# The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
 _NAME = re.compile(r"(?:.*/)?([0-9]{1,19})(_ab)?\.pgm", re.IGNORECASE)
-_TICKS = 1e7  # a second
+_TICKS = 1e7  # per second
 _MAX_BYTES = 1 << 24
 _REMEDY = "copy the recording again"
 
@@ -60,7 +60,7 @@ class HoloLens2:
 
 
 class HoloLens2Source(FileSource):
-    """Radial range in mm with active brightness, and the headset's own poses as reference."""
+    """Radial range in mm with active brightness, and the headset's poses as reference."""
 
     concurrent = True
 
@@ -184,12 +184,12 @@ def _streams(path: Path) -> list[str]:
     ]
 
 
-# Location of an image (file, offset, size), by its time and whether it is the amplitude.
+# Location of an image (file, offset, size), keyed by (time, is amplitude).
 _Images = dict[tuple[int, bool], tuple[Path, int, int]]
 
 
 def _images(folder: Path, stream: str) -> _Images:
-    """All images of a stream: in its folder if it was extracted, else in its archive."""
+    """All images of a stream: from its folder if extracted, else from its archive."""
     found: _Images = {}
     if is_folder(folder / stream):
         for path in list_folder(folder / stream):
@@ -215,7 +215,7 @@ def _images(folder: Path, stream: str) -> _Images:
 
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
-    """Rays (H, W, 2) from a table of unit vectors; NaN where it has none."""
+    """Rays (H, W, 2) from a table of unit vectors; NaN where undefined."""
     data = read_bytes(path, limit=_MAX_BYTES)
     height, width = shape
     if len(data) != 12 * height * width:

@@ -31,14 +31,14 @@ _NEEDED = (
     "intrinsicCalibModelID",
     "intrinsicCalibModelParameters",
 )
-_MAX_FRAMES, _MAX_BYTES = 1_000_000, 1 << 26  # of a file, and of a frame
+_MAX_FRAMES, _MAX_BYTES = 1_000_000, 1 << 26  # per file, and per frame
 _LENS_NUMBERS = 10
 
 
 @part("reader", "ifm-h5", label="experimental")
 @dataclass(frozen=True)
 class IfmH5:
-    """A .h5 file with streams o3r_tof_0 and so on: range, noise, amplitude, lens."""
+    """A .h5 file with streams o3r_tof_0, ...: range, noise, amplitude, intrinsics."""
 
     joinable: ClassVar[bool] = False
 
@@ -59,7 +59,7 @@ class IfmH5:
 
 
 class IfmH5Source(FileSource):
-    """Radial range of one head, with the camera's own noise and lens."""
+    """Radial range of one head, with the camera's noise estimate and intrinsics."""
 
     def __init__(self, path: Path, stream: str | None) -> None:
         self.path = path
@@ -79,7 +79,7 @@ class IfmH5Source(FileSource):
             times = self._times()
         except InputError:
             raise
-        except Exception as error:  # h5py can raise anything for a damaged file
+        except Exception as error:  # any exception of h5py for a damaged file
             raise self._damaged(error) from error
         super().__init__(times)
         self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
@@ -115,7 +115,7 @@ class IfmH5Source(FileSource):
             )
 
     def _times(self) -> Float64:
-        """Timestamps (N,) in s of the first exposure or the acquisition; else the frame numbers."""
+        """Timestamps (N,) in s of the first exposure or acquisition; else frame numbers."""
         for name, unit in (("timestamp_ns", 1e-9), ("_data_timestamp", 1e-6)):
             if name in self.fields:
                 ticks = np.asarray(self.rows[name], float).reshape(len(self.rows), -1)[:, 0]
@@ -176,7 +176,7 @@ class IfmH5Source(FileSource):
 
     @staticmethod
     def _metres(counts: NDArray[Any], unit: float) -> Float32:
-        """Whole numbers are counts of the unit; floats are in metres."""
+        """Convert to metres: integers are counts of `unit` (m); floats are in metres."""
         scale = unit if counts.dtype.kind in "ui" else 1.0
         return counts.astype(np.float32) * np.float32(scale)
 

@@ -29,7 +29,7 @@ _MAX_BYTES = 2 << 30
 @part("reader", "ifm-o3r", label="validated")
 @dataclass(frozen=True)
 class IfmO3r:
-    """A .data or .pcic file of frames as the O3R sends them: range, noise, amplitude, lens."""
+    """A .data or .pcic file of the O3R's frames: range, noise, amplitude, intrinsics."""
 
     joinable: ClassVar[bool] = False
 
@@ -50,7 +50,7 @@ class IfmO3r:
 
 
 class IfmO3rSource(FileSource):
-    """Frames of radial range with the camera's own noise and lens."""
+    """Frames of radial range with the camera's noise estimate and intrinsics."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -67,7 +67,7 @@ class IfmO3rSource(FileSource):
                 try:
                     info = _info(self.data, chunks[INFO], f"{path}: frame {k}")
                 except InputError:
-                    continue  # an error of that frame alone, raised when it is read
+                    continue  # raised when this frame is read
                 self.metadata["depth_unit_m"] = info.distance_unit_m
                 if NOISE in chunks:
                     self.metadata["sigma_unit_m"] = info.distance_unit_m

@@ -75,7 +75,7 @@ def _color(file: Path) -> Path | None:
 
 
 def _calibration(folder: Path, name: str) -> Path | None:
-    """The calibration in the folder of the images, or in its only subfolder with one."""
+    """The calibration in the folder of the images, or in its only subfolder that has one."""
     if is_file(folder / name):
         return folder / name
     try:
@@ -86,7 +86,7 @@ def _calibration(folder: Path, name: str) -> Path | None:
 
 
 def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
-    """The images are rectified: pinhole cameras with the calibration's matrix."""
+    """Return the pinhole camera of rectified images: the calibration's matrix."""
     if size not in _VIEWS:
         raise InputError(
             f"has images of {size[0]} x {size[1]} pixels, unlike any Kinect v2",

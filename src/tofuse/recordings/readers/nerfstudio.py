@@ -40,7 +40,7 @@ _REMEDY = "correct it there"
 @part("reader", "nerfstudio", label="experimental")
 @dataclass(frozen=True)
 class Nerfstudio:
-    """Folders with a transforms.json whose frames have depth, or such a file."""
+    """A transforms.json whose frames have depth, or the folder of one."""
 
     joinable: ClassVar[bool] = False
 
@@ -62,7 +62,7 @@ class Nerfstudio:
 
 
 class NerfstudioSource(FileSource):
-    """Depth images with a lens each, and the poses of the file as reference."""
+    """Depth images with individual intrinsics, and the file's poses as reference."""
 
     concurrent = True
 
@@ -145,7 +145,7 @@ class NerfstudioSource(FileSource):
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """The entry of one frame, with the common values as defaults."""
+    """The entry of one frame; values common to all frames are its defaults."""
 
     common: dict[str, Any]
     own: dict[str, Any]
@@ -169,7 +169,7 @@ class _Frame:
         return name_order(Path(str(self.own.get("file_path", self.number))))
 
     def path(self, *names: str) -> Path | None:
-        """Return the first of these files that the entry refers to."""
+        """Return the path under the first of these keys that the entry has."""
         named = next((self.own[name] for name in names if name in self.own), None)
         if not isinstance(named, str) or not named or "\0" in named:
             return None
@@ -198,7 +198,7 @@ class _Frame:
         return number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        """Return the camera of depth images of a size (width, height); the file's may be larger."""
+        """Return the camera scaled from the file's image size to the depth's (width, height)."""
         word = self.own.get("camera_model", self.common.get("camera_model", "OPENCV"))
         model = _MODELS.get(word) if isinstance(word, str) else None
         if model is None:
@@ -235,7 +235,7 @@ class _Frame:
         return scaled(camera, *size)
 
     def _by_angle(self, name: str, pixels: float) -> float | None:
-        """Focal length by the field of view; None if not given."""
+        """Focal length in pixels from the field of view; None if not given."""
         angle = self.own.get(name, self.common.get(name))
         if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < 3.1:
             return None
@@ -247,7 +247,7 @@ def _file(path: Path) -> Path:
 
 
 def _in_order(frames: list[_Frame]) -> list[_Frame]:
-    """The frames by time, or by the names of their images if some have no time."""
+    """The frames sorted by time, or by image names if some have no time."""
     if all(math.isfinite(frame.time) for frame in frames):
         return sorted(frames, key=lambda frame: frame.time)
     return sorted(frames, key=lambda frame: frame.key)
@@ -274,7 +274,7 @@ def _array(path: Path) -> Float32:
     """Depth (H, W) of a .npy file."""
     try:
         table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
+    except Exception as error:  # NumPy evaluates the header as Python: any exception
         raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
     if table.ndim == 3 and table.shape[2] == 1:
         table = table[..., 0]

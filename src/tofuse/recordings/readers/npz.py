@@ -1,4 +1,4 @@
-"""Reader of NumPy archives with a few named arrays, for data without a reader of its own."""
+"""Reader of NumPy archives with a few named arrays, for formats without a dedicated reader."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Npz:
 
 
 class NpzSource(FileSource):
-    """Frames of arrays in memory."""
+    """Frames from arrays in memory."""
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
@@ -142,7 +142,7 @@ class NpzSource(FileSource):
         if options.camera is not None:
             about, camera = load_camera(options.camera, (width, height))
             self.kind = about.depth_kind
-            if self.depth.dtype.kind != "f":  # those are metres already
+            if self.depth.dtype.kind != "f":  # floats are in metres
                 unit = about.depth_unit_m
         elif "rays" in arrays:
             rays = self._floats(arrays, "rays")
@@ -244,5 +244,5 @@ class NpzSource(FileSource):
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays, unless they decompress to an absurd size."""
+    """Read all arrays; reject an implausible decompressed size."""
     return read_npz(path, limit=MAX_BYTES)

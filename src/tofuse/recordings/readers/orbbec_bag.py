@@ -1,4 +1,4 @@
-"""Reader of the bags that Orbbec's viewer and SDK write."""
+"""Reader of bags written by Orbbec's viewer and SDK."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ORBBEC = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 @part("reader", "orbbec-bag")
 @dataclass(frozen=True)
 class OrbbecBag:
-    """A .bag of Orbbec's viewer or SDK: depth, infrared of the same pixels, and colour."""
+    """A .bag of Orbbec's viewer or SDK: depth, pixel-aligned infrared, and colour."""
 
     joinable: ClassVar[bool] = False
 
@@ -54,7 +54,7 @@ _PROFILE = struct.Struct("<2B9f3f3H4f8fB")
 
 @dataclass(frozen=True, eq=False)
 class _Profile:
-    """Size, frames a second, lens and place of a stream: its motion into the colour stream."""
+    """Size, frame rate (Hz), intrinsics of a stream, and its transform into the colour frame."""
 
     size: tuple[int, int]
     rate: int
@@ -68,7 +68,7 @@ class _Profile:
 
 
 class OrbbecSource(BagSource):
-    """See `OrbbecBag`; its messages have more fields than those of ROS, and are decoded here."""
+    """See `OrbbecBag`; its messages extend those of ROS, and are decoded here."""
 
     @staticmethod
     def open_bag(path: Path) -> Any:
@@ -121,7 +121,7 @@ class OrbbecSource(BagSource):
         )
 
     def message(self, track: Track, index: int) -> Any:
-        """Read the part of an image message that is as in ROS 1."""
+        """Read the part of an image message that is identical to ROS 1."""
         raw = bytes(track.raw(index))
         where = f"{self.path}: {track.connection.topic}, message {index}"
         at = _header_end(raw, where)
@@ -140,7 +140,7 @@ class OrbbecSource(BagSource):
 
 
 def _header_end(raw: bytes, where: str) -> int:
-    """The end of a ROS 1 header (counter, time, name of the frame)."""
+    """The end offset of a ROS 1 header (counter, time, name of the frame)."""
     if len(raw) < 16:
         raise InputError("is cut off", where=where, remedy="check the bag")
     return 16 + int.from_bytes(raw[12:16], "little")

@@ -1,4 +1,4 @@
-"""Reader of PCD clouds; organised ones become images if they fit a camera."""
+"""Reader of PCD clouds; organised ones become range images if they fit a camera."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PcdClouds:
 
 
 def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read a file as a cloud, less `shift` (3,); its viewpoint is the sensor's position."""
+    """Read a file as a cloud, minus `shift` (3,) in m; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
     cloud = pcd.cloud
     return cloud_frame(
@@ -75,7 +75,7 @@ def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame
 
 
 def _camera(files: list[Path]) -> Camera | None:
-    """Return the camera of organised files, from up to `SAMPLES` that can be read; or None."""
+    """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
     step = max(1, len(files) // SAMPLES)
     images: list[Float32] = []
     for file in files[::step][:SAMPLES]:

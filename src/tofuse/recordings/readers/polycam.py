@@ -51,7 +51,7 @@ class Polycam:
 
 
 class PolycamSource(PhoneSource):
-    """Frames with ARKit's lens, and the poses that Polycam optimised, or else ARKit's."""
+    """Frames with ARKit's intrinsics, and the poses optimised by Polycam, or else ARKit's."""
 
     def __init__(self, folder: Path) -> None:
         files = files_with(folder / "depth", ".png") if is_folder(folder / "depth") else []
@@ -71,11 +71,11 @@ class PolycamSource(PhoneSource):
             try:
                 self.cameras.append(_lens(read_json(path), size, path))
             except InputError as error:
-                self.cameras.append(error)  # without its lens this frame alone can't be used
+                self.cameras.append(error)  # only this frame is unusable
         self._read_poses(folder)
 
     def _read_poses(self, folder: Path) -> None:
-        """Take the poses that Polycam optimised, or ARKit's; they differ too much to be mixed."""
+        """Read Polycam's optimised poses, else ARKit's; never a mix, as they differ too much."""
         paths = [folder / "corrected_cameras" / f"{file.stem}.json" for file in self.files]
         if any(is_file(path) for path in paths):
             self.metadata[POSES_BY] = "Polycam"
@@ -96,7 +96,7 @@ def _keyframes(path: Path) -> Path:
 
 
 def _times(files: list[Path]) -> Float64:
-    """Timestamps (N,) in s of files named by microseconds; their numbers for other names."""
+    """Timestamps (N,) in s of files named by microseconds; else the indices."""
     if all(file.stem.isdecimal() and len(file.stem) <= 18 for file in files):
         return np.array([int(file.stem) for file in files], float) * 1e-6
     return np.arange(len(files), dtype=float)

@@ -1,4 +1,4 @@
-"""Reader of the bags that RealSense's viewer and SDK write."""
+"""Reader of bags written by RealSense's viewer and SDK."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class RealSenseSource(BagSource):
         self.unit = self._unit(sensor)
         name = self._name(sensor.rsplit("/", 1)[0])
         self.metadata["sensor"] = name
-        if "L5" in name:  # of stereo cameras infrared is another view
+        if "L5" in name:  # a stereo camera's infrared is another view
             found = [
                 c.topic
                 for c in self.bag.connections
@@ -94,9 +94,9 @@ class RealSenseSource(BagSource):
         return ColorCamera(lens, color[common[0]] @ inverse(depth[common[0]]))
 
     def _places(self, stream: str) -> dict[str, Float64]:
-        """Return motions (4, 4) into a stream's frame, each from a reference that a number names.
+        """Return transforms (4, 4) into a stream's frame, by the number of their reference.
 
-        In ROS 1 bags they are transforms, later text: a rotation by columns, and a translation.
+        ROS 1 bags store transforms; later versions text: a column-major rotation and a translation.
         """
         out = {}
         for connection in self.bag.connections:
@@ -143,7 +143,7 @@ class RealSenseSource(BagSource):
     def _info(self, stream: str) -> Info:
         where = f"{self.path}: {stream}"
         message = first_message(self.bag, f"{stream}/info/camera_info")
-        # Newer versions write it as text.
+        # Newer versions write text.
         return self._as_text(stream, where) if message is None else camera_info(message, where)
 
     def _as_text(self, stream: str, where: str) -> Info:
@@ -176,7 +176,7 @@ class RealSenseSource(BagSource):
         return float(np.float32(unit))
 
     def _name(self, device: str) -> str:
-        """Return the camera's name, which is a message (key, value) among others."""
+        """Return the camera's name, from the (key, value) messages."""
         for connection in self.bag.connections:
             if connection.topic != f"{device}/info":
                 continue

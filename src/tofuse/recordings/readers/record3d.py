@@ -76,7 +76,7 @@ class Record3DSource(FileSource):
         self.camera = about.lens(self.size)
         times = about.times()
         numbers = np.array(store.numbers)
-        # Poses and timestamps are of all frames; an export may contain only some.
+        # Poses and timestamps cover all frames; an export may contain a subset.
         if times is None or numbers.max() >= len(times):
             rate = about.frame_rate()
             times = np.arange(numbers.max() + 1) / rate
@@ -270,7 +270,7 @@ class _Metadata:
         return times if len(times) else None
 
     def poses(self) -> Float64 | None:
-        """T_world_camera (N, 4, 4) of all frames, NaN where it was lost; or None."""
+        """T_world_camera (N, 4, 4) of all frames, NaN where tracking was lost; or None."""
         if "poses" not in self.data:
             return None
         table = self._numbers("poses", None, columns=7)
@@ -316,7 +316,7 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:
-    """Return depth in m; values that aren't finite, or are absurd, become 0."""
+    """Return depth (H, W) in m; non-finite and implausible values become 0."""
     if depth.shape != (size[1], size[0]):
         raise InputError(
             f"is {depth.shape[1]} x {depth.shape[0]} pixels, metadata says {size[0]} x {size[1]}",

@@ -1,4 +1,4 @@
-"""Reader of RGB-D folders as Open3D and Redwood lay them out (Choi et al. 2015)."""
+"""Reader of RGB-D folders in the layout of Open3D and Redwood (Choi et al. 2015)."""
 
 from __future__ import annotations
 
@@ -142,13 +142,13 @@ def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Pat
 
 
 def _number(path: Path) -> int | None:
-    """Number of an image, with which its name begins."""
+    """Number of an image: the prefix of its name."""
     first = path.stem.split("-")[0]
     return int(first) if first.isdecimal() and len(first) <= 18 else None
 
 
 def _poses(path: Path, count: int) -> Float64:
-    """Read a trajectory.log: (count, 4, 4), NaN for frames that it leaves out."""
+    """Read a trajectory.log: (count, 4, 4), NaN for frames that it omits."""
     found = read_poses(path)
     if found.frames is None:
         raise InputError(

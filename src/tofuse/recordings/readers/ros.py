@@ -160,7 +160,7 @@ class RosSource(FileSource):
         return f"{self.path}: {self.connection.topic}, message {index}"
 
     def _candidates(self) -> list[Any]:
-        """The connections that may contain depth, the most likely first."""
+        """The connections that may contain depth, most likely first."""
         return sorted(
             (c for c in self.bag.connections if _rank(c) is not None),
             key=lambda c: (_rank(c), c.topic),
@@ -310,7 +310,7 @@ class RosSource(FileSource):
         return replace(frame, color_image=sampled_color(frame, seen, self.color_camera, where))
 
     def _find_amplitude(self) -> Track | None:
-        """The amplitude images of the same sensor: of the size and times of the depth images."""
+        """The amplitude track of the same sensor: its images match the depth's size and times."""
         assert self.camera is not None
         for connection in sorted(self.bag.connections, key=lambda c: c.topic):
             named = any(word in connection.topic.lower() for word in _AMPLITUDE_WORDS)
@@ -367,10 +367,10 @@ class RosSource(FileSource):
 
 
 def _rank(connection: Any) -> int | None:
-    """The rank of a topic as a source of depth, 0 first; None if it can't be one."""
+    """The rank of a topic as a source of depth, 0 is best; None if it can't be one."""
     topic, kind = connection.topic.lower(), connection.msgtype
     if kind == IMAGE and "depth" in topic:
-        # Depth in its own view is preferred to depth registered to another one.
+        # Depth in its own frame is preferred to depth registered to another camera.
         registered = any(word in topic for word in ("align", "regist", "_to_", "color", "rgb"))
         return 1 if registered else 0
     if kind == COMPRESSED and topic.endswith("compresseddepth"):

@@ -63,7 +63,7 @@ class ScannerApp:
                 source.timestamps[k] = facts.time
                 source.cameras.append(facts.lens(size))
             except InputError as error:
-                # Without its camera, the frame can't be used; the others can.
+                # Only this frame is unusable without its camera.
                 source.cameras.append(error)
                 continue
             try:
@@ -95,7 +95,7 @@ class _Facts:
         K = _numbers(self.path, self.data, "intrinsics", 9).reshape(3, 3)
         image = IMAGE_SIZE
         if "projectionMatrix" in self.data:
-            # Its diagonal is twice the focal length over the size of the image.
+            # Its diagonal is 2 * focal length / image size.
             P = _numbers(self.path, self.data, "projectionMatrix", 16).reshape(4, 4)
             with np.errstate(all="ignore"):
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]

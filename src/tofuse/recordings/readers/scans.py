@@ -31,7 +31,7 @@ from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
-_MAX_COMPRESSION = 1000  # of LAZ; 4 to 15 for scans
+_MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
 _MISSING = "give `pip install 'tofuse[scan]'`"
 
 
@@ -72,7 +72,7 @@ def _las_header(path: Path) -> Any:
     try:
         with laspy.open(path) as file:
             header = file.header
-    except Exception as error:  # laspy can raise anything
+    except Exception as error:  # laspy raises arbitrary exceptions
         raise _damaged(error, path) from error
     count, size = int(header.point_count), int(header.point_format.size)
     whole = path.stat().st_size
@@ -84,16 +84,16 @@ def _las_header(path: Path) -> Any:
     if packed and count:
         try:
             _check_chunks(path, header)
-        except Exception as error:  # lazrs has errors of its own
+        except Exception as error:  # lazrs has its own exception types
             raise _damaged(error, path) from error
     return header
 
 
 def _check_records(head: bytes, path: Path) -> None:
-    """Reject more records than the file has room for: laspy tries to read each of them."""
+    """Reject a record count that exceeds the file size: laspy tries to read each record."""
     count = int.from_bytes(head[100:104], "little")
     more = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
-    if 54 * count + 60 * more > path.stat().st_size:  # bytes of their headers
+    if 54 * count + 60 * more > path.stat().st_size:  # header sizes in bytes
         raise InputError(
             f"declares {count + more} records beside its points",
             where=path,
@@ -106,7 +106,7 @@ def _check_chunks(path: Path, header: Any) -> None:
 
     lazrs allocates what the table declares, and aborts the process if that fails. The table
     consists of its version, the number of chunks and their compressed sizes. Its offset precedes
-    the chunks or, if it was unknown then, is in the last 8 bytes (specification of LASzip 2.2).
+    the chunks or, if unknown at that time, is in the last 8 bytes (specification of LASzip 2.2).
     """
     lazrs = importlib.import_module("lazrs")
     size, start = path.stat().st_size, int(header.offset_to_point_data)
@@ -123,7 +123,7 @@ def _check_chunks(path: Path, header: Any) -> None:
             raise ValueError("its chunk table is not in the file")
         file.seek(table)
         _, count = struct.unpack("<II", file.read(8))
-        # Each begins with an uncompressed point.
+        # Each chunk begins with an uncompressed point.
         if count * layout.item_size() > table - start:
             raise ValueError(f"it declares {count} chunks")
         file.seek(start)
@@ -134,7 +134,7 @@ def _check_chunks(path: Path, header: Any) -> None:
 
 
 def _shift(path: Path) -> Float64:
-    """The shift (3,) to subtract from map coordinates for float32."""
+    """The offset (3,) subtracted from map coordinates so that float32 suffices."""
     header = _las_header(path)
     low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -152,7 +152,7 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
         color = None
         if {"red", "green", "blue"} <= names:
             wide = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
-            # The standard has 16 bits; many programs fill 8 of them.
+            # The standard uses 16 bits; many programs write 8-bit values.
             color = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
     except InputError:
         raise
@@ -171,7 +171,7 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 @part("reader", "e57")
 @dataclass(frozen=True)
 class E57Scans:
-    """A .e57 file: one view for each scan in it, in the scanner's frame; its poses to compare."""
+    """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
 
     joinable: ClassVar[bool] = False
 
@@ -192,7 +192,7 @@ class E57Scans:
 
 
 class E57Source(FileSource):
-    """Scans of a file, read when they are asked for."""
+    """Scans of a file, read on demand."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -210,7 +210,7 @@ class E57Source(FileSource):
                 poses = [self._pose(header) for header in headers]
             finally:
                 file.close()
-        except Exception as error:  # the library can raise anything
+        except Exception as error:  # the library raises arbitrary exceptions
             raise _damaged(error, path) from error
         if not self.counts:
             raise InputError(

@@ -40,7 +40,7 @@ _RATE_HZ = 30.0
 @part("reader", "sens")
 @dataclass(frozen=True)
 class Sens:
-    """A .sens file: depth, colour, both lenses, and the poses of ScanNet as reference."""
+    """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
 
     joinable: ClassVar[bool] = False
 
@@ -69,7 +69,7 @@ class _Entry:
 
 
 class SensSource(FileSource):
-    """Frames that are located by one pass over the file, and read on demand."""
+    """Frames located in one pass over the file, and read on demand."""
 
     camera: Camera
     unit: float
@@ -173,7 +173,7 @@ class SensSource(FileSource):
         return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
 
     def _walk(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
-        """Locate frames until the end of the file; a cut-off one is skipped."""
+        """Locate frames until the end of the file; a truncated one is skipped."""
         at = file.tell()
         for _ in range(count):
             file.seek(at)

@@ -51,7 +51,7 @@ class Slam6d:
 
 
 def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read one scan: x y z [reflectance ...] in each line, maybe after a line with their number."""
+    """Read one scan: lines of x y z [reflectance ...], optionally after a line with their count."""
     text = read_text(path)
     first = text.split("\n", 1)[0].split()
     table = parse_numbers(text, path, skip=int(len(first) == 1))
@@ -59,7 +59,7 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path)
     with np.errstate(over="ignore"):
         points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
-    # The scanner writes the origin for missing measurements.
+    # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
     amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
     return cloud_frame(index, timestamp, points, amplitude=amplitude)

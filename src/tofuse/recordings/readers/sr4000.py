@@ -19,10 +19,10 @@ from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource
 
 FRAME_RATE_HZ = 32.0
-# Modulated at 30 MHz, as the maker ships it.
+# Modulated at 30 MHz, the factory default.
 AMBIGUITY_M = 5.0
-# The export measures Z from about 1 cm before the optical centre; such near points can't be
-# measured, and don't determine a ray.
+# The export measures Z from about 1 cm in front of the optical centre; nearer points are not
+# measurable and don't determine a ray.
 NEAREST_M = 0.01
 
 _BLOCKS = {
@@ -69,11 +69,11 @@ def _files(path: Path) -> list[Path]:
 
 
 class Sr4000Source(FileSource):
-    """Frames with the camera's own vectors, exactly, as each frame's ray table.
+    """Frames whose ray tables reproduce the camera's vectors exactly.
 
-    The vectors point left and up, and are turned. They do not meet in the origin but about 1 cm
-    behind it, so that x/z of a pixel depends a little on its z: each frame has its own table,
-    by which `frame.points` are the vectors of the file.
+    The file's axes point left and up, and are converted. The rays meet about 1 cm behind the
+    origin, so that x/z of a pixel depends slightly on z: each frame has its own table, with which
+    `frame.points` equals the vectors of the file.
     """
 
     def __init__(self, files: list[Path]) -> None:
@@ -100,7 +100,7 @@ class Sr4000Source(FileSource):
         if not known.all():
             self.warnings.append(f"{int((~known).sum())} frames have no timestamp: interpolated")
         times[~known] = np.interp(index[~known], index[known], times[known])
-        # Where the camera's counter starts again, the frames still follow each other.
+        # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():
             self.warnings.append("timestamps decrease; frames stay in the order of files")
@@ -137,7 +137,7 @@ class Sr4000Source(FileSource):
 
 def _time_stamp(path: Path) -> float:
     """Timestamp in s from the last lines of a file; NaN if there is none."""
-    if not is_file(path):  # a queue would be waited for, a device read for ever
+    if not is_file(path):  # reading a FIFO would block, a device never end
         return float("nan")
     try:
         with path.open("rb") as file:

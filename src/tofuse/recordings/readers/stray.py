@@ -28,8 +28,8 @@ from tofuse.recordings.reader import ReaderOptions, Sniff
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _LENS = ("fx", "fy", "cx", "cy")
-# Axes of the phone are x right, y up and z towards the face of a person; the camera's image is
-# turned by a quarter. Apple's accelerometers measure g downwards at rest.
+# Axes of the phone are x right, y up and z towards the user; the camera's image is rotated by 90
+# degrees. Apple's accelerometers measure g downwards at rest.
 _IMU = {
     "a_y": ("ax", 1.0),
     "a_x": ("ay", 1.0),
@@ -60,12 +60,12 @@ class Stray:
 
 
 class StraySource(PhoneSource):
-    """Frames with ARKit's poses, which the app writes in the axes that are used here.
+    """Frames with ARKit's poses, which the app writes in this package's convention.
 
     Attributes
     ----------
     imu
-        Columns as those of the native imu.csv, along the axes of the depth camera; or None.
+        Columns of the native imu.csv, in the axes of the depth camera; or None.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -127,7 +127,7 @@ class StraySource(PhoneSource):
         }
 
     def _read_odometry(self, folder: Path) -> None:
-        """Read timestamps, poses and, from newer versions of the app, the lens of each frame."""
+        """Read timestamps, poses and, from newer versions of the app, per-frame intrinsics."""
         path = folder / "odometry.csv"
         columns = read_columns(path)
         missing = [name for name in ("timestamp", "frame", *_POSE) if name not in columns]
@@ -137,7 +137,7 @@ class StraySource(PhoneSource):
             )
         rows = {int(n): k for k, n in enumerate(columns["frame"]) if np.isfinite(n)}
         row = np.array([rows.get(number, -1) for number in self.numbers])
-        # A number that isn't finite is as good as a missing row.
+        # A non-finite value counts as a missing row.
         times = np.where(row < 0, np.nan, columns["timestamp"][row])
         known = np.isfinite(times)
         if not known.any():

@@ -62,9 +62,9 @@ class Tiff:
 
 
 class TiffSource(FileSource):
-    """Depth, and amplitude if there is one image per frame; times and poses as in native folders.
+    """Depth, and amplitude if every frame has one; times and poses as in native folders.
 
-    Values are times `depth_unit_m`, floats too, as the images don't tell their unit.
+    Values, floats too, are scaled by `depth_unit_m`, as the images don't state their unit.
     """
 
     concurrent = True

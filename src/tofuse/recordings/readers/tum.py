@@ -22,7 +22,7 @@ from tofuse.recordings.sources import check_timestamps, tum_poses
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
 
-# Of the colour cameras: depth is registered to colour (the infrared ones nearly double errors).
+# Of the colour cameras: depth is registered to colour (infrared ones nearly double errors).
 CAMERAS = {
     "freiburg1": BrownConrady(
         640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
@@ -64,7 +64,7 @@ class Tum:
         color: list[Path | None] | None = None
         if is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
-            # A depth image without its own takes a neighbour's: colour is for looks.
+            # A depth image without its own takes a neighbour's: colour is for display only.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).any():
                 color = [color_files[k] if k >= 0 else None for k in pairs]
@@ -81,7 +81,7 @@ class Tum:
 
 
 def camera_of(path: Path) -> BrownConrady | None:
-    """Return the colour camera by the name of the folder or its parent."""
+    """Return the colour camera, identified by the name of the folder or its parent."""
     for name in (path.absolute().name, path.absolute().parent.name):
         found = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
         if found:

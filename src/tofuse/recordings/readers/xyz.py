@@ -25,9 +25,9 @@ _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
 class XyzClouds:
     """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
 
-    The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and
-    where all have length 1; colours in .xyzrgb (0 to 1), and where all are whole numbers up to
-    255. Other columns are left aside.
+    The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
+    all have length 1; colours in .xyzrgb (0 to 1), and where all are integers up to 255. Other
+    columns are ignored.
     """
 
     joinable: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""Reader of Pico Zense folders: depth images, and a .toml with the lens."""
+"""Reader of Pico Zense folders: depth images, and a .toml with the intrinsics."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _depth_files(path: Path) -> list[Path]:
 
 
 def _settings(path: Path) -> Path | None:
-    """The .toml with a lens, if there is one."""
+    """The .toml with intrinsics, if there is one."""
     if not is_folder(path):
         return None
     files = [p for p in files_with(path, ".toml") if is_file(p)]
@@ -76,7 +76,7 @@ def _settings(path: Path) -> Path | None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the values of all tables of a file by their own names."""
+    """Return the values of all tables of a file, keyed without table names."""
     data = parse_toml(read_text(path), where=path)
     values: dict[str, Any] = {}
     for key, value in data.items():
@@ -85,7 +85,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, int]:
-    """(width, height) as in the file, or else of the images."""
+    """(width, height) as given in the file, else of the images."""
     if "image_width" not in values or "image_height" not in values:
         return first_size(files)
     size = tuple(number_in(values, key, path) for key in ("image_width", "image_height"))
