@@ -1,1 +1,1 @@
-"""A ToF camera simulator: the package's own source of truth."""
+"""A ToF camera simulator: the package's source of ground truth."""

@@ -1,4 +1,4 @@
-"""What an accelerometer on the camera measures: gravity, motion, its zero and noise."""
+"""A simulated accelerometer on the camera: gravity, motion, bias and noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tofuse.lab.simulation.scene import Sequence
 
 GRAVITY = 9.81
 RATE_HZ = 100.0
-# Of a phone's: noise of a sample, and its zero, which it keeps for the recording, m/s^2.
+# Of a phone's: noise per sample, and bias, constant over a recording, m/s^2.
 _NOISE, _ZERO = 0.03, 0.08
 
 

@@ -1,4 +1,4 @@
-"""Which errors the simulated camera makes, and how strongly."""
+"""Simulated camera errors and their strengths."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ NoiseLaw = Literal["poisson", "other"]
 class Effects:
     """Switches and strengths of the errors of section 2.7; all are on by default.
 
-    Strengths are factors on what the camera model says (1 is the camera as it is, 0 switches the
-    effect off), except `scatter`, which is a share.
+    Strengths are factors on the camera model's values (1 is the real camera, 0 switches the effect
+    off), except `scatter`, which is a fraction.
 
     Attributes
     ----------
     shot_noise
-        Poisson noise of all electrons (signal and ambient light) and noise of reading them out.
+        Poisson noise of all electrons (signal and ambient light), and read-out noise.
     ambient
         Factor on the ambient light.
     saturation
         A bucket that overflows its full well makes the pixel invalid, amplitude 65535.
     under_exposure
-        Cameras that drop weak pixels drop them (the SR4000 never does: it gives noise).
+        Weak pixels are invalid for cameras that drop them (the SR4000 reports noise instead).
     mixed_pixels
-        Light of several sub-rays, and of neighbours through the blur of the lens, adds up in a
-        pixel as phasors: "flying" pixels.
+        Sub-rays, and neighbours by the blur of the lens, sum up in a pixel as phasors: "flying"
+        pixels.
     wrap
-        Ranges beyond one period come back as short ones.
+        Ranges beyond the ambiguity range are wrapped.
     scatter
-        Share of the light that is scattered in the lens over the whole image.
+        Fraction of the light that is scattered in the lens over the whole image.
     multipath
-        Light that came by way of another surface (one bounce): rounded corners.
+        Multipath with one bounce: rounded corners.
     gloss
-        Glossy surfaces mirror their share of the light, and return that much less themselves.
+        Glossy surfaces reflect a fraction of the light specularly, and scatter less.
     smear
-        Each of the four phase images is exposed at its own pose.
+        Each of the four phase images is exposed at a different pose.
     wiggling
-        Odd harmonics of the correlation: an error that is periodic in range.
+        Odd harmonics of the correlation: an error periodic in range.
     pixel_offsets
-        Delay along the read-out chain and from pixel to pixel.
+        Read-out delay and per-pixel offsets.
     amplitude_nonlinearity
-        Strong signals are measured weaker than they are.
+        Compression of strong signals.
     thermal_drift
         Offset that grows as the camera warms up.
     noise
-        "poisson" is the physical law. "other" has the same mean variance, but heavy tails,
-        correlated neighbours and a gain of noise per pixel: what no weight has been told.
+        "poisson" is the physical law. "other" has the same mean variance, but heavy tails, spatial
+        correlation and a per-pixel gain: not modelled by any weight.
     """
 
     shot_noise: bool = True
@@ -80,11 +80,11 @@ class Effects:
 
     @classmethod
     def none(cls, **on: Any) -> Self:
-        """Return an ideal camera, but for the effects given by name."""
+        """Return an ideal camera except for the effects given by name."""
         return cls(**({name: _off(name) for name in SWITCHES} | on))
 
     def without(self, *names: str) -> Self:
-        """Return these effects with the ones named switched off; "all" stands for every one.
+        """Return these effects with the named ones switched off; "all" means every one.
 
         Raises
         ------
@@ -110,9 +110,9 @@ def _off(name: str) -> Any:
 
 
 class Flag(IntFlag):
-    """Which errors hit a pixel: the bits of truth/flags/*.png (uint16).
+    """Errors that affect a pixel: the bits of truth/flags/*.png (uint16).
 
-    Errors of every pixel (noise, wiggling, offsets, drift) have no bit.
+    Errors common to all pixels (noise, wiggling, offsets, drift) have no bit.
     """
 
     NO_RETURN = 1

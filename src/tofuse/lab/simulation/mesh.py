@@ -1,4 +1,4 @@
-"""Triangle meshes and the shapes that scenes are put together from."""
+"""Triangle meshes and the primitives of which scenes consist."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float64, Int64
 from tofuse.geometry import se3
 
-# Edges flatter than this are shaded as one curved surface.
+# Crease angle: edges below it are smoothed.
 CREASE_RAD = np.deg2rad(48.0)
 
 
@@ -27,7 +27,7 @@ class Mesh:
     faces
         (F, 3) indices of vertices.
     surface
-        (F,) which surface (material) each triangle belongs to.
+        (F,) surface id (material) of each triangle.
     """
 
     vertices: Float64
@@ -41,11 +41,11 @@ class Mesh:
         return cls(np.asarray(vertices, float).reshape(-1, 3), f, np.zeros(len(f), np.int64))
 
     def moved(self, T: ArrayLike) -> Self:
-        """Return the mesh mapped by a rigid motion (4, 4)."""
+        """Return the mesh transformed by a rigid motion (4, 4)."""
         return replace(self, vertices=se3.transform(T, self.vertices))
 
     def shifted(self, x: float, y: float, z: float) -> Self:
-        """Return the mesh moved by a vector in m."""
+        """Return the mesh translated by a vector in m."""
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def warped(self, function: Callable[[Float64], Float64]) -> Self:
@@ -62,7 +62,7 @@ class Mesh:
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Put meshes side by side."""
+    """Concatenate meshes."""
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     return Mesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -82,8 +82,8 @@ def face_normals(mesh: Mesh) -> Float64:
 def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     """(F, 3, 3) unit normals at the corners, smooth across edges flatter than `crease_rad`.
 
-    Each corner averages, weighted by area, the triangles that share its vertex and whose normal
-    is within the crease angle of its own.
+    Each corner takes the area-weighted mean of the triangles that share its vertex and whose
+    normals are within the crease angle of its own.
     """
     flat = face_normals(mesh)
     c = mesh.corners()
@@ -123,7 +123,7 @@ def box_between(low: ArrayLike, high: ArrayLike) -> Mesh:
 
 
 def inside_out(mesh: Mesh) -> Mesh:
-    """Return the mesh with its triangles turned round."""
+    """Return the mesh with reversed triangle orientation."""
     return replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 
@@ -136,8 +136,8 @@ def quad(corner: ArrayLike, u: ArrayLike, v: ArrayLike) -> Mesh:
 def grid(points: ArrayLike, *, closed: bool = False) -> Mesh:
     """Sheet through (A, B, 3) points; `closed` joins the last column to the first.
 
-    Points that coincide become one, and triangles without area are dropped, so that a row may
-    shrink to a pole.
+    Coincident points are merged and degenerate triangles dropped, so that a row may collapse to a
+    pole.
     """
     p = np.asarray(points, float)
     rows, columns = p.shape[:2]
@@ -156,7 +156,7 @@ def grid(points: ArrayLike, *, closed: bool = False) -> Mesh:
 
 
 def lathe(profile: ArrayLike, segments: int = 16) -> Mesh:
-    """Turn a profile (K, 2) of (radius, z), z rising, about the z axis."""
+    """Surface of revolution of a profile (K, 2) of (radius, z), z ascending, about the z axis."""
     rz = np.asarray(profile, float)
     angle = np.arange(segments) * (2 * np.pi / segments)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -197,7 +197,7 @@ def superellipsoid(
     """
     half = 0.5 * np.asarray(size, float)
     rows, columns = segments
-    # Steps crowd towards the edges of a boxy shape if spaced evenly in angle.
+    # Steps uniform in angle would concentrate at the edges of a boxy shape.
     eta = np.linspace(-np.pi / 2, np.pi / 2, rows + 1)
     omega = np.arange(columns) * (2 * np.pi / columns)
 

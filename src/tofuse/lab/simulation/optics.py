@@ -1,4 +1,4 @@
-"""From what rays hit to the light in each pixel: sub-rays, mirrors, one bounce, scattering."""
+"""Per-pixel irradiance from ray hits: sub-rays, mirror reflection, one bounce, lens scattering."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.lab.simulation.scene import Scene
 from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 
-# Paths start this far off a surface, so as not to hit it again.
+# Offset in m of secondary rays from their surface, against self-intersection.
 _LIFT = 1e-4
-# A surface point counts as lit if nothing is nearer than it by more than this.
+# Depth tolerance in m of the shadow test.
 _SHADOW = 0.005
-# Light of the highlight of a full mirror, seen head-on, relative to a white wall's; and its width.
+# Highlight of a perfect mirror at normal incidence, relative to a white wall; and its width.
 _HIGHLIGHT, _HIGHLIGHT_RAD = 40.0, 0.03
-# So many that what is left of the sampling, as an error of the range, is about a millimetre.
+# Chosen for a sampling error of the range of about a millimetre.
 _BOUNCE_RAYS = 128
 
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Unit directions (H s + 1, W s + 1, 3) in the camera frame, s to a pixel, or (H, W, 3).
+    """Unit directions (H s + 1, W s + 1, 3) in the camera frame, s per pixel, or (H, W, 3).
 
     Attributes
     ----------
     directions
-        Unit rays in the camera frame, NaN where the lens shows nothing.
+        Unit rays in the camera frame, NaN outside the lens model's domain.
     stride
-        Samples from one pixel to the next.
+        Samples per pixel pitch.
     weights
-        Of the samples in a pixel's window, along rows and columns; their sum is 1.
+        Weights of the samples in a pixel's window along one axis (separable); they sum to 1.
     """
 
     directions: Float64
@@ -45,21 +45,21 @@ class RayGrid:
 
     @property
     def window(self) -> int:
-        """Samples along a side of a pixel's window."""
+        """Side length of a pixel's window in samples."""
         return len(self.weights)
 
     @property
     def centre(self) -> tuple[slice, slice]:
-        """Slices that pick the sample at each pixel's centre."""
+        """Slices of the samples at the pixel centres."""
         pick = slice(self.window // 2, None, self.stride)
         return pick, pick
 
 
 @cache
 def ray_grid(model: CameraModel, mixed: bool) -> RayGrid:
-    """Return the rays of a camera: one in each pixel's centre, or a grid of half pixels.
+    """Return the rays of a camera: one per pixel centre, or a half-pixel grid.
 
-    The grid's samples on the border between two pixels count for both, as the optics' blur does.
+    Samples on the border of two pixels contribute to both, which models the optical blur.
     """
     camera = model.camera
     if not mixed:
@@ -84,16 +84,16 @@ def _directions(camera: Pinhole) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """What comes back along N rays: up to R returns each, and the surface that they hit.
+    """Returned signal of N rays: up to R returns each, and the surface hit.
 
     Attributes
     ----------
     strength
-        (N, R), relative to a white wall at 1 m; the first is the direct one.
+        (N, R) relative to a white wall at 1 m; the first is the direct return.
     path
-        (N, R) in m, there and back.
+        (N, R) round-trip path length in m.
     diffuse
-        (N,) share of light that the surface scatters: albedo, less what it mirrors.
+        (N,) diffuse reflectance: albedo reduced by the specular fraction.
     distance
         (N,) in m, infinite without a hit.
     points, normals
@@ -120,11 +120,11 @@ def trace(
     *,
     gloss: bool,
 ) -> Returns:
-    """Follow rays (N, 3) of the camera frame to what they hit, and on over mirroring surfaces.
+    """Trace rays (N, 3) of the camera frame to the first hit, and on after specular reflection.
 
-    The lamp is at the camera's centre. A surface that mirrors the share g sends back a highlight
-    head-on, and shows what is mirrored in it: lit through the mirror (g^2, the mirror image) and
-    lit directly (g, on a shorter path). g depends on the angle, see `_mirrored`.
+    The light source is at the camera's centre. A surface with specular reflectance g returns a
+    highlight at normal incidence and the reflected scene: illuminated via the mirror (g^2, the
+    mirror image) and directly (g, on a shorter path). g depends on the angle, see `_mirrored`.
     """
     origin = T_room_camera[:3, 3]
     rays = directions @ T_room_camera[:3, :3].T
@@ -151,7 +151,7 @@ def trace(
     strength[:, 0], path[:, 0] = direct, 2 * safe
     g, r, n, d = mirror[shiny], safe[shiny], normals[shiny], rays[shiny]
     tilt = np.arccos(cosine[shiny])
-    # The mirrored lamp stands at twice the distance.
+    # The mirrored light source is at twice the distance.
     strength[shiny, 0] += g * _HIGHLIGHT / (4 * r**2) * np.exp(-((tilt / _HIGHLIGHT_RAD) ** 2))
     onward = d - 2 * (d * n).sum(1, keepdims=True) * n
     start = points[shiny] + _LIFT * n
@@ -165,7 +165,7 @@ def trace(
     strength[shiny, 1] = g * g * albedo * arriving / (r + s) ** 2
     path[shiny, 1] = 2 * (r + s)
     lit, length = lit_by(scene, origin, y, n2, T_room_bodies)
-    # Lit where the lamp shines there, not along the ray.
+    # Illuminated from the light source, not along the ray.
     lit *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(model, directions[shiny])
     strength[shiny, 2] = g * albedo * lit
     path[shiny, 2] = r + s + length
@@ -173,9 +173,9 @@ def trace(
 
 
 def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
-    """Share of the light that a surface mirrors (Schlick 1994): gloss^2 head-on, more askance.
+    """Specular reflectance (Schlick 1994): gloss^2 at normal incidence, rising to grazing.
 
-    So a full mirror mirrors everything, and varnish (gloss 0.2) 4 % head-on and 20 % at most.
+    A perfect mirror reflects all light, varnish (gloss 0.2) 4 % at normal incidence, at most 20 %.
     """
     return gloss * (gloss + (1 - gloss) * (1 - cosine) ** 5)
 
@@ -187,7 +187,7 @@ def lit_by(
     normals: Float64,
     T_room_bodies: Float64 | None,
 ) -> tuple[Float64, Float64]:
-    """Light of the lamp (3,) on points (N, 3): cos / r^2, 0 in shadow; and the distances r."""
+    """Irradiance of points (N, 3) by a lamp (3,): cos / r^2, 0 in shadow; and distances r in m."""
     toward = points - lamp
     length = np.maximum(np.linalg.norm(toward, axis=1), 1e-3)
     toward = toward / length[:, None]
@@ -203,7 +203,7 @@ def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
 
 
 def bounce_weights(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
-    """What a pixel makes of light that arrives at its surface, (H, W, 7): half a path more."""
+    """Response (H, W, 7) of pixels to light arriving at their surface: half a path is added."""
     return _pooled(grid, returns.diffuse[:, None], returns.path[:, :1] / 2, frequency)
 
 
@@ -244,15 +244,14 @@ def bounced_light(
     *,
     gloss: bool = True,
 ) -> list[Float64]:
-    """Light that reaches each pixel's surface by way of another one, for each frequency.
+    """Single-bounce indirect light on each pixel's surface, for each frequency.
 
-    On a coarse grid of pixels, rays leave the surface in fixed directions whose density is
-    the cosine to the normal (so the mean of what they see is the light that the surface
-    scatters), and what they hit is lit by the camera's lamp. Paths run from the lamp to the
-    pixel's surface.
+    On a coarse pixel grid, rays are cast in fixed cosine-weighted directions about the normal (so
+    that their mean radiance is what the surface scatters); the surfaces they hit are illuminated by
+    the camera's lamp. Paths run from the lamp to the pixel's surface.
 
-    The light is relative to what the lamp sends towards the pixel, as direct light is: an image
-    falls off as lens and lamp together do, but this light has not come from there.
+    Like direct light, it is relative to the lamp's emission towards the pixel: the image falloff is
+    that of lens and lamp combined, but this light was emitted in another direction.
 
     Parameters
     ----------
@@ -304,7 +303,7 @@ def bounced_light(
             len(coarse),
             coarse,
         )
-        # Points relative to the lens: the tolerance off a plane grows with the range.
+        # Points relative to the lens: the plane tolerance grows with the range.
         light = _upsampled(coarse.reshape(*shape, -1), x - lamp, n, points - lamp, normals, step)
         out.append(light / beam[..., None])
     return out
@@ -323,10 +322,10 @@ def _upsampled(
 
 
 def _beam(model: CameraModel, directions: Float64) -> Float64:
-    """Light of the lamp in directions (N, 3) of the camera frame, relative to the axis.
+    """Emission of the lamp in directions (N, 3) of the camera frame, relative to the axis.
 
-    Falls as half of the camera's falloff, and to nothing from 1.1 to 1.3 times the angle of
-    the image's corner.
+    Half of the camera's falloff, and a ramp to zero from 1.1 to 1.3 times the angle of the image
+    corner.
     """
     cosine = directions[:, 2] / np.maximum(np.linalg.norm(directions, axis=1), 1e-9)
     corner = float(np.nanmax(np.linalg.norm(model.camera.rays(), axis=-1)))
@@ -338,7 +337,7 @@ def _beam(model: CameraModel, directions: Float64) -> Float64:
 
 @cache
 def _hemisphere(count: int) -> Float64:
-    """Fixed directions (count, 3) around z, as dense as the cosine to it (a spiral)."""
+    """Fixed cosine-weighted directions (count, 3) about z (a spiral)."""
     k = np.arange(count)
     radius = np.sqrt((k + 0.5) / count)
     turn = k * np.pi * (3 - np.sqrt(5))
@@ -346,7 +345,7 @@ def _hemisphere(count: int) -> Float64:
 
 
 def _frames(normals: Float64) -> Float64:
-    """For each normal (N, 3) two tangents and the normal itself, as rows (N, 3, 3)."""
+    """Orthonormal frames (N, 3, 3) of normals (N, 3): rows are two tangents and the normal."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(helper, normals)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
@@ -354,7 +353,7 @@ def _frames(normals: Float64) -> Float64:
 
 
 def combine(weights: Float64, light: Float64) -> Float64:
-    """Pixel's light after a bounce, (H, W, 7): weights and arriving light, harmonic by harmonic."""
+    """Pixel's light after a bounce, (H, W, 7): weights times arriving light per harmonic."""
     out = weights * light
     for c in (1, 3, 5):
         a = weights[..., c] + 1j * weights[..., c + 1]
@@ -364,7 +363,7 @@ def combine(weights: Float64, light: Float64) -> Float64:
 
 
 def blurred(images: Float64, sigma_px: float) -> Float64:
-    """Images (..., H, W) as a lens shows them that spreads a point by sigma_px."""
+    """Images (..., H, W) after a Gaussian blur of sigma_px."""
     if sigma_px == 0:
         return images
     radius = int(np.ceil(3 * sigma_px))
@@ -375,10 +374,10 @@ def blurred(images: Float64, sigma_px: float) -> Float64:
 
 
 class LensScatter:
-    """Light scattered in the lens: a share of every image spreads widely over it.
+    """Light scattered in the lens: a fraction of every image is spread widely over it.
 
-    The spread is a mixture of a Gaussian of 0.06 and one of 0.25 image widths, which are so
-    wide that a grid of every fourth pixel (or coarser) carries them.
+    The point spread function is a mixture of Gaussians of 0.06 and 0.25 image widths, wide enough
+    to be sampled at every fourth pixel (or coarser).
     """
 
     def __init__(self, width: int, height: int, share: float) -> None:
@@ -390,7 +389,7 @@ class LensScatter:
         ]
 
     def __call__(self, image: Float64) -> Float64:
-        """Return the scattered image (H, W)."""
+        """Return the scattered light (H, W) of an image (H, W)."""
         if self.share == 0:
             return image
         out = (1 - self.share) * image

@@ -1,8 +1,8 @@
-"""Things that pass through the view of a moving camera: a person who walks, a box that slides.
+"""Distractors that pass through the view of a moving camera: a walking person, a sliding box.
 
-They cross the image from side to side now and then, in the middle of each pass at such a distance
-that they cover a given share of it, and are far below the floor in between. The camera's true poses
-are in the room; what passes by does not change them.
+They cross the image periodically from side to side, at mid-pass at the distance where they cover a
+given fraction of it, and are far below the floor in between. The camera's true poses are relative
+to the room and not affected.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Kind = Literal["person", "box"]
 
 CARTON = Material("carton", 0.45, 0.25, "print", (0.2, 0.2, 0.2))
 
-# Where they are while they don't pass.
+# Their position between passes.
 _AWAY = np.eye(4)
 _AWAY[2, 3] = -100.0
 _NEAREST_M = 0.6
-# They keep away from what is behind them by this factor on its distance.
+# Largest distance relative to that of the background.
 _CLEAR = 0.75
 _SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)
 _LIMB_RAD, _GAIT_HZ = 0.42, 0.9
@@ -42,19 +42,19 @@ _COLUMNS = 44
 
 @dataclass(frozen=True)
 class Passing:
-    """What passes by, how often, and how large it looks.
+    """Kind, period and apparent size of a passing distractor.
 
     Attributes
     ----------
     kind
-        "person" walks, its limbs swinging; "box" slides.
+        "person" walks with swinging limbs; "box" slides.
     share
-        Of the image that it covers in the middle of a pass, 0 to 1. It is made smaller where
-        there is no place so far away.
+        Fraction of the image covered at mid-pass, 0 to 1. The body is scaled down where the room
+        has not enough depth.
     seconds
-        How long it takes to cross the image.
+        Time to cross the image.
     period_s
-        From the begin of one pass to that of the next.
+        Time from the begin of one pass to that of the next.
     start_s
         Begin of the first pass, after the first frame.
     """
@@ -80,14 +80,14 @@ class Passing:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One rigid part: its mesh about the joint, where the joint is, and which way it swings."""
+    """One rigid part: its mesh relative to the joint, the joint's position, and its swing."""
 
     mesh: Mesh
     joint: Float64 = field(default_factory=lambda: np.zeros(3))
     swing: float = 0.0
 
     def T_thing_part(self, t: float) -> Float64:
-        """(4, 4) pose in the thing's frame at time t in s of its gait."""
+        """(4, 4) pose in the body's frame at time t in s of its gait."""
         angle = self.swing * _LIMB_RAD * np.sin(2 * np.pi * _GAIT_HZ * t)
         T = paths.rotation([0, angle, 0])
         T[:3, 3] = self.joint
@@ -96,14 +96,14 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """One crossing: from one border of the view over its middle to the other, on the floor."""
+    """One crossing on the floor: from one border of the view over its middle to the other."""
 
     start: float
     end: float
     places: Float64  # (3, 2) in m, at the begin, the middle and the end
 
     def T_room_thing(self, t: float) -> Float64:
-        """(4, 4) pose at time t in s; it faces where it goes."""
+        """(4, 4) pose at time t in s, facing the direction of motion."""
         u = (t - self.start) / (self.end - self.start)
         weights = np.array([(1 - u) * (1 - 2 * u), 4 * u * (1 - u), u * (2 * u - 1)])
         slopes = np.array([4 * u - 3, 4 - 8 * u, 4 * u - 1])
@@ -124,24 +124,24 @@ def enter(
     seed: int = 0,
     texture: bool = True,
 ) -> tuple[Scene, Sequence]:
-    """Let something pass through the view.
+    """Add a passing distractor to a scene and its sequence.
 
     Parameters
     ----------
     scene, sequence, model
         The scene, the motion and the camera.
     passing
-        What passes.
+        The distractor.
     first, last
         Times in s of the first and the last frame.
     seed
-        Decides from which side it comes.
+        Seed of the side from which it enters.
     texture
-        False gives it the same albedo as all else.
+        False gives it the uniform albedo.
 
     Returns
     -------
-    The scene and the sequence with it.
+    The extended scene and sequence.
     """
     materials, whole = _person() if passing.kind == "person" else _box()
     span = passing.seconds
@@ -150,7 +150,7 @@ def enter(
     view = _View.of(model)
     farthest = [_clear(scene, sequence, view, t) for t in middles]
     for scale in _SCALES:
-        # A box stays as high as it is, or it would slip out of view below.
+        # A box keeps its height, or it would be below the field of view.
         size = np.full(3, scale) if passing.kind == "person" else np.array([scale, scale, 1.0])
         parts = [_scaled(part, size) for part in whole]
         bodies = [Body(part.mesh) for part in parts]
@@ -177,7 +177,7 @@ def enter(
             else:
                 near = middle
         reach = max(np.hypot(*(part.mesh.vertices[:, :2].T)).max() for part in parts)
-        # Beyond the border by half its own width, so that it comes into view bit by bit.
+        # Beyond the border by half its width, so that it enters the view gradually.
         out = view.half_angle + np.arctan2(reach, distance) + _MARGIN_RAD
         places = [
             _ahead(sequence.T_room_camera(s), distance, angle)
@@ -207,7 +207,7 @@ def enter(
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Coarse rays of a camera (N, 3), unit; and half the angle that it sees across."""
+    """Coarse unit rays (N, 3) of a camera; and half of its horizontal field of view."""
 
     rays: Float64
     half_angle: float
@@ -225,7 +225,7 @@ class _View:
     def covered(
         self, T_room_camera: Float64, bodies: SequenceOf[Body], poses: SequenceOf[Float64]
     ) -> float:
-        """Share of the image that bodies at poses T_room_body cover."""
+        """Fraction of the image covered by bodies at poses T_room_body."""
         nearest = np.full(len(self.rays), np.inf)
         for body, T in zip(bodies, poses, strict=True):
             T_body_camera = se3.inverse(T) @ T_room_camera
@@ -235,7 +235,7 @@ class _View:
 
 
 def _clear(scene: Scene, sequence: Sequence, view: _View, t: float) -> float:
-    """How far away in m something may pass: before most of what is seen."""
+    """Largest distance in m of a pass: in front of most of the visible surfaces."""
     T = sequence.T_room_camera(t)
     hits = scene.cast(T[:3, 3], view.rays @ T[:3, :3].T, sequence.T_room_bodies(t))
     away = hits.distance * view.rays[:, 2]
@@ -248,7 +248,7 @@ def _heading(T_room_camera: Float64) -> float:
 
 
 def _ahead(T_room_camera: Float64, distance: float, angle: float) -> Float64:
-    """Place (2,) on the floor before the camera, turned to the left by an angle in rad."""
+    """Position (2,) on the floor at `distance` m from the camera, `angle` rad to the left."""
     heading = _heading(T_room_camera) + angle
     return T_room_camera[:2, 3] + distance * np.array([np.cos(heading), np.sin(heading)])
 
@@ -258,7 +258,7 @@ def _scaled(part: _Part, size: Float64) -> _Part:
 
 
 def _person() -> tuple[list[Material], list[_Part]]:
-    """A standing person of 1.76 m who faces +x: trunk and head, legs, arms."""
+    """Parts of a standing person of 1.76 m facing +x: trunk and head, legs, arms."""
     shirt, trousers, skin, hair = range(4)
     rod, egg = meshes.rod, meshes.superellipsoid
 

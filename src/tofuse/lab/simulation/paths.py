@@ -1,4 +1,4 @@
-"""How cameras and objects move: poses as functions of time, without jumps in velocity."""
+"""Paths of cameras and objects: poses as functions of time, with continuous velocity."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float64:
 
 
 def still(T: Float64) -> Path:
-    """Stay where one is."""
+    """Constant pose T (4, 4)."""
     return lambda _t: T.copy()
 
 
 def turn_angle(t: float, seconds: float, unevenness: float = 0.02) -> float:
-    """Angle in rad of a full turn by hand in `seconds`: exactly 2 pi then, nearly even between.
+    """Angle in rad of a full turn by hand: exactly 2 pi at `seconds`, at nearly even speed.
 
-    `unevenness` is the largest share by which the speed differs from the mean. The angle carries
-    on before 0 and after the end.
+    `unevenness` is the largest relative deviation of the speed from its mean. The angle continues
+    before 0 and after the end.
     """
     u = t / seconds
     return float(2 * np.pi * u + unevenness / 3 * np.sin(3 * 2 * np.pi * u))
 
 
 def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0.0) -> Path:
-    """Turn the camera about its own vertical (y) axis, to the right.
+    """Rotate the camera about its own vertical (y) axis, to the right.
 
-    `axis_offset_m` is how far the optical centre sits in front of the axis of the stand.
+    `axis_offset_m` is the distance of the optical centre in front of the stand's axis.
     """
     arm = np.eye(4)
     arm[2, 3] = axis_offset_m
@@ -57,17 +57,17 @@ def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0
 
 
 def object_turn(seconds: float) -> Path:
-    """Turn an object about the z axis of its frame, which stands in the room's origin."""
+    """Rotate an object about the z axis of its frame, which is at the room's origin."""
     return lambda t: rotation([0, 0, turn_angle(t, seconds)])
 
 
 def rotation(w: ArrayLike) -> Float64:
-    """Motion (4, 4) that turns by a rotation vector in rad."""
+    """Rotation (4, 4) by a rotation vector (3,) in rad."""
     return se3.exp(np.concatenate([np.zeros(3), np.asarray(w, float)]))
 
 
 def smooth_step(u: float) -> float:
-    """From 0 at u = 0 to 1 at u = 1 with minimal jerk: how a hand moves a thing."""
+    """Minimum-jerk profile from 0 at u = 0 to 1 at u = 1."""
     u = min(max(u, 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
@@ -75,7 +75,7 @@ def smooth_step(u: float) -> float:
 def there_and_back(
     T_room_camera: Float64, length_m: float, seconds: float, outward_share: float = 0.38
 ) -> Path:
-    """Slide along the camera's +x axis by `length_m` and back again, faster on the way out."""
+    """Translate along the camera's +x axis by `length_m` and back, faster on the way out."""
     out = outward_share * seconds
 
     def path(t: float) -> Float64:

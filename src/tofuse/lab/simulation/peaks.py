@@ -1,4 +1,4 @@
-"""The synthetic case of the thesis (4.1.6): MATLAB's `peaks`, seen by 20 cameras on a circle."""
+"""The synthetic case of the thesis (4.1.6): MATLAB's `peaks`, viewed by 20 cameras on a circle."""
 
 from __future__ import annotations
 
@@ -65,24 +65,24 @@ def peaks_cameras() -> Float64:
 
 
 def peaks_seen() -> list[Intp]:
-    """Rows of `peaks_points` that each camera sees: the 2500 nearest to it, ascending."""
+    """Ascending rows of `peaks_points` visible to each camera: the 2500 nearest to it."""
     points = peaks_points()
     distances = [np.linalg.norm(points - T[:3, 3], axis=1) for T in peaks_cameras()]
     return [np.sort(np.argsort(d, kind="stable")[:POINTS_PER_VIEW]) for d in distances]
 
 
 def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
-    """Make the 20 noisy views and the true poses.
+    """Return the 20 noisy views and the true poses.
 
-    Each view holds the 2500 points nearest to its camera, which stands in for occlusion, with
-    fresh Gaussian noise on every coordinate.
+    Each view contains the 2500 points nearest to its camera, as a substitute for occlusion, with
+    independent Gaussian noise on every coordinate.
 
     Parameters
     ----------
     sigma
         Standard deviation of the noise in m.
     seed
-        Draws the noise; two sigmas with the same seed get the same noise, scaled.
+        Of the noise; two sigmas with the same seed get the same noise, scaled.
 
     Returns
     -------

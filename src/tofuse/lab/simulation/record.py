@@ -1,4 +1,4 @@
-"""A whole simulated recording: in memory, or as a native folder with the truth beside it."""
+"""A whole simulated recording: in memory, or as a native folder with its ground truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.models import CameraModel, camera_model
 
-# Is told how many frames are done, and of how many.
+# Called with the number of frames done and the total.
 Progress = Callable[[int, int], None]
 
 _DEFAULT = Effects()
@@ -36,12 +36,12 @@ _DEFAULT = Effects()
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is to be recorded.
+    """A planned recording.
 
     Attributes
     ----------
     raw
-        (N,) indices of the raw frames taken.
+        (N,) indices of the raw frames to render.
     """
 
     scene: scenes.Scene
@@ -56,7 +56,7 @@ class Plan:
         """(N, 4, 4) true T_world_camera."""
         rate = self.sequence.frame_rate_hz
         poses = [self.sequence.T_world_camera(k / rate, self.raw[0] / rate) for k in self.raw]
-        # Exactly, whatever rounding did.
+        # Exactly the identity, despite rounding.
         poses[0] = np.eye(4)
         return np.stack(poses)
 
@@ -66,7 +66,7 @@ class Plan:
         return sensor.calibrated(self.model, self.effects)
 
     def frames(self, progress: Progress | None) -> Iterator[Rendered]:
-        """Take the frames, numbered from 0."""
+        """Render the frames, numbered from 0."""
         for k, raw in enumerate(self.raw):
             rendered = render(
                 self.scene,
@@ -94,13 +94,13 @@ def plan(
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
 ) -> Plan:
-    """Say what is to be recorded; see `simulate` for the parameters.
+    """Plan a recording; see `simulate` for the parameters.
 
     Raises
     ------
     InputError
-        For an unknown scene or camera, a stride or number of frames below 1, or a first frame
-        that is not there.
+        For an unknown scene or camera, a stride or number of frames below 1, or a first frame out
+        of range.
     """
     model = camera_model(camera)
     built, sequence = scenes.build(scene, seed=seed, texture=texture, axis_offset_m=axis_offset_m)
@@ -138,7 +138,7 @@ def simulate_recording(
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Recording:
-    """Make a recording in memory, as reading what `simulate` writes would give it.
+    """Simulate a recording in memory, equal to one read from the output of `simulate`.
 
     The true poses are its reference. See `simulate` for the parameters.
     """
@@ -186,51 +186,47 @@ def simulate(
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Path:
-    """Make a recording and write it as a native folder, with the truth in groundtruth.txt, truth/.
+    """Simulate a recording as a native folder, with the truth in groundtruth.txt and truth/.
 
     Parameters
     ----------
     scene
-        One of `scene.SCENES`, or "peaks", which is made of clouds and has no camera.
+        One of `scene.SCENES`, or "peaks", which consists of clouds and has no camera.
     out
-        The folder; made if missing, must be empty.
+        The folder; created if missing, must be empty.
     camera
         One of `sensor.models.CAMERAS`.
     seed
         Of scene and noise.
     effects
-        Which errors the camera makes.
-    every
-        Take every so manieth raw frame; the stride of the thesis if not given. A raw frame looks
-        the same whatever the stride.
+        Simulated errors of the camera. every Stride over raw frames; that of the thesis if not
+        given. A raw frame does not depend on it.
     frames
-        Stop after so many taken frames.
+        Maximum number of frames.
     first
-        Raw frame to begin with; its camera's frame is the world.
+        First raw frame; its camera frame is the world.
     correction
-        Whether the factory correction is written beside the (uncorrected) depth.
+        Whether the factory correction is written along with the (uncorrected) depth.
     texture
         False gives every surface the same albedo.
     axis_offset_m
         See `scene.build`.
     passing
-        What passes through the view, if anything; its pixels are flagged in truth/flags. The
-        surface in truth/ is without it.
+        A distractor that passes through the view; its pixels are flagged in truth/flags. It is not
+        part of the surface in truth/.
     imu
         Whether an accelerometer on the camera is recorded as well.
     sigma_m
         Noise of "peaks" in m.
     progress
-        Is told how many frames are done, and of how many.
-
-    Returns
+        Called with the number of frames done and the total. Returns
     -------
     The folder.
 
     Raises
     ------
     InputError
-        For an unknown scene or camera, or a number that makes no sense.
+        For an unknown scene or camera, or an invalid number.
     OutputError
         If the folder can't be written or isn't empty.
     """
@@ -259,7 +255,7 @@ def write(
     imu: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Take what is planned and write it as a native folder; see `simulate`."""
+    """Render a planned recording and write it as a native folder; see `simulate`."""
     model, effects, seed = made.model, made.effects, made.seed
     writer = RecordingWriter(
         out,

@@ -1,4 +1,4 @@
-"""One frame of a simulated recording, with the truth about it."""
+"""One frame of a simulated recording, with its ground truth."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _MIRROR_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A frame as the camera reports it, and what is true.
+    """A frame as the camera reports it, and its ground truth.
 
     Attributes
     ----------
     frame
         Its depth is not corrected.
     depth
-        (H, W) float32, true depth in m at the pixels' centres at the frame's timestamp, 0 without
-        a surface; of the frame's depth kind.
+        (H, W) float32, true depth in m at the pixel centres at the frame's timestamp, in the
+        frame's depth kind; 0 without a surface.
     flags
         (H, W) uint16 of `Flag` bits.
     """
@@ -43,7 +43,7 @@ class Rendered:
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """Light of one pose: (F, H, W, 7) direct and by one bounce, and what the rays hit."""
+    """Light of one pose: (F, H, W, 7) direct and single-bounce, and the ray hits."""
 
     direct: Float64
     weights: Float64
@@ -51,7 +51,7 @@ class _Light:
 
 
 def tap_times(model: CameraModel, time_s: float) -> Float64:
-    """Middle (4,) in s of the exposures of the phase images of a frame, around its timestamp."""
+    """Mid-exposure times (4,) in s of a frame's phase images, centred on its timestamp."""
     return time_s + (np.arange(sensor.TAPS) - 1.5) / sensor.TAPS * model.integration_s
 
 
@@ -64,9 +64,9 @@ def render(
     effects: Effects = _DEFAULT,
     seed: int = 0,
 ) -> Rendered:
-    """Take raw frame `index` of a sequence, at the time index / frame rate.
+    """Render raw frame `index` of a sequence, at the time index / frame rate.
 
-    The same frame comes out whichever others are taken, and however many threads there are.
+    The result depends neither on the other frames rendered nor on the number of threads.
     """
     time_s = index / sequence.frame_rate_hz
     grid = optics.ray_grid(model, effects.mixed_pixels)
@@ -144,14 +144,14 @@ class _PhaseImages:
     Attributes
     ----------
     sharp, direct, lit
-        (F, 4, H, W) correlations of direct light, before and after the lens's blur, and with what
-        came by a bounce.
+        (F, 4, H, W) correlations of direct light, before and after the lens blur, and including
+        single-bounce light.
     total
         (F, 4, H, W) all modulated light.
     albedo
-        (H, W) what the surface scatters.
+        (H, W) diffuse reflectance.
     unsmeared
-        (H, W) phasor of direct light, had nothing moved; None where nothing did.
+        (H, W) phasor of direct light without motion during the exposures; None for a static scene.
     """
 
     sharp: Float64
@@ -178,7 +178,7 @@ class _PhaseImages:
         )
 
     def flags(self, model: CameraModel, effects: Effects) -> UInt16:
-        """Bits of the effects that can be told from the light alone."""
+        """Bits of the effects that are determined by the light alone."""
         out = np.zeros(self.direct.shape[2:], np.uint16)
         lit = sensor.phasor_of(self.lit[0])
         direct = sensor.phasor_of(self.direct[0])
@@ -200,7 +200,7 @@ def _bit(mask: Bool, flag: Flag) -> UInt16:
 
 
 def _apart(model: CameraModel, a: Complex128, b: Complex128, limit_m: float = _NOTABLE_M) -> Bool:
-    """Where two phasors differ in range by more than a limit; nowhere if one has no light."""
+    """Mask of phasors whose ranges differ by more than `limit_m`; False where one is zero."""
     turn = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
     return (turn > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)
 
@@ -236,7 +236,7 @@ def _phase_images(
 
 
 def _offset(model: CameraModel, effects: Effects, ranges: Float64, time_s: float) -> Float64:
-    """Delays of pixels and of a warm camera move the phase, and so wrap with it."""
+    """Add the range offsets of pixels and thermal drift, which wrap with the phase."""
     ranges = ranges + effects.pixel_offsets * sensor.pixel_offsets(model)
     ranges += effects.thermal_drift * sensor.drift(model, time_s)
     return np.mod(ranges, model.ambiguity_m)
@@ -259,7 +259,7 @@ def _pixel_flags(
         off = np.max([optics.off_plane(grid, tap.returns) for tap in taps], axis=0)
         limit = np.maximum(_MIXED_M, _MIXED_SHARE * np.where(hit, distance, 0))
         out |= _bit(off > limit, Flag.MIXED)
-    # Half of the shortest period that can be mistaken for another.
+    # Half of the shortest ambiguity period.
     out |= _bit(
         hit & (np.abs(ranges - np.where(hit, distance, 0)) > model.period_m / 2), Flag.WRAPPED
     )

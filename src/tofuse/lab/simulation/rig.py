@@ -1,4 +1,4 @@
-"""Several cameras at once: on one path, or still around what moves; each with its own clock."""
+"""Multi-camera rigs: moving on one path, or static around an object; each with its own clock."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class Mount:
     Attributes
     ----------
     T_rig_camera
-        (4, 4) where it is.
+        (4, 4) pose in the rig.
     model
-        What it is.
+        Camera model.
     frame_rate_hz
-        How fast its own clock makes it run.
+        Frame rate by its own clock.
     time_offset_s
         The rig's time is the camera's timestamp plus this.
     depth_offset_m
-        By how much its ranges are too long.
+        Constant bias of its ranges.
     """
 
     T_rig_camera: Float64 = field(default_factory=lambda: np.eye(4))
@@ -47,7 +47,7 @@ class Mount:
     depth_offset_m: float = 0.0
 
     def sequence(self, rig: scenes.Sequence) -> scenes.Sequence:
-        """Return how this camera sees what happens in front of the rig."""
+        """Return the rig's sequence as seen by this camera."""
 
         def later(path: Path) -> Path:
             return lambda t: path(t + self.time_offset_s)
@@ -64,7 +64,7 @@ class Mount:
 def around(
     centre: SequenceOf[float], radius: float, height: float, count: int, first_rad: float = np.pi
 ) -> list[Float64]:
-    """(4, 4) T_room_camera of `count` cameras evenly around a point, facing it."""
+    """(4, 4) T_room_camera of `count` cameras evenly spaced around a point, facing it."""
     angles = first_rad + 2 * np.pi * np.arange(count) / count
     at = np.asarray(centre, float)
     offsets = [np.array([radius * np.cos(a), radius * np.sin(a), height]) for a in angles]
@@ -72,7 +72,7 @@ def around(
 
 
 def relative(T_room_camera: SequenceOf[Float64]) -> list[Float64]:
-    """T_rig_camera of cameras that stand in a room: the first is the identity."""
+    """T_rig_camera of static cameras given by T_room_camera: the first is the identity."""
     first = se3.inverse(np.asarray(T_room_camera[0]))
     return [np.eye(4), *(np.asarray(first @ T, np.float64) for T in T_room_camera[1:])]
 
@@ -93,11 +93,11 @@ def simulate_rig(
     Parameters
     ----------
     scene, sequence
-        What there is, and how the rig (the sequence's camera) and the rest move.
+        The scene, and the motion of the rig (the sequence's camera) and of all bodies.
     first_s
-        Begin, in s of the rig's time; timestamps are those of the cameras' own clocks.
+        Start in s of the rig's time; timestamps are those of the cameras' own clocks.
     frames, every
-        How many images each camera takes, and every how manieth.
+        Images per camera, and the stride.
     """
     recordings = []
     for k, mount in enumerate(mounts):
@@ -121,7 +121,7 @@ def simulate_rig(
 
 
 def _recorded(made: Plan, mount: Mount, frame: RangeFrame) -> RangeFrame:
-    """Take the factory's correction off an image, and add what is wrong with this camera."""
+    """Apply the factory correction to an image, and add this camera's bias."""
     depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
     if mount.depth_offset_m:
         along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
@@ -132,16 +132,16 @@ def _recorded(made: Plan, mount: Mount, frame: RangeFrame) -> RangeFrame:
 def wander(
     centre: SequenceOf[float], radii: SequenceOf[float], seconds: float, tilt_rad: float = 0.25
 ) -> Path:
-    """A rig carried round a room: along an ellipse, turning once, tilted to and fro.
+    """Path of a rig carried round a room: an ellipse, one full turn, oscillating tilt.
 
     Parameters
     ----------
     centre, radii
-        (3,) and (2,) of the ellipse, m.
+        (3,) and (2,) of the ellipse in m.
     seconds
-        Of one round.
+        Duration of one round.
     tilt_rad
-        By how much it is tilted about its line of sight, and up and down.
+        Amplitude of roll and pitch.
     """
     middle = np.asarray(centre, float)
 

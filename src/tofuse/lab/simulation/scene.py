@@ -1,7 +1,7 @@
-"""What there is to see: surfaces that rays can be cast at, and how camera and object move.
+"""Simulated scenes: surfaces for ray casting, and the motion of camera and object.
 
-A scene stands in its room's frame (z up, the floor at 0). What moves in it are bodies with frames
-and trees of their own: the object that a recording is about, and things that only pass by.
+A scene is given in its room's frame (z up, the floor at 0). Moving bodies have their own frames and
+trees: the recorded object, and distractors that pass by.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tofuse.lab.simulation.mesh import Mesh
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.texture import Material
 
-# Small enough for every thread to get some, large enough that starting one does not count.
+# Small enough to occupy all threads, large enough to amortise their start.
 _RAYS_PER_CHUNK = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What N rays hit.
+    """First hits of N rays.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Hits:
     albedo
         (N,) float32, near-infrared diffuse reflectance 0 to 1 at the hit.
     gloss
-        (N,) float32, share of the light that is mirrored rather than scattered, 0 to 1.
+        (N,) float32, fraction of the light that is reflected specularly, 0 to 1.
     surface
         (N,) int32, index into `Scene.materials`, -1 without a hit.
     """
@@ -57,7 +57,7 @@ class Hits:
 
 
 class Body:
-    """A mesh with its tree, ready for rays."""
+    """A mesh with its tree for ray casting."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -105,7 +105,7 @@ class Body:
 
 
 class Scene:
-    """Surfaces that rays can be cast at.
+    """Surfaces for ray casting.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Scene:
     ambient
         Ambient infrared light, 0 (dark room) to 1 (bright office).
     max_depth_m
-        Where `--object` cuts the background off; None for a scene without a moving object.
+        Depth beyond which `--object` removes the background; None without a moving object.
     materials
         One for each surface id.
     """
@@ -142,14 +142,14 @@ class Scene:
         self._noise = texture.noise_tables(seed)
 
     def with_passing(self, materials: SequenceOf[Material], meshes: SequenceOf[Mesh]) -> Self:
-        """Return the scene with more bodies that move through it.
+        """Return the scene with additional bodies that move through it.
 
         Parameters
         ----------
         materials
-            Of the new bodies; they are numbered after those that the scene has.
+            Of the new bodies; their ids follow those of the scene.
         meshes
-            One for each body, in its own frame; surfaces are numbered as in `materials`.
+            One for each body, in its own frame; surface ids index `materials`.
         """
         scene = copy.copy(self)
         first = len(self.materials)
@@ -163,12 +163,12 @@ class Scene:
 
     @property
     def _moving(self) -> tuple[Body, ...]:
-        """All bodies that move, the object first."""
+        """All moving bodies, the object first."""
         return self._passing if self._object is None else (self._object, *self._passing)
 
     @property
     def passing_surfaces(self) -> frozenset[int]:
-        """Ids of the surfaces of what passes by."""
+        """Surface ids of the passing bodies."""
         return frozenset(int(k) for body in self._passing for k in np.unique(body.mesh.surface))
 
     @property
@@ -186,18 +186,18 @@ class Scene:
         directions: ArrayLike,
         T_room_bodies: ArrayLike | None = None,
     ) -> Hits:
-        """Find what rays hit first.
+        """Return the first hit of each ray.
 
         Parameters
         ----------
         origins
             (N, 3), or (3,) for all, in m in the room's frame. A ray that starts on a surface may
-            hit it again: start 0.1 mm off it, along the normal.
+            hit it again: offset it by 0.1 mm along the normal.
         directions
             (N, 3) unit vectors in the room's frame.
         T_room_bodies
-            (B, 4, 4) poses of what moves in the room, the object first; (4, 4) where it is one
-            body. Identity if not given.
+            (B, 4, 4) poses of the moving bodies, the object first; (4, 4) for a single one.
+            Identity if not given.
         """
         directions = np.asarray(directions)
         origins = np.atleast_2d(np.asarray(origins))
@@ -241,8 +241,8 @@ class Scene:
     def truth_mesh(self) -> tuple[Float64, Int64]:
         """Return the true surface: vertices (V, 3) in m and faces (F, 3).
 
-        For a scene with a moving object, the object in its own frame; else the room in the
-        room's frame. `Sequence.T_world_truth` maps either into the recording's world.
+        It is the moving object in its own frame if there is one, else the room in its frame.
+        `Sequence.T_world_truth` maps either into the recording's world.
         """
         body = self._room if self._object is None else self._object
         return body.mesh.vertices, body.mesh.faces
@@ -250,22 +250,21 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """How camera and object move.
+    """Motion of camera and bodies.
 
     Attributes
     ----------
     frames
         Number of raw frames.
     stride
-        Every how manieth raw frame the thesis used.
+        The thesis used every `stride`-th raw frame.
     frame_rate_hz
-        Raw frames a second; frame k is at time k / frame_rate_hz.
+        Raw frames per second; frame k is at time k / frame_rate_hz.
     camera_path, object_path
-        Poses in the room at a time in s, for any time; `object_path` is None where nothing but
-        the camera moves.
+        Poses in the room as functions of time in s; `object_path` is None if only the camera moves.
     passing_paths
-        Poses in the room of the bodies that pass by, in the scene's order. Poses of the camera
-        are not relative to them.
+        Poses in the room of the passing bodies, in the scene's order. Camera poses are never
+        relative to them.
     """
 
     frames: int
@@ -284,11 +283,11 @@ class Sequence:
         return None if self.object_path is None else self.object_path(t)
 
     def with_passing(self, passing: SequenceOf[Path]) -> Self:
-        """Return the sequence with the paths of more bodies that pass by."""
+        """Return the sequence with the paths of additional passing bodies."""
         return replace(self, passing_paths=(*self.passing_paths, *passing))
 
     def T_room_bodies(self, t: float) -> Float64 | None:
-        """(B, 4, 4) poses of all that moves, the object first, at time t in s; None: nothing."""
+        """(B, 4, 4) poses of the bodies at time t in s, the object first; None without bodies."""
         paths = self.passing_paths
         if self.object_path is not None:
             paths = (self.object_path, *paths)
@@ -297,14 +296,14 @@ class Sequence:
     def T_world_camera(self, t: float, first: float = 0.0) -> Float64:
         """(4, 4) true pose of the camera in the recording's world at time t in s.
 
-        The world is the object where one moves, else the room; its frame is that of the camera
-        at time `first`, so the pose at `first` is the identity.
+        The world is the moving object if there is one, else the room; its frame is the camera's at
+        time `first`, so the pose at `first` is the identity.
         """
-        # Exactly the identity, which the product is only to within rounding.
+        # Exactly the identity; the product has rounding errors.
         return np.eye(4) if t == first else self.T_world_truth(first) @ self._T_subject_camera(t)
 
     def T_world_truth(self, first: float = 0.0) -> Float64:
-        """(4, 4) motion that maps `Scene.truth_mesh` into the recording's world."""
+        """(4, 4) transform of `Scene.truth_mesh` into the recording's world."""
         return se3.inverse(self._T_subject_camera(first))
 
     def _T_subject_camera(self, t: float) -> Float64:
@@ -322,13 +321,13 @@ class SceneKind:
     Attributes
     ----------
     summary
-        What there is to see and how it moves.
+        Content and motion of the scene.
     module
         Module of `tofuse.lab.simulation.scenes` that builds it.
     frames, stride
-        Raw frames of the whole sequence, and every how manieth the thesis used.
+        Number of raw frames of the whole sequence, and the thesis's stride.
     turns
-        Whether the camera turns on a stand, so that `axis_offset_m` has a meaning.
+        Whether the camera rotates on a stand, so that `axis_offset_m` applies.
     """
 
     summary: str
@@ -360,7 +359,7 @@ FRAME_RATE_HZ = 30.0
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What a scene's builder is told: the arguments of `build`."""
+    """Options of a scene's builder: the arguments of `build`."""
 
     name: str
     seed: int
@@ -370,7 +369,7 @@ class SceneOptions:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a scene's builder gives back; `build` makes a scene and a sequence of it."""
+    """Output of a scene's builder, from which `build` makes a scene and a sequence."""
 
     materials: SequenceOf[Material]
     room: Mesh
@@ -396,18 +395,18 @@ def build(
     name
         One of `SCENES`.
     seed
-        Of the textures and of how furniture is turned.
+        Seed of the textures and of the furniture's orientation.
     texture
         False gives every surface the same matte albedo.
     frames
-        Stop after so many raw frames; the motion is the same. All if not given.
+        Number of raw frames to stop after; the motion is the same. All if not given.
     axis_offset_m
-        How far the optical centre sits in front of the axis that the camera turns about.
+        Distance in m of the optical centre in front of the rotation axis of the stand.
 
     Raises
     ------
     InputError
-        For an unknown name, no frames, or an axis offset where no camera turns.
+        For an unknown name, no frames, or an axis offset without a rotating camera.
     """
     kind = SCENES.get(name)
     if kind is None:

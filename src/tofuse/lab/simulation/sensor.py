@@ -1,11 +1,11 @@
-"""From the light in each pixel to what the camera reports: four phase images and their sums.
+"""Sensor model, from per-pixel light to the reported data: four phase images and their sums.
 
-Phase image k correlates the light with the signal shifted by ``theta_k = k pi / 2`` in two
-buckets, whose difference is ``D_k = m sum s c(phase - theta_k)`` electrons with the correlation
-``c(x) = cos x + h3 cos 3x + h5 cos 5x`` (Lange 2000; Lindner et al. 2010 for the harmonics). The
-phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` has the range in its angle and the amplitude in its
-length (eq 2.2). As the third and fifth harmonic are aliased onto the first by four samples, the
-range errs with four periods to one of the phase: wiggling.
+Phase image k correlates the light with the signal shifted by ``theta_k = k pi / 2`` in two buckets,
+whose difference is ``D_k = m sum s c(phase - theta_k)`` electrons with the correlation ``c(x) = cos
+x + h3 cos 3x + h5 cos 5x`` (Lange 2000; Lindner et al. 2010 for the harmonics). The phasor ``((D_0
+- D_2) + i (D_1 - D_3)) / 2`` has the range in its angle and the amplitude in its length (eq 2.2).
+As four samples alias the third and fifth harmonic onto the first, the range error has four periods
+per period of the phase: wiggling.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TAPS = 4
 
 
 def correlate(light: Float64, tap: int, harmonics: tuple[float, float]) -> Float64:
-    """Correlation (H, W) of light (H, W, 7) (channels of `kernels.phasor`) in a phase image."""
+    """Correlation (H, W) of light (H, W, 7) (channels of `kernels.phasor`) in phase image `tap`."""
     # Multiples of a right angle, exactly.
     cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[tap]
     third = harmonics[0] * (light[..., 3] * cosine - light[..., 4] * sine)
@@ -49,7 +49,7 @@ class Exposure:
     total
         (F, 4, H, W) all modulated light.
     ambient
-        (H, W) light that is not modulated, relative to a white wall in a bright office.
+        (H, W) unmodulated light, relative to a white wall in a bright office.
     """
 
     difference: Float64
@@ -59,7 +59,7 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What the camera makes of an exposure.
+    """The camera's measurement of an exposure.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Measurement:
 def expose(
     model: CameraModel, effects: Effects, exposure: Exposure, rng: np.random.Generator | None
 ) -> Measurement:
-    """Fill the buckets and read them out.
+    """Simulate charge integration and read-out of the buckets.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def expose(
 
 
 def unwrapped(model: CameraModel, phasors: Complex128) -> Float64:
-    """Range (H, W) in m of phasors (F, H, W): the fine one's, in the period of the coarse one."""
+    """Range (H, W) in m of phasors (F, H, W): the fine one's, unwrapped by the coarse one."""
     turns = np.mod(np.angle(phasors) / (2 * np.pi), 1)
     fine = turns[0] * model.period_m
     if model.unwrap_hz is None:
@@ -131,8 +131,8 @@ def _noisy(
         a = rng.poisson(mean_a) + rng.normal(0, read, mean_a.shape)
         b = rng.poisson(mean_b) + rng.normal(0, read, mean_b.shape)
         return a, b
-    # A factor that all phase images of a pixel share makes the tails of the range heavy
-    # (Student's t with 5 degrees).
+    # A common factor of a pixel's phase images makes the tails of the range heavy (Student's t with
+    # 5 degrees of freedom).
     shape = mean_a.shape[2:]
     tails = np.sqrt(3 / rng.chisquare(5, shape))
     gain = _noise_gain(shape) * tails
@@ -144,13 +144,13 @@ def _noisy(
 
 @cache
 def _noise_gain(shape: tuple[int, ...]) -> Float64:
-    """Factor on the noise of each pixel, log-normal with mean square 1: some pixels are bad."""
+    """Factor on the noise of each pixel, log-normal with mean square 1."""
     spread = 0.35
     return np.exp(np.random.default_rng([90210]).normal(0, spread, shape) - spread**2)
 
 
 def _alike(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
-    """Normal noise of unit variance, half of which a pixel shares with its neighbours."""
+    """Normal noise of unit variance, half of which is correlated with the neighbours."""
     own, other = rng.normal(size=shape), rng.normal(size=shape)
     shifts = [np.roll(other, shift, (-2, -1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))]
     return (own + sum(shifts) / 2) / np.sqrt(2)
@@ -158,7 +158,7 @@ def _alike(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
 
 @cache
 def pixel_offsets(model: CameraModel) -> Float64:
-    """Range offset (H, W) in m of each pixel: along the read-out chain, and at random."""
+    """Range offset (H, W) in m of each pixel: read-out delay plus a random part."""
     height, width = model.camera.height, model.camera.width
     ramp = np.linspace(-0.5, 0.5, width) + 0.25 * np.linspace(-0.5, 0.5, height)[:, None]
     random = np.random.default_rng([height, width]).normal(0, model.pixel_delay_m, (height, width))
@@ -166,15 +166,15 @@ def pixel_offsets(model: CameraModel) -> Float64:
 
 
 def drift(model: CameraModel, time_s: float) -> float:
-    """Range offset in m of a camera that was switched on at time 0."""
+    """Thermal range offset in m at `time_s` after the camera was switched on."""
     return model.drift_m * (1 - float(np.exp(-max(time_s, 0.0) / model.drift_time_s)))
 
 
 def calibrated(model: CameraModel, effects: Effects) -> DepthCorrection:
-    """Calibrate the camera: the correction that it ships with.
+    """Calibrate the camera: return its factory correction.
 
-    All pixels are shown one known range after another without noise, scattering or bounces, which
-    gives the curve; the offset of each pixel is what remains at one of them.
+    All pixels measure a series of known ranges without noise, scattering or multipath, which gives
+    the curve; a pixel's offset is its residual at one of them.
     """
     per_period = 96
     count = per_period * round(model.ambiguity_m / model.period_m)
@@ -206,12 +206,12 @@ def _of_known_range(model: CameraModel, effects: Effects, true: Float64) -> Floa
 
 
 def scaled_harmonics(model: CameraModel, effects: Effects) -> tuple[float, float]:
-    """Harmonics of the correlation, as strong as the effects say."""
+    """Harmonics of the correlation, scaled by the effects."""
     return model.harmonics[0] * effects.wiggling, model.harmonics[1] * effects.wiggling
 
 
 def reported_amplitude(model: CameraModel, measurement: Measurement) -> Float32:
-    """Amplitude image (H, W) in the camera's counts, whole numbers up to 65534, or saturated."""
+    """Amplitude image (H, W) in the camera's counts: integers up to 65534, or saturated."""
     amplitude = measurement.amplitude
     if model.amplitude_kind == "range_compensated":
         light = np.maximum(model.transmission, 1e-6)
@@ -221,7 +221,7 @@ def reported_amplitude(model: CameraModel, measurement: Measurement) -> Float32:
 
 
 def reported_confidence(model: CameraModel, measurement: Measurement) -> UInt8 | None:
-    """Confidence (H, W): how many thresholds the raw amplitude passes; 0 where saturated."""
+    """Confidence (H, W): number of thresholds below the raw amplitude; 0 where saturated."""
     if not model.confidence_thresholds:
         return None
     level = np.searchsorted(model.confidence_thresholds, measurement.amplitude, side="right")
@@ -229,9 +229,9 @@ def reported_confidence(model: CameraModel, measurement: Measurement) -> UInt8 |
 
 
 def reported_sigma(model: CameraModel, measurement: Measurement) -> Float32 | None:
-    """Standard deviation (H, W) in m of the range that the camera itself states, or None.
+    """Standard deviation (H, W) in m of the range, as reported by the camera, or None.
 
-    What it can know: its read-out noise and the shot noise of the amplitude that it measured.
+    Estimated from the read-out noise and the shot noise of the measured amplitude.
     """
     if not model.reports_noise:
         return None

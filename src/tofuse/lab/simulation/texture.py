@@ -1,4 +1,4 @@
-"""What a surface looks like to an infrared camera: albedo, pattern, gloss."""
+"""Appearance of a surface to an infrared camera: albedo, pattern, gloss."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class Material:
     Attributes
     ----------
     name
-        Of the surface, for people and tests.
+        Of the surface, for display and tests.
     albedo
         Mean diffuse reflectance, 0 to 1.
     contrast
-        Standard deviation of the pattern as a share of the mean, about.
+        Approximate standard deviation of the pattern relative to the mean.
     pattern
         "plain"; "noise" (three octaves), "wood" (grain), "tiles" (joints), "print" (a poster:
         noise with strong steps), "speckle" (carpet).
     scale_m
-        Size of the largest blotches along the three axes of the body's frame.
+        Size of the largest features along the three axes of the body's frame.
     gloss
-        Share of the light that is mirrored rather than scattered, 0 to 1.
+        Fraction of the light that is reflected specularly, 0 to 1.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Material:
     gloss: float = 0.0
 
     def uniform(self) -> Self:
-        """Return the same surface, matte and of the albedo that all uniform surfaces share."""
+        """Return the same surface, matte and with the common albedo of uniform surfaces."""
         return replace(self, albedo=UNIFORM_ALBEDO, contrast=0.0, pattern="plain", gloss=0.0)
 
 
@@ -65,7 +65,7 @@ def noise_tables(seed: int) -> tuple[Int32, Float64]:
 
 
 def parameter_rows(materials: Sequence[Material], seed: int) -> Float64:
-    """(S, 10) parameters of the surfaces; each pattern is shifted to its own place in the noise."""
+    """(S, 10) parameters of the surfaces; each pattern has its own offset in the noise."""
     rows = np.zeros((len(materials), kernels.COLUMNS))
     for k, material in enumerate(materials):
         shift = np.random.default_rng([seed, 2, k]).uniform(0.0, 97.0, 3)

@@ -1,4 +1,4 @@
-"""Putting meshes and materials together, and what several scenes share."""
+"""Assembly of meshes and materials, and parts common to several scenes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Assembly:
         self._parts.extend(part.of_surface(surface) for part in parts)
 
     def add_mixed(self, materials: Sequence[Material], part: Mesh) -> None:
-        """Add one part whose surfaces are numbered as in `materials`."""
+        """Add one part whose surface ids index `materials`."""
         ids = np.array([self._id(material) for material in materials])
         self._parts.append(replace(part, surface=ids[part.surface]))
 
@@ -37,12 +37,12 @@ class Assembly:
         return self.materials.index(material)
 
     def mesh(self) -> Mesh:
-        """Return everything added so far."""
+        """Return the mesh of all parts added so far."""
         return meshes.joined(self._parts)
 
 
 def placed(position: tuple[float, float], yaw: float) -> Float64:
-    """Pose of furniture on the floor, turned about z."""
+    """Pose (4, 4) of furniture on the floor, rotated by `yaw` rad about z."""
     T = paths.rotation([0, 0, yaw])
     T[:2, 3] = position
     return T
@@ -69,5 +69,5 @@ WHITE = Material("ceiling", 0.78)
 
 
 def studio(assembly: Assembly) -> None:
-    """Add a room around an object at the origin and a camera at -x: the background is 3 m off."""
+    """Add a room around an object at the origin and a camera at -x: the background is 3 m away."""
     shell(assembly, (-2.2, -2.6, 0), (3.0, 2.6, 2.6), [BACKDROP] * 4, LINOLEUM, WHITE)

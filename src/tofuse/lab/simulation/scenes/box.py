@@ -25,7 +25,7 @@ def plan(options: SceneOptions) -> Plan:
     turning.add(BOX, meshes.box((WIDTH, DEPTH, HEIGHT), (0, 0, BOTTOM + HEIGHT / 2)))
     turning.add(STEEL, meshes.rod((0, 0, 0.031), (0, 0, BOTTOM - 0.012), 0.02))
     turning.add(STEEL, meshes.rod((0, 0, BOTTOM - 0.012), (0, 0, BOTTOM), 0.08, segments=20))
-    # High enough above the top face to see it well, not so high that the sides foreshorten.
+    # High enough above the top face to see it well, but the sides not foreshortened.
     camera = paths.look_at((-DISTANCE, 0, 1.68), (0, 0, BOTTOM + HEIGHT / 2 - 0.01))
     return Plan(
         turning.materials,

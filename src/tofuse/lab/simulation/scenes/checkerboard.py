@@ -1,4 +1,4 @@
-"""A printed checkerboard on a long wall, looked at from many places, standing still at each."""
+"""A printed checkerboard on a long wall, viewed from many static poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tofuse.lab.simulation.texture import Material
 
 # Inner corners, and the side of a square in m.
 COLUMNS, ROWS, SQUARE_M = 8, 6, 0.1
-# Of white paper around the squares, m; and how far paper and print lie before the wall.
+# Margin of white paper, m; and offsets of paper and print in front of the wall.
 MARGIN_M, _PAPER_M = 0.08, 0.0005
 PLACES = 32
 SECONDS_EACH = 3.0
-# Of the time at each place, spent on the way to the next one.
+# Fraction of the time per pose spent moving to the next one.
 _MOVING = 0.8
 _HEIGHT = 1.5
 
@@ -29,7 +29,7 @@ INK = Material("ink", 0.12)
 
 
 def plan(options: SceneOptions) -> Plan:
-    """Lay out wall and board; the board's middle is at the height of the camera's."""
+    """Lay out wall and board; the board's centre is at the camera's height."""
     assembly = Assembly([])
     assembly.add(WALL, meshes.quad((-60, 0, -60), (120, 0, 0), (0, 0, 120)))
     width, height = (COLUMNS + 1) * SQUARE_M, (ROWS + 1) * SQUARE_M
@@ -56,9 +56,9 @@ def _upright(x: float, z: float, y: float, width: float, height: float) -> meshe
 
 
 def places(seed: int) -> Float64:
-    """(PLACES, 4, 4) poses T_room_camera: all distances, tilts and parts of the image in turn."""
+    """(PLACES, 4, 4) poses T_room_camera: covers distances, tilts and image regions."""
     rng = np.random.default_rng([seed, 30])
-    # A narrow lens sees the whole board from 1.4 m on; a wide one fills its image from nearer.
+    # A narrow lens sees the whole board from 1.4 m on; a wide one needs shorter distances.
     near, middle = 6, 16
     distance = np.concatenate(
         [
@@ -76,7 +76,7 @@ def places(seed: int) -> Float64:
         )
         position = np.array([0, 0, _HEIGHT]) + d * direction
         T = paths.look_at(position, (0, 0, _HEIGHT))
-        # Off the middle, as far as a narrow image has room at this distance, and rolled.
+        # Off-centre, within a narrow field of view at this distance, and rolled.
         room = np.radians([21.0, 17.0]) - np.arctan([0.45 / d, 0.35 / d])
         off = rng.uniform(-1, 1, 2) * np.maximum(room, np.radians(3)) * 0.9
         roll = np.radians(rng.uniform(-20, 20))
@@ -85,13 +85,13 @@ def places(seed: int) -> Float64:
 
 
 def _stops(poses: Float64) -> Path:
-    """Stand still at each pose in turn; between them, move with minimal jerk."""
+    """Path that rests at each pose in turn, with minimum-jerk motion in between."""
     steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
 
     def path(t: float) -> Float64:
         place = min(max(t / SECONDS_EACH, 0.0), len(poses) - 1.0)
         k = min(int(place), len(poses) - 2)
-        # Half of the rest before the way, half of it after.
+        # Half of the rest precedes the motion, half follows it.
         share = paths.smooth_step((place - k - (1 - _MOVING) / 2) / _MOVING)
         return np.asarray(poses[k] @ se3.exp(share * steps[k]))
 

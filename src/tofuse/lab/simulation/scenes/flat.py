@@ -1,9 +1,8 @@
-"""Four rooms of 4.4 x 4.4 m in a square, each joined to the next by a doorway, and a walk through.
+"""Four rooms of 4.4 x 4.4 m in a square, connected by doorways, and a walk through them.
 
-Room k is room 0 turned by k quarter turns about the middle of the flat: each has a doorway in the
-middle of its +y wall, by which the walk enters, and one in its +x wall, by which it leaves. In
-`flat` rooms have different walls and furniture; in `flat-alike` all have the same, with small
-differences.
+Room k is room 0 rotated by k quarter turns about the middle of the flat: each has a doorway in the
+middle of its +y wall, where the path enters, and one in its +x wall, where it leaves. In `flat`
+rooms have different walls and furniture; in `flat-alike` all have the same, with small differences.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ _WALK = [
 
 
 def T_flat_room(room: int) -> Float64:
-    """(4, 4) pose of a room's frame, whose origin is in the middle of its floor."""
+    """(4, 4) pose of a room's frame, whose origin is the middle of its floor."""
     corner = np.eye(4)
     corner[:2, 3] = -(HALF + WALL / 2)
     return paths.rotation([0, 0, room * np.pi / 2]) @ corner
@@ -139,7 +138,7 @@ def _poster(
 
 
 def _study(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
-    """Furnish with desk, chair, shelf and plant; where exactly they stand differs a little."""
+    """Furnish with desk, chair, shelf and plant at slightly random poses."""
 
     def near(x: float, y: float, yaw: float) -> Float64:
         off = rng.normal(0.0, 0.03, 2)
@@ -197,7 +196,7 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
     for room in range(ROOMS):
         T = T_flat_room(room)
         for k, (x, y, yaw) in enumerate(_WALK):
-            # No room is walked through like another; a doorway leaves little choice.
+            # Waypoints vary between rooms, but little in the doorways.
             off = rng.normal(0.0, 0.02 if k == 0 else 0.08, 2)
             points.append(se3.transform(T, np.array([[x + off[0], y + off[1], EYE]]))[0])
             turn = rng.normal(0.0, 2.0 if k == 0 else 5.0)
@@ -208,7 +207,7 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
     yaws = yaws[first:] + [yaw + 2 * np.pi for yaw in yaws[:first]]
     points, yaws = [*points, points[0]], [*yaws, yaws[0] + 2 * np.pi]
     places, yaw_rad = np.array(points), np.array(yaws)
-    # Even speed, but slower where the camera turns.
+    # Constant speed, but slower where the camera turns.
     effort = np.linalg.norm(np.diff(places, axis=0), axis=1) + 0.6 * np.abs(np.diff(yaw_rad))
     times = seconds * np.concatenate([[0.0], np.cumsum(effort)]) / effort.sum()
     place = CubicSpline(times, places, bc_type="periodic")
@@ -230,6 +229,6 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
 
 
 def room_of(position: Float64) -> int:
-    """Return in which room a place (3,) in the flat's frame is."""
+    """Return the room of a position (3,) in the flat's frame."""
     x, y = position[:2]
     return {(False, False): 0, (True, False): 1, (True, True): 2, (False, True): 3}[x > 0, y > 0]

@@ -1,4 +1,4 @@
-"""Furniture: office chair, desk with things on it, plant. Forward is +x, the floor is z = 0."""
+"""Furniture: office chair, desk with objects on it, plant. Forward is +x, the floor is z = 0."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def star_base() -> list[Mesh]:
 
 
 def cushion() -> Mesh:
-    """Seat of 0.48 x 0.49 m whose front edge falls off; its top is at z = 0.50."""
+    """Seat of 0.48 x 0.49 m with a sloping front edge; its top is at z = 0.50."""
 
     def fall(p: Float64) -> Float64:
         q = p.copy()
@@ -50,7 +50,7 @@ def backrest() -> Mesh:
     """Back of 0.44 x 0.52 m, curved around the sitter and leaning back."""
 
     def curve(p: Float64) -> Float64:
-        # Thickness was built along z: turn it to x, then bend.
+        # Built with its thickness along z: rotate it to x, then bend.
         x, y, z = p[:, 2], p[:, 0], p[:, 1]
         lean = -0.20 * (z + 0.1)
         lumbar = 0.025 * np.cos(np.clip((z + 0.10) / 0.20, -1, 1) * np.pi / 2)
@@ -99,7 +99,7 @@ LAMP = Material("lamp", 0.6, 0.0, "plain", gloss=0.1)
 
 
 def desk(assembly: Assembly, T: Float64) -> None:
-    """Add a desk of 1.6 x 0.75 x 0.73 m, long along y, the sitter at +x, with things on it."""
+    """Add a desk of 1.6 x 0.75 x 0.73 m, long along y, the sitter at +x, with objects on it."""
     top = 0.73
 
     def add(material: Material, *parts: Mesh) -> None:

@@ -68,7 +68,7 @@ def bed(assembly: Assembly, T: Float64) -> None:
 def shelf(
     assembly: Assembly, T: Float64, rng: np.random.Generator, width: float = 0.9, boards: int = 6
 ) -> None:
-    """Add a shelf 0.30 m deep, full of books of many sizes; its back is at x = 0."""
+    """Add a shelf 0.30 m deep with books of random sizes; its back is at x = 0."""
     pitch, half = 0.34, width / 2
     top = 0.04 + pitch * (boards - 1)
     _add(

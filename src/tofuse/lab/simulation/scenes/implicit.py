@@ -1,6 +1,6 @@
 """Smooth bodies as blends of simple shapes, and their triangulation.
 
-A shape is a function that gives the (approximate) signed distance of points (..., 3) in m,
+A shape is a function of the (approximate) signed distance of points (..., 3) in m,
 negative inside. Shapes are blended by Quilez's polynomial smooth minimum, and triangulated by
 naive surface nets (Gibson 1998), which are closed wherever the shape lies inside the grid.
 """
@@ -32,7 +32,7 @@ def ellipsoid(centre: ArrayLike, radii: ArrayLike) -> Shape:
 
 
 def limb(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> Shape:
-    """Capsule whose radius changes evenly from start to end."""
+    """Capsule whose radius changes linearly from start to end."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     axis = b - a
 
@@ -45,7 +45,7 @@ def limb(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> 
 
 
 def blend(shapes: Sequence[tuple[Shape, float]]) -> Shape:
-    """Union of (shape, m over which it is blended with those before it)."""
+    """Smooth union of (shape, blending width in m with those before it)."""
 
     def distance(p: Float64) -> Float64:
         total = shapes[0][0](p)
@@ -97,7 +97,7 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
     number = np.full(index.size, -1)
     number[used] = np.arange(len(used))
     q = number[np.concatenate(quads)]
-    # The shorter diagonal bends less.
+    # Split along the shorter diagonal.
     p = vertices[q]
     short = np.linalg.norm(p[:, 0] - p[:, 2], axis=1) <= np.linalg.norm(p[:, 1] - p[:, 3], axis=1)
     first = np.where(short[:, None], q[:, [0, 1, 2]], q[:, [0, 1, 3]])
@@ -124,7 +124,7 @@ def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
 
 
 def settled(shape: Shape, vertices: Float64, step: float) -> Float64:
-    """Move vertices onto the surface along its gradient, by no more than half a cell."""
+    """Project vertices onto the surface along its gradient, by at most half a cell."""
     moved = vertices
     h = 1e-4
     for _ in range(3):

@@ -101,10 +101,10 @@ def _fittings(assembly: Assembly) -> None:
 
 
 def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
-    """Add seven chairs evenly around the camera, more or less facing it."""
+    """Add seven chairs evenly around the camera, roughly facing it."""
     for k, fabric in enumerate(FABRICS):
         around = 2 * np.pi * (k + 0.35) / CHAIRS
-        # Evenly in angle, so that one is always in view, on an ellipse clear of the walls.
+        # Evenly in angle, so that one is always visible, on an ellipse clear of the walls.
         c, s = np.cos(around), np.sin(around)
         position = np.array([c, s]) / np.hypot(c / 2.15, s / 1.12)
         T = paths.rotation([0, 0, around + np.pi + rng.uniform(-0.9, 0.9)])

@@ -27,7 +27,7 @@ SEAT = Material("seat", 0.3, 0.1, "speckle", (0.03, 0.03, 0.03))
 def body() -> list[tuple[Shape, float, Material]]:
     """Shapes of a seated person, facing +x, with the seat at z = 0.47 m.
 
-    Returns (shape, m over which it blends with those before it, material).
+    Returns (shape, blending width in m with those before it, material).
     """
     parts: list[tuple[Shape, float, Material]] = [
         (ellipsoid((-0.01, 0, 0.89), (0.115, 0.155, 0.19)), 0.05, SHIRT),
@@ -47,7 +47,7 @@ def body() -> list[tuple[Shape, float, Material]]:
         (ellipsoid((-0.012, 0, 1.290), (0.096, 0.083, 0.108)), 0.01, HAIR),
     ]
     for side in (-1, 1):
-        # Left and right differ a little, as they do in people.
+        # Slightly asymmetric, as real people.
         lift = 0.02 if side > 0 else 0.0
         elbow = (-0.03 - lift, 0.255 * side, 0.755 + lift)
         wrist = (0.20, 0.175 * side, 0.655 + 0.5 * lift)
@@ -76,7 +76,7 @@ def person() -> tuple[Mesh, list[Material]]:
     materials = [SHIRT, TROUSERS, SKIN, HAIR]
 
     def distances(p: Float64) -> Float64:
-        """Distance of each point to the nearest part of each material, (4, V)."""
+        """Distance (4, V) in m of points to the nearest part of each material."""
         return np.stack([np.min([s(p) for s, _, m in parts if m is own], 0) for own in materials])
 
     vertices = implicit.settled(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
@@ -85,19 +85,19 @@ def person() -> tuple[Mesh, list[Material]]:
 
 
 def _snapped(mesh: Mesh, distance: Float64) -> Float64:
-    """Move vertices next to a border between materials onto it, so that it does not zigzag."""
+    """Move vertices next to a border between materials onto it, to smooth it."""
     label = distance.argmin(0)
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     a, b = edges[label[edges[:, 0]] != label[edges[:, 1]]].T
-    # How much nearer the other end's material is, at either end: 0 on the border.
+    # Difference of the distances to both materials, at either end: 0 on the border.
     at_a = distance[label[b], a] - distance[label[a], a]
     at_b = distance[label[b], b] - distance[label[a], b]
     share = at_a / np.maximum(at_a - at_b, 1e-12)
     near = share <= 0.5
     a, b, share = a[near], b[near], share[near]
     step = share[:, None] * (mesh.vertices[b] - mesh.vertices[a])
-    # The last assignment of a vertex is the one that stays: the shortest step.
+    # The last assignment of a vertex prevails: the shortest step.
     order = np.argsort(-np.linalg.norm(step, axis=1), kind="stable")
     vertices = mesh.vertices.copy()
     vertices[a[order]] += step[order]
