@@ -1,4 +1,4 @@
-"""Views moved side by side, each against all others (Bergevin et al. 1996)."""
+"""Simultaneous update of all views, each against all others (Bergevin et al. 1996)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tofuse.kernels.icp import transform_points
 from tofuse.lab.methods.multiview import Cloud, Pairs, Relaxing
 from tofuse.parts import part
 
-# Relative size of eigenvalues that are rounding errors.
+# Relative size below which eigenvalues are rounding errors.
 _RANK = 1e-10
 
 
 @part("refinement", "bergevin", label="validated")
 @dataclass(frozen=True)
 class Bergevin(Relaxing):
-    """In each round each view moves to the tangent planes of all others, where these were before.
+    """Each round aligns each view with the tangent planes of all others at their previous poses.
 
-    The views form a star about the first, which stays. The increments of all views are worked
-    out from the same poses and applied together, so that no order of the views is preferred and
-    the error is spread over all of them, not heaped up at the end of a chain. Chen and Medioni's
+    The views form a star about the first, which is fixed. The increments of all views are computed
+    from the same poses and applied together, so that the order of the views does not matter and the
+    error is distributed over all of them, not accumulated along a chain. Chen and Medioni's
     distance to the tangent plane, small angles.
     """
 

@@ -15,9 +15,9 @@ from tofuse.registration.interfaces import Alignment, Matches, Rejector
 @part("rejector", "normal", label="validated")
 @dataclass(frozen=True)
 class NormalCompatibility(Rejector):
-    """Drops pairs whose normals point in different directions (Zhang 1994; Pulli 1999).
+    """Drops pairs whose normals differ in direction (Zhang 1994; Pulli 1999).
 
-    Pairs without a normal stay out as well.
+    Pairs without a normal are dropped as well.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class NormalCompatibility(Rejector):
 @part("rejector", "curvature", label="validated")
 @dataclass(frozen=True)
 class CurvatureCompatibility(Rejector):
-    """Drops pairs where one surface is bent more than the other (section 2.9.4).
+    """Drops pairs of different curvature (section 2.9.4).
 
     Attributes
     ----------
     tolerance
-        Largest difference of the mean curvatures times the resolution.
+        Largest difference of the mean curvatures, times the resolution.
     """
 
     tolerance: float = 0.2
@@ -96,7 +96,7 @@ class ColorCompatibility(Rejector):
     Attributes
     ----------
     tolerance
-        Largest distance of the colours in RGB, where black and white lie sqrt(3) apart.
+        Largest RGB distance; black and white differ by sqrt(3).
     """
 
     tolerance: float = 0.2
@@ -114,10 +114,10 @@ class ColorCompatibility(Rejector):
 @part("rejector", "boundary", label="validated")
 @dataclass(frozen=True)
 class Boundary(Rejector):
-    """Drops pairs whose target point is where its surface ends (Turk and Levoy 1994).
+    """Drops pairs whose target point is on the surface boundary (Turk and Levoy 1994).
 
-    Where the views overlap in part, all points beyond the overlap are closest to its edge, and
-    would pull the source towards the target.
+    With partial overlap, all points beyond the overlap are closest to its boundary, and would bias
+    the motion towards the target.
     """
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
@@ -130,12 +130,12 @@ class Boundary(Rejector):
 class Trimmed(Rejector):
     """Keeps the shortest pairs, as many as the source has points in the overlap (TrICP).
 
-    Chetverikov, Stepanov and Krsek (2005). Of equally short pairs the first stay.
+    Chetverikov, Stepanov and Krsek (2005). Of equally short pairs the first are kept.
 
     Attributes
     ----------
     share
-        The overlap: a share of all of the source's points that take part.
+        The overlap, as a fraction of the source's selected points.
     """
 
     share: float = 0.8

@@ -1,4 +1,4 @@
-"""Comprehensive ICP (Almhdie, Leger, Deriche and Ledee 2007): pairs that no two points share."""
+"""Comprehensive ICP (Almhdie, Leger, Deriche and Ledee 2007): one-to-one pairs."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
 
-# Neighbours that a point asks for at first; it asks for twice as many when all are taken.
+# Initial number of neighbours per query, doubled when all are taken.
 _FIRST = 8
 
 
 @part("matcher", "comprehensive", label="validated")
 @dataclass(frozen=True)
 class Comprehensive(Matcher):
-    """The shortest pairs of all, each point in one pair at most.
+    """The shortest pairs, each point in at most one pair.
 
     The paper writes the distances of all points into a lookup matrix, takes the smallest entry,
-    strikes out its row and its column, and goes on. The same pairs come from a kd-tree, without
-    the matrix: each source point offers its nearest target point that is free, and the shortest
-    offer is taken.
+    deletes its row and its column, and repeats. A kd-tree gives the same pairs without the matrix:
+    each source point proposes its nearest free target point, and the shortest proposal is accepted.
     """
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: Points) -> Search:
-        """Build the tree, once for all iterations: the target doesn't move."""
+        """Build the tree, once for all iterations."""
         return _LookupSearch(KdTree(target.points))
 
 
@@ -83,7 +82,7 @@ class Cicp(Variant):
     points
         Random points of the source, against all of the target.
     max_iterations
-        Iterations after which it ends in any case.
+        Maximum number of iterations.
     """
 
     resolution: float = 0.01

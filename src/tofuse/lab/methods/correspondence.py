@@ -19,23 +19,23 @@ from tofuse.registration.shape import tree_of
 
 Invariant = Literal["curvature", "moments"]
 
-# Lines this close to a tangent plane (cosine) never meet it in a useful place.
+# Min cosine between line and normal; lines closer to the tangent plane are rejected.
 _GRAZING = 0.1
 
 
 @part("matcher", "normal-shooting", label="validated")
 @dataclass(frozen=True)
 class NormalShooting(Matcher):
-    """Where the normal of a source point meets the target's surface (Chen and Medioni 1992).
+    """Intersection of a source point's normal with the target's surface (Chen and Medioni 1992).
 
-    The surface is only known at points, so the meeting point is approached as in the paper: the
-    line is cut with the tangent plane of the closest target point, then with that of the point
-    closest to the cut, and so on. The target point closest to the last cut is taken.
+    The surface is sampled, so the intersection is iterated as in the paper: the line is intersected
+    with the tangent plane of the closest target point, then with that of the point closest to the
+    intersection, and so on. The target point closest to the last intersection is returned.
 
     Attributes
     ----------
     steps
-        Tangent planes that are tried.
+        Number of iterations.
     """
 
     steps: int = 3
@@ -46,7 +46,7 @@ class NormalShooting(Matcher):
             raise ValueError(f"steps is {self.steps}, not 1 or more")
 
     def prepare(self, target: Points) -> Search:
-        """Build the tree, once for all iterations: the target doesn't move."""
+        """Build the tree, once for all iterations."""
         return _NormalSearch(KdTree(target.points), self.steps)
 
 
@@ -81,7 +81,7 @@ class _NormalSearch:
 @part("matcher", "projection", label="validated")
 @dataclass(frozen=True)
 class Projection(Matcher):
-    """The target point on the pixel that a source point falls on ("reverse calibration").
+    """The target point on the pixel to which a source point projects ("reverse calibration").
 
     Blais and Levine (1995). Needs a target with a camera, best with all of its points.
     """
@@ -89,17 +89,17 @@ class Projection(Matcher):
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def prepare(self, target: Points) -> Search:
-        """Find the point of each pixel."""
+        """Index the target's points by pixel."""
         return _GridSearch(*_grid(target), 0)
 
 
 @part("matcher", "projection-search", label="validated")
 @dataclass(frozen=True)
 class ProjectionSearch(Matcher):
-    """The closest point near the pixel that a source point falls on (section 2.9.3).
+    """The closest point around the pixel to which a source point projects (section 2.9.3).
 
-    From the closest of the pixels within `radius` the search goes on round that one, until none
-    is closer. Needs a target with a camera.
+    The search continues around the closest point within `radius` until none is closer. Needs a
+    target with a camera.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class ProjectionSearch(Matcher):
             raise ValueError(f"radius is {self.radius}, not 1 or more")
 
     def prepare(self, target: Points) -> Search:
-        """Find the point of each pixel."""
+        """Index the target's points by pixel."""
         return _GridSearch(*_grid(target), self.radius)
 
 
@@ -152,10 +152,10 @@ class _GridSearch:
 @part("matcher", "closest-compatible", label="validated")
 @dataclass(frozen=True)
 class ClosestCompatible(Matcher):
-    """The closest target point of like amplitude (ICCP: Godin, Rioux and Baribeau 1994).
+    """The closest target point of similar amplitude (ICCP: Godin, Rioux and Baribeau 1994).
 
-    Points are compatible if their amplitudes differ by less than a factor. The search passes over
-    the others, where a rejector would lose the pair.
+    Points are compatible if their amplitudes differ by less than a factor. The search skips
+    incompatible points, where a rejector would drop the pair.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class _CompatibleSearch:
     tolerance: float
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        # Amplitudes choose; among the compatible only the distance in space counts.
+        # Amplitudes select candidates; among these only the distance in space counts.
         asked = _log_amplitude(alignment.source)
         index, squared = self.tree.nearest_featured(
             alignment.moved, self.features, asked, self.tolerance, reach, 0.0
@@ -194,7 +194,7 @@ class _CompatibleSearch:
 
 
 def _log_amplitude(points: Points) -> Float64:
-    """(n, 1) logarithm of the amplitude; NaN, which matches nothing, where there is none."""
+    """(n, 1) logarithm of the amplitude; NaN, which never matches, where missing."""
     amplitude = points.amplitude
     return np.log(np.where(amplitude > 0, amplitude, np.nan))[:, None]
 
@@ -204,19 +204,19 @@ def _log_amplitude(points: Points) -> Float64:
 class ClosestInvariant(Matcher):
     """The target point closest in space and in invariant features (ICPIF: Sharp et al. 2002).
 
-    Least is ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features don't change when a view is
-    moved: mean curvature, or the three eigenvalues of the second moments of the surface in a ball
-    (whose symmetric functions are the paper's moment invariants J1 to J3). They are scaled by
-    their mean absolute deviation over the target, and their weight is in resolutions.
+    Minimises ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features are pose-invariant: mean
+    curvature, or the three eigenvalues of the second moments of the surface in a ball (whose
+    symmetric functions are the paper's moment invariants J1 to J3). They are scaled by their mean
+    absolute deviation over the target, and their weight is in resolutions.
 
     Attributes
     ----------
     features
-        Which: "curvature", "moments".
+        Any of "curvature", "moments".
     weight
-        Distance, in resolutions, that counts as much as one deviation of a feature.
+        Distance, in resolutions, equivalent to one mean absolute deviation of a feature.
     radius
-        Of the ball for moments, in resolutions.
+        Radius of the ball for moments, in resolutions.
     """
 
     features: tuple[Invariant, ...] = ("moments",)
@@ -239,7 +239,7 @@ class ClosestInvariant(Matcher):
 class _InvariantSearch:
     options: ClosestInvariant
     tree: KdTree
-    # Features of both views, as found at the first matching; those of the source by its identity.
+    # Features of both views, cached at the first matching; the source's by its identity.
     known: dict[str, tuple[Points, Float64]]
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
@@ -269,7 +269,7 @@ class _InvariantSearch:
 
 
 def _mean_deviation(column: Float64) -> float:
-    """Mean absolute deviation from the median of the values that aren't NaN; 1 if it is nil."""
+    """Mean absolute deviation from the median, ignoring NaN; 1 if it is zero."""
     column = column[np.isfinite(column)]
     deviation = float(np.abs(column - np.median(column)).mean()) if len(column) else 0.0
     return deviation or 1.0

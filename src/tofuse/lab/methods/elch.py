@@ -1,7 +1,7 @@
-"""Explicit loop closing heuristics (Sprickerhof et al. 2009): each loop's error is handed round.
+"""Explicit loop closing heuristics (Sprickerhof et al. 2009): loop errors are distributed.
 
-The error of a loop is spread over the poses along it in proportion to the distance in the graph,
-whose edges are as long as their measurement is uncertain. Nothing is minimised, so it is quick.
+The error of a loop is distributed over its poses in proportion to their distance in the graph,
+where the length of an edge is its uncertainty. Fast, as nothing is minimised.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
 from tofuse.posegraph.sparse import parts_of
 
-_LEAST = 1e-12  # of the largest: no edge is so certain that it has no length
+_LEAST = 1e-12  # min edge length relative to the largest
 
 
 @part("optimiser", "elch", label="validated")
 @dataclass(frozen=True)
 class Elch(Optimiser):
-    """Close one loop after another, in the order in which the camera came round.
+    """Close loops sequentially, in temporal order.
 
-    Positions are moved in proportion, and orientations turned by slerp, with distances of their
-    own: the traces of the edges' covariances of translation and of rotation. A pose off the loop
-    moves with the pose of the loop that it hangs on. A closed loop is an edge of the graph for
-    those after it. The first vertex of each connected part stays where it is. Gravity and anchors
-    are not used.
+    Positions are interpolated linearly and orientations by slerp, with separate distances: the
+    traces of the edges' covariances of translation and of rotation. A pose off the loop moves with
+    the pose of the loop to which it is connected. A closed loop is an edge of the graph for later
+    ones. The first vertex of each connected component is fixed. Gravity and anchors are not used.
     """
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
-        """See `Optimiser.optimise`; logged is the sum of weighted squared errors.
+        """See `Optimiser.optimise`; logs the sum of weighted squared errors.
 
-        It is lowered by no promise. Raises InputError for what is not finite or not positive.
+        It need not decrease. Raises InputError for non-finite or non-positive input.
         """
         check_graph(graph)
         lengths = _lengths(graph)
@@ -75,11 +74,11 @@ def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:
 
 
 def _shares(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float64 | None:
-    """(N,) share of the loop's error that each pose takes, 0 to 1; None where it closes nothing."""
+    """(N,) fraction of the loop's error for each pose, 0 to 1; None if it closes no loop."""
     n = len(graph.ids)
     start, end = graph.edges[loop]
     i, j = graph.edges[known].T
-    # Of several edges between two poses the shortest counts, and the sparse matrix would add them.
+    # Keep the shortest of parallel edges, which the sparse matrix would add up.
     order = np.lexsort((length[known], np.maximum(i, j), np.minimum(i, j)))
     low, high, value = np.minimum(i, j)[order], np.maximum(i, j)[order], length[known][order]
     first = np.ones(len(order), bool)
@@ -103,7 +102,7 @@ def _shares(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float6
 
 
 def _spread(poses: Float64, graph: PoseGraph, loop: int, slide: Float64, turn: Float64) -> Float64:
-    """Move every pose by its shares of what brings the loop's end to where it was measured."""
+    """Move every pose by its fractions of the loop's correction."""
     i, j = graph.edges[loop]
     wanted = poses[i] @ graph.measurements[loop]
     shift = wanted[:3, 3] - poses[j, :3, 3]

@@ -1,4 +1,4 @@
-"""Registration by points that look alike in two images (sections 2.5.1 and 2.5.2)."""
+"""Registration by matched image features (sections 2.5.1 and 2.5.2)."""
 
 from __future__ import annotations
 
@@ -28,35 +28,35 @@ from tofuse.registration.sample_consensus import (
 @part("registration", "features")
 @dataclass(frozen=True)
 class Features(Registrar):
-    """Points that SIFT, ORB or FAST find in the albedo or the colour, matched, placed in space.
+    """SIFT, ORB or FAST keypoints of the albedo or the colour, matched, with 3D positions.
 
-    A match counts if it is the best both ways, and better than the second best by a ratio (Lowe
-    2004). Each end has a depth, so three matches give a motion, and RANSAC finds the one that most
-    agree on: a match may miss by some standard deviations of its own noise. Weighted least squares
-    over these give the pose. The guess is not used.
+    Matches are mutual nearest neighbours that pass the ratio test (Lowe 2004). As all have depth,
+    three matches determine a motion; RANSAC maximises the inliers, with thresholds in standard
+    deviations of each match. The pose is a weighted least-squares fit to the inliers. The guess is
+    not used.
 
     Attributes
     ----------
     detector
         "sift", "orb" or "fast".
     light
-        Where points are looked for: the "albedo" (amplitude times squared range), the "color", or
-        "auto": the albedo if there is amplitude.
+        Image of the detector: the "albedo" (amplitude times squared range), the "color", or "auto":
+        the albedo if there is amplitude.
     count
-        The strongest so many points of each view.
+        Number of strongest keypoints per view.
     ratio
-        Largest distance of the descriptors of a match, relative to that of the second best.
+        Largest descriptor distance of a match, relative to that of the second best.
     mutual
-        Whether it must be the best both ways.
+        Whether matches must be mutual nearest neighbours.
     blur_px
-        Standard deviation of where a point is found, pixels.
+        Standard deviation of the detected position, pixels.
     verify
-        Whether what both images saw (`agreement`) counts as much as the matches when one of several
-        motions is chosen; one that they contradict is refused.
+        Whether the image agreement (`agreement`) counts as much as the matches in the choice among
+        several motions; contradicted ones are rejected.
     surface
-        How the depth and its noise are prepared.
+        Preparation of the depth and its noise.
     consensus
-        How the motion is found that most matches agree on.
+        Options of the sample consensus.
     """
 
     detector: Detector = "sift"
@@ -84,13 +84,13 @@ class Features(Registrar):
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
     ) -> Registration:
-        """See `Registrar.register`; points are the matches, correspondences those that agree.
+        """See `Registrar.register`; points are the matches, correspondences the inliers.
 
         Raises
         ------
         RegistrationError
-            If a view has no light to look at, or too few matches agree on a motion, or the images
-            contradict it.
+            If a view has neither amplitude nor colour, or too few matches are inliers, or the
+            images contradict the motion.
         """
         (a, s), (b, t) = self._found(source), self._found(target)
         pairs = self.pairs(a, b)
@@ -128,7 +128,7 @@ class Features(Registrar):
         return Pairs(source.points[i], target.points[j], source.variance[i] + target.variance[j])
 
     def _matched(self, a: NDArray[Any], b: NDArray[Any]) -> tuple[Int64, Int64]:
-        """Positions of the descriptors that match, in the order of the first."""
+        """Index pairs of matching descriptors, in the order of a."""
         nothing = np.zeros(0, np.int64)
         if len(a) < 2 or len(b) < 2:
             return nothing, nothing

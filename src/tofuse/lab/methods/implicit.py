@@ -1,4 +1,4 @@
-"""IMLS: points against an implicit moving-least-squares surface (Deschaud 2018)."""
+"""IMLS: points to an implicit moving-least-squares surface (Deschaud 2018)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from tofuse.registration.interfaces import Alignment, Matches
 from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
 from tofuse.registration.surface_metrics import PointToPlane, SurfaceMetric
 
-# Weights beyond so many widths are nothing (exp(-9)).
+# Cutoff of the weights in widths (exp(-9)).
 _FAR = 3.0
 
 
 @part("metric", "imls", label="validated")
 @dataclass(frozen=True)
 class Implicit(SurfaceMetric):
-    """Distances to the surface that the target's points have on the average (eq 1 of the paper).
+    """Distances to the IMLS surface of the target's points (eq 1 of the paper).
 
-    ``I(x) = sum W_i(x) (x - p_i) . n_i / sum W_i(x)`` with ``W_i(x) = exp(-|x - p_i|^2 / h^2)``
-    is the distance of x from the surface; the point on it is ``y = x - I(x) n``, with n the normal
-    of the closest target point, and the motion makes ``sum (n . (R x + t - y))^2`` least. The
-    noise of the target is averaged over the width h, which point-to-plane takes from one point.
+    ``I(x) = sum W_i(x) (x - p_i) . n_i / sum W_i(x)`` with ``W_i(x) = exp(-|x - p_i|^2 / h^2)`` is
+    the distance of x from the surface; its projection is ``y = x - I(x) n``, with n the normal of
+    the closest target point, and the motion minimises ``sum (n . (R x + t - y))^2``. The target's
+    noise is averaged over the width h, unlike in point-to-plane.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Implicit(SurfaceMetric):
         return pairs.motion(solve(H, g, pairs.size))
 
     def distance(self, x: Float64, alignment: Alignment) -> Float64:
-        """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN where nothing is near."""
+        """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN without neighbours."""
         target, h = alignment.target, self.width * alignment.resolution
         tree = neighbourhood(target).tree
         near, squared = tree.neighbours(x, min(target.neighbours, len(tree)))
@@ -64,5 +64,5 @@ class Implicit(SurfaceMetric):
         return np.divide(sums, total, out=np.full(len(x), np.nan), where=total > 0)
 
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
-        """See `SurfaceMetric.fit`: as of point-to-plane."""
+        """See `SurfaceMetric.fit`: that of point-to-plane."""
         return PointToPlane().fit(pairs)

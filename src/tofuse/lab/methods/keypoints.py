@@ -1,4 +1,4 @@
-"""Points of an image that can be found again: where they are, what is around them, how far."""
+"""Image keypoints: detection, descriptors and 3D positions."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from tofuse.registration.prepared_view import PreparedView
 Detector = Literal["sift", "orb", "fast"]
 Light = Literal["auto", "albedo", "color"]
 
-# Detectors want images of some size: small ones are enlarged until they are this wide.
+# Min image width of the detectors, px: smaller images are enlarged.
 _WIDE = 500
-# Share of the darkest and of the brightest pixels that are made black and white.
+# Fractions of the darkest and of the brightest pixels that saturate.
 _TAIL = 0.5
-# Contrast below which SIFT takes nothing for a point; images are stretched to full contrast.
+# Contrast threshold of SIFT; images are stretched to full contrast.
 _CONTRAST = 0.01
-# Steps of brightness by which FAST wants a ring to differ.
+# Threshold of FAST in grey levels.
 _STEP = 5
-# Diameter that a FAST corner is described over, in pixels of the enlarged image.
+# Diameter of a FAST corner's descriptor patch, in pixels of the enlarged image.
 _PATCH = 9.0
-# Depths within this share of the nearest one are of the same surface.
+# Relative depth difference within one surface.
 _SAME = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """n points that were found in an image.
+    """n keypoints of an image.
 
     Attributes
     ----------
     points
         (n, 3) m, in the frame of the view.
     variance
-        (n,) of a point along each axis, m^2.
+        (n,) isotropic position variance, m^2.
     descriptors
-        (n, d) float32, or uint8 whose bits count.
+        (n, d) float32, or binary as uint8.
     pixels
         (n, 2) u, v of the frame's image.
     """
@@ -57,12 +57,12 @@ class Keypoints:
 
 
 def light_image(frame: RangeFrame, light: Light) -> UInt8:
-    """(H, W) what the surfaces reflect, as grey levels; black where nothing is known.
+    """(H, W) reflectance as grey levels; black where unknown.
 
-    The albedo is the amplitude times the squared range, unless the camera did that, on a
-    logarithmic scale: exposure then only shifts it. Colour is its luminance.
+    The albedo is the amplitude times the squared range (unless the camera compensates it), on a
+    logarithmic scale, where exposure is an offset. Colour is converted to luminance.
 
-    Raises RegistrationError where the frame has not what is asked for.
+    Raises RegistrationError if the frame lacks the requested channel.
     """
     has_color = frame.color_image is not None and frame.color_registered
     if frame.amplitude_image is not None and light != "color":
@@ -86,7 +86,7 @@ def light_image(frame: RangeFrame, light: Light) -> UInt8:
         raise RegistrationError("shows nothing but black", where=f"frame {frame.index}")
     low, high = np.percentile(grey[known], [_TAIL, 100 - _TAIL])
     levels = np.clip((grey - low) / max(float(high - low), 1e-6), 0, 1) * 255
-    # Holes take the levels around them: their rims would be found otherwise.
+    # Holes are filled from their surroundings, or their rims would be detected.
     image: UInt8 = np.where(known, levels, 0).astype(np.uint8)
     around = cv2.medianBlur(image, 5)
     return np.where(known, image, around).astype(np.uint8)
@@ -101,21 +101,21 @@ def keypoints(
     count: int,
     blur_px: float,
 ) -> Keypoints:
-    """Find points in an image and place them in space.
+    """Detect keypoints in an image and compute their 3D positions.
 
     Parameters
     ----------
     surface
-        Of the frame; it knows the noise, and the planes that points lie on.
+        The prepared view of the frame, with noise and local planes.
     detector
         "sift" (Lowe 2004), "orb" (Rublee et al. 2011), or "fast": FAST corners (Rosten and
         Drummond 2006), upright and described as those of SIFT, all over patches of one size.
     light
-        "albedo", "color", or what there is of the two ("auto"), the albedo first.
+        "albedo", "color", or "auto": the albedo if available, else colour.
     count
-        The strongest so many are kept.
+        Number of strongest keypoints to keep.
     blur_px
-        Standard deviation of where a point is found, in pixels of the frame.
+        Standard deviation of the detected position, in pixels of the frame.
     """
     image = light_image(frame, light)
     enlarged = max(1, round(_WIDE / image.shape[1]))
@@ -133,7 +133,7 @@ def keypoints(
 
 
 def _detected(image: UInt8, detector: Detector, count: int) -> tuple[Any, NDArray[Any] | None]:
-    """Keypoints as OpenCV gives them, in an order that does not depend on it, and descriptors."""
+    """OpenCV's keypoints in a deterministic order, and descriptors."""
     if detector == "orb":
         orb = cv2.ORB.create(nfeatures=count, fastThreshold=_STEP)
         return orb.compute(image, _strongest(orb.detect(image, None), count))
@@ -154,9 +154,9 @@ def _strongest(found: Any, count: int) -> list[Any]:
 def _placed(
     surface: PreparedView, pixels: Float64, width: int, blur_px: float
 ) -> tuple[Float64, Float64, Bool]:
-    """Points (n, 3) of pixels (n, 2) of an image so wide, variances (n,), and which are known.
+    """Points (n, 3) of pixels (n, 2) of an image `width` wide, variances (n,), validity (n,).
 
-    At an edge the nearer surface is taken: it is the one that has the edge.
+    At an edge the nearer surface is used, as the edge belongs to it.
     """
     rows, columns = surface.z.shape
     step = max(1, width // columns)
@@ -167,7 +167,7 @@ def _placed(
     near_v, near_u = near // columns, near % columns
     z = surface.z[near_v, near_u].astype(float)
     sigma = surface.sigma[near_v, near_u].astype(float)
-    # A plane knows the depth better than one pixel.
+    # A plane's depth is more precise than a single pixel's.
     w = surface.planes[near_v, near_u, 3].astype(float)
     plane = w > 0
     z = np.where(plane, 1 / np.where(plane, w, 1), z)
@@ -178,7 +178,7 @@ def _placed(
     points = np.column_stack([rays * z[:, None], z])
     across = (blur_px / step * spacing * z) ** 2
     normals = surface.normals[near_v, near_u].astype(float)
-    # What the place is off across the surface is off along the ray where that is steep.
+    # Lateral errors become range errors on slanted surfaces.
     steep = np.abs(normals[:, 2])
     slope = np.where(plane & (steep > 0.2), 1 / np.maximum(steep, 0.2) ** 2 - 1, 0)
     variance = (depth_variance + across * (2 + slope)) / 3
@@ -187,9 +187,9 @@ def _placed(
 
 
 def _nearest_known(z: Float32) -> Int64:
-    """(H, W) position of the pixel, among the nine around each, that is on the nearest surface.
+    """(H, W) index of the pixel in each 3 x 3 window that is on the nearest surface.
 
-    Of those on it, the one closest to the middle.
+    Of several, the one closest to the centre.
     """
     rows, columns = z.shape
     padded = np.pad(np.where(z > 0, z, np.float32(np.inf)), 1, constant_values=np.inf)

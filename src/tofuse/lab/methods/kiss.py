@@ -1,4 +1,4 @@
-"""KISS-ICP (Vizzo et al. 2023): odometry by point-to-point ICP against a map of voxels."""
+"""KISS-ICP (Vizzo et al. 2023): odometry by point-to-point ICP against a voxel map."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tofuse.registration.interfaces import Alignment, Matches, Points
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.prepared_view import PreparedView
 
-# Of the range: edges of the map's voxels, the first threshold's sigma and the smallest motion that
-# it learns from (the paper: 1 m, 2 m and 0.1 m of 100 m).
+# Relative to the range: voxel size of the map, initial sigma of the threshold and the smallest
+# motion that updates it (the paper: 1 m, 2 m and 0.1 m of 100 m).
 _VOXEL, _INITIAL, _MOTION = 0.01, 0.02, 0.001
 _IN_VOXEL = 20
 _RANGE_QUANTILE = 95
@@ -31,20 +31,20 @@ _AT_REST = 1e-4  # largest motion of a point, in voxels
 
 @dataclass
 class AdaptiveThreshold:
-    """How far points may lie from their partners: learnt from how wrong predictions were (eq 5).
+    """Correspondence distance threshold, estimated from prediction errors (eq 5).
 
     A correction by an angle theta and a length of t moves a point at range r by at most
     ``delta = 2 r sin(theta / 2) + t`` (eqs 3 and 4). The threshold is three times ``sigma``, the
-    root mean square of the deltas that were more than a minimum, and the loss' scale a third of it.
+    root mean square of the deltas above a minimum, and the scale of the loss a third of it.
 
     Attributes
     ----------
     range_m
         r, the largest range.
     smallest
-        Deltas below this (m) say nothing.
+        Deltas below this (m) are ignored.
     initial
-        Of sigma, m, until there is a delta.
+        Initial value of sigma, m.
     """
 
     range_m: float
@@ -59,7 +59,7 @@ class AdaptiveThreshold:
         return math.sqrt(self._sum / self._count) if self._count else self.initial
 
     def learn(self, correction: Float64) -> None:
-        """Take in by how much a prediction was corrected, (4, 4)."""
+        """Update sigma by the correction (4, 4) of a prediction."""
         theta = float(se3.angle(correction[:3, :3]))
         delta = 2 * self.range_m * math.sin(theta / 2) + float(np.linalg.norm(correction[:3, 3]))
         if delta > self.smallest:
@@ -70,22 +70,22 @@ class AdaptiveThreshold:
 @part("odometry", "kiss-icp", label="validated")
 @dataclass(frozen=True)
 class Kiss(Odometry):
-    """Registers each frame to a map of all before, from the last motion, by point-to-point ICP.
+    """Point-to-point ICP of each frame to the map of the previous ones; constant velocity model.
 
-    The frame is thinned to one point in a voxel of half the map's, and of those to one in 1.5 of
-    it for the registration. Points are paired with the closest of the map within three sigma of
-    the adaptive threshold, weighted by Geman and McClure's loss with the scale sigma / 3, and moved
-    until a step is small. The map keeps up to twenty points in a voxel, none further away than the
-    range. The defaults are those of the paper, as shares of the range: nothing is to be tuned.
+    The frame is downsampled to one point per voxel of half the map's voxel size, and these to one
+    per 1.5 voxel sizes for the registration. Points are paired with the closest of the map within
+    three sigma (the adaptive threshold), weighted by Geman and McClure's loss with the scale sigma
+    / 3, and aligned until a step is small. The map stores up to twenty points per voxel, within the
+    range. The defaults are those of the paper, relative to the range, without parameters to tune.
 
     Attributes
     ----------
     voxel
-        Edge of the map's voxels, m; None: a hundredth of the first frame's range.
+        Voxel size of the map, m; None: a hundredth of the first frame's range.
     max_iterations
-        Of each frame.
+        Maximum number per frame.
     minimum_points
-        Valid points that a frame must have.
+        Minimum number of valid points of a frame.
     """
 
     voxel: float | None = None
@@ -100,19 +100,19 @@ class Kiss(Odometry):
             raise ValueError(f"minimum_points is {self.minimum_points}, not 3 or more")
 
     def start(self, seed: int) -> Tracker:
-        """See `Odometry.start`; nothing is drawn."""
+        """See `Odometry.start`; deterministic."""
         return _KissTracker(self)
 
 
 @dataclass
 class _Map:
-    """Points of the world by voxel, up to twenty each, in the order in which they came."""
+    """Points of the world by voxel, up to twenty each, in order of insertion."""
 
     size: float
     points: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     def add(self, x: Float64, position: Float64, reach: float) -> None:
-        """Add points, and forget those beyond `reach` of the camera."""
+        """Add points, and remove those beyond `reach` m of the camera."""
         every = np.concatenate([self.points, x])
         cell = np.floor(every / self.size).astype(np.int64)
         _, key = np.unique(cell, axis=0, return_inverse=True)
@@ -139,7 +139,7 @@ class _KissTracker(Tracker):
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
-        """See `Tracker.push`; raises nothing for frames without points."""
+        """See `Tracker.push`; frames without points raise no error."""
         if len(frame) < self._options.minimum_points:
             need = f"{len(frame)} valid points, {self._options.minimum_points} are needed"
             return Step("lost", need, None)
@@ -168,7 +168,7 @@ class _KissTracker(Tracker):
         return Step("tracked", "", pose.copy(), reference, found)
 
     def _registered(self, p: Float64, predicted: Float64) -> tuple[Float64, Registration]:
-        """Pose T_world_camera of points p, and the motion since the last frame."""
+        """Pose T_world_camera of points p (n, 3), and the motion since the last frame."""
         assert self._map is not None
         sigma = self._threshold.sigma
         target = _cloud(self._map.points)

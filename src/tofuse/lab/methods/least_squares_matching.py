@@ -19,7 +19,7 @@ from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import All, at_most
 
 _FEWEST = 8
-# Triangles whose sides are longer than so many resolutions bridge a gap.
+# Max side length of a triangle in resolutions; longer ones bridge a gap.
 _WIDEST = 5.0
 _AT_REST = 1e-4  # largest change of a parameter, in resolutions
 _SMALLEST_SIGMA = 1e-3
@@ -27,14 +27,14 @@ _SMALLEST_SIGMA = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SimilarityMatch(Registration):
-    """A registration that estimates the scale as well.
+    """A registration that also estimates the scale.
 
     Attributes
     ----------
     scale
-        Sizes in the target by those in the source; 1 where it was not estimated.
+        Scale from source to target; 1 if not estimated.
     precision
-        (7,) standard deviations: translation (m), rotation (rad), scale; of the middle of the
+        (7,) standard deviations: translation (m), rotation (rad), scale; about the centroid of the
         source's points.
     """
 
@@ -44,7 +44,7 @@ class SimilarityMatch(Registration):
 
 @dataclass(frozen=True, eq=False)
 class _Feet:
-    """Where points meet the triangles of the target: of those that do."""
+    """Foot points on the triangles of the target, for the points that have one."""
 
     point: Int64
     distance: Float64
@@ -56,20 +56,19 @@ class _Feet:
 @part("registration", "ls3d", label="validated")
 @dataclass(frozen=True)
 class LeastSquaresMatching(Registrar):
-    """Generalised Gauss-Markoff model of the distances between two surfaces.
+    """Generalised Gauss-Markov model of the distances between two surfaces.
 
-    The target is a surface of planar triangles (the fans of neighbours round its points). Each
-    point of the source has an observation equation (eq 8 of the paper, here with the source as
-    the surface that moves)::
+    The target is a surface of planar triangles (fans of each point's neighbours). Each point of the
+    source has an observation equation (eq 8 of the paper, here with a moving source)::
 
         -e_i = n_i . (t + w x (m p_i) + dm p_i) - l_i
 
     with l_i the distance to the triangle on which the point's foot lies and n_i its normal, the
     numeric derivatives of the surface. The seven parameters of a similarity are observations as
-    well, with weights of their own: that of the scale decides whether it is free. Points whose
-    foot lies on no triangle are beyond the surface's boundary; observations with residuals
-    beyond `outlier` standard deviations are left out, in each iteration anew (section 2.3).
-    With `light` a second surface takes part, whose height is the intensity (Akca 2007).
+    well, with individual weights: that of the scale decides whether it is free. Points whose foot
+    lies on no triangle are beyond the surface's boundary; in each iteration, observations with
+    residuals beyond `outlier` standard deviations are rejected (section 2.3). With `light` a second
+    surface is matched, whose height is the intensity (Akca 2007).
 
     Attributes
     ----------
@@ -80,14 +79,13 @@ class LeastSquaresMatching(Registrar):
     reach
         Largest distance of a point from its foot, in resolutions.
     outlier
-        K of section 2.3: residuals beyond K sigma_0 are left out.
+        K of section 2.3: residuals beyond K sigma_0 are rejected.
     scale_sigma
-        Standard deviation of the scale's observation, a share; 0: the scale is one.
+        Relative standard deviation of the scale's observation; 0 fixes the scale to one.
     light
-        Height of the surface of intensities, m for a change by the whole of the target's median
-        amplitude; 0: not used.
+        Height in m of the intensity surface per median amplitude of the target; 0: not used.
     max_iterations
-        Iterations after which it ends in any case.
+        Maximum number of iterations.
     """
 
     resolution: float = 0.01
@@ -168,9 +166,9 @@ class LeastSquaresMatching(Registrar):
         light: tuple[Float64, Float64] | None,
         scale: float,
     ) -> tuple[Float64, Float64]:
-        """N (7, 7) and right side (7,) of the observations that are no outliers, and the scale's.
+        """N (7, 7) and right-hand side (7,) of the inlier observations, and the scale's.
 
-        `arm` (k, 3) leads from the middle of the source to its points, in the target's frame.
+        `arm` (k, 3) are the source's points relative to their centroid, in the target's frame.
         """
         A, height = self._equations(arm, feet, light)
         keep = np.abs(height) <= self.outlier * _sigma(height)
@@ -185,7 +183,7 @@ class LeastSquaresMatching(Registrar):
     def _equations(
         self, arm: Float64, feet: _Feet, light: tuple[Float64, Float64] | None
     ) -> tuple[Float64, Float64]:
-        """Design matrix (k, 7) and distances (k,) in m, of the geometry and of the intensities."""
+        """Design matrix (k, 7) and distances (k,) in m, of geometry and intensity."""
         A = _rows(arm, feet.normal)
         if light is None:
             return A, feet.distance
@@ -199,7 +197,7 @@ class LeastSquaresMatching(Registrar):
         model: Points,
         light: tuple[Float64, Float64] | None,
     ) -> _Feet:
-        """Feet of points x (n, 3) on the triangles round the nearest points of the target."""
+        """Foot points of x (n, 3) on the triangles around the nearest points of the target."""
         surface = neighbourhood(model)
         nearest, _ = surface.tree.nearest(x, self.reach * self.resolution)
         point = np.flatnonzero(nearest >= 0)
@@ -213,7 +211,7 @@ class LeastSquaresMatching(Registrar):
         away = x[point][:, None] - a
         with np.errstate(invalid="ignore", divide="ignore"):
             normal = normal / double[..., None]
-            # Coordinates of the foot in the triangle.
+            # Barycentric coordinates of the foot.
             u = (np.cross(away, e2) * normal).sum(2) / double
             v = (np.cross(e1, away) * normal).sum(2) / double
         sides = np.maximum(np.linalg.norm(e1, axis=2), np.linalg.norm(e2, axis=2))
@@ -238,7 +236,7 @@ class LeastSquaresMatching(Registrar):
 
 
 def _in_source(N: Float64, T_target_source: Float64, middle: Float64) -> Float64:
-    """Information (6, 6) about the middle, in the target's frame, as `Registration` has it."""
+    """Convert information (6, 6) about `middle`, in the target's frame, to `Registration`'s."""
     turn, shift = np.zeros((6, 6)), np.eye(4)
     turn[:3, :3] = turn[3:, 3:] = T_target_source[:3, :3]
     shift[:3, 3] = -middle
@@ -248,7 +246,7 @@ def _in_source(N: Float64, T_target_source: Float64, middle: Float64) -> Float64
 
 
 def _rows(arm: Float64, n: Float64) -> Float64:
-    """Derivatives (k, 7) of n . x by translation, rotation and scale about the middle."""
+    """Derivatives (k, 7) of n . x by translation, rotation and scale about the centroid."""
     return np.column_stack([n, np.cross(arm, n), (arm * n).sum(1)])
 
 

@@ -1,14 +1,14 @@
 """Global relaxation in six dimensions, after Lu and Milios (1997) and Borrmann et al. (2008).
 
-Each edge says by how much its two poses should move against each other: D_ij, a small motion in
-the world's frame (v, w), p -> p + v + w x p, with the inverse covariance C_ij^-1 of the pair. To
-first order the motions X_i of the poses then minimise::
+Each edge measures the relative correction of its two poses: D_ij, a small motion in the world's
+frame (v, w), p -> p + v + w x p, with the inverse covariance C_ij^-1 of the pair. To first order
+the motions X_i of the poses then minimise::
 
     sum (X_j - X_i - D_ij)^T C_ij^-1 (X_j - X_i - D_ij)
 
 which is linear, G X = B, and solved exactly in one step (Borrmann et al. 2008, eqs 3 to 8). The
 poses, as a position and Euler angles, move by H_i^-1 X_i, with H the derivative of the motion by
-the six numbers (their eq 17); then D and C are taken anew, until nothing changes.
+the six parameters (their eq 17); then D and C are recomputed, until convergence.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from tofuse.posegraph.sparse import PairSystem
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
 _EULER = "YXZ"
-_SAME = 1e-6  # a rise by less than this share is no rise: the last digits swing to and fro
+_SAME = 1e-6  # relative increase that counts as rounding error
 
 
 @part("optimiser", "lu-milios", label="validated")
 @dataclass(frozen=True)
 class LuMilios(Optimiser):
-    """Solve the linearised graph again and again (Borrmann et al. 2008).
+    """Solve the linearised graph iteratively (Borrmann et al. 2008).
 
-    Each edge counts by its information; there is no damping and no kernel. The first vertex of
-    each connected part stays where it is. The best poses on the way are the result, which are
-    those of the input where no step was a gain. Gravity and anchors are not used.
+    Edges are weighted by their information, without damping or robust kernel. The first vertex of
+    each connected component is fixed. Returns the best poses of all iterations; the input if no
+    step lowers the error. Gravity and anchors are not used.
 
     Attributes
     ----------
     max_iterations
-        At most so many linear systems are solved.
+        Maximum number of linear systems to solve.
     tolerance
-        Stop when a step lowers the sum of weighted squared errors by less than this share of it.
+        Minimum relative decrease of the sum of weighted squared errors.
     """
 
     max_iterations: int = 50
     tolerance: float = 1e-6
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
-        """See `Optimiser.optimise`. Raises InputError for what is not finite or not positive."""
+        """See `Optimiser.optimise`. Raises InputError for non-finite or non-positive input."""
         check_graph(graph)
         system = PairSystem(len(graph.ids), graph.edges)
         best, history, converged = graph, [graph.chi2()], bool(system.fixed.all())
@@ -68,11 +68,11 @@ class LuMilios(Optimiser):
             if history[-1] < before:
                 best = here
             if before - history[-1] <= self.tolerance * before:
-                # Settled, or it went up: then this is no way to a minimum from here.
+                # Converged, or diverging.
                 converged = history[-1] <= (1 + _SAME) * before
                 break
         if history[-1] > min(history):
-            history.append(min(history))  # the step back to the best
+            history.append(min(history))  # return to the best
         return Optimisation(best, tuple(history), converged)
 
 
@@ -90,7 +90,7 @@ def solve_linear(graph: PoseGraph, system: PairSystem) -> Float64 | None:
 
 
 def _moved(poses: Float64, motion: Float64) -> Float64:
-    """Poses after motions X in the world's frame, by way of position and Euler angles."""
+    """Poses (N, 4, 4) after motions X in the world's frame, via position and Euler angles."""
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler(_EULER)
     turn = np.zeros((len(poses), 3, 3))  # w = turn @ change of the angles
     first = np.eye(3)["XYZ".index(_EULER[0])]
@@ -101,7 +101,7 @@ def _moved(poses: Float64, motion: Float64) -> Float64:
     turn[:, :, 2] = both.apply(np.eye(3)["XYZ".index(_EULER[2])])
     v, w = motion[:, :3], motion[:, 3:]
     out = poses.copy()
-    # H^-1: the position moves as a point of the moving frame does, the angles as w asks.
+    # H^-1: the position moves with the frame, the angles follow from w.
     out[:, :3, 3] += v + np.cross(w, poses[:, :3, 3])
     change = (np.linalg.pinv(turn) @ w[..., None])[..., 0]
     out[:, :3, :3] = Rotation.from_euler(_EULER, angles + change).as_matrix()

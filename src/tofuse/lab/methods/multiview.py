@@ -1,7 +1,7 @@
-"""Registration of many views at once by corresponding points (section 2.10, eq 2.8).
+"""Joint registration of many views by corresponding points (section 2.10, eq 2.8).
 
-Views are paired, moved by the pairs, and paired again. How the pairs move the views is what the
-methods differ in: each is a `Relaxing`, in a file of its own.
+Correspondences and poses are updated alternately. Methods differ in how correspondences determine
+the poses: each is a `Relaxing`, in its own file.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.shape import shape_at
 
-# Views overlap if this share of the points of one has a partner in the other, and so many.
+# Min fraction and number of points with a partner in an overlapping view.
 _OVERLAP, _FEWEST = 0.1, 30
-# Views are at rest when no point has moved by more, in resolutions.
+# Converged when no point has moved by more, in resolutions.
 _AT_REST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A view that takes part.
+    """A view of the joint registration.
 
     Attributes
     ----------
@@ -42,8 +42,8 @@ class Cloud:
     points, normals
         (n, 3) in the view's frame, m; normals may be NaN.
     boundary
-        (n,) where the surface ends. What another view sees beyond is nearest to these points, and
-        is no partner of theirs (Turk and Levoy 1994).
+        (n,) whether a point is on the surface boundary. Points of other views beyond it are closest
+        to these points, and not paired (Turk and Levoy 1994).
     tree
         Of the points.
     """
@@ -56,7 +56,7 @@ class Cloud:
 
     @classmethod
     def of(cls, view: CloudFrame) -> Cloud:
-        """Make a cloud ready."""
+        """Prepare the points of a view."""
         points = view.points.astype(np.float64)
         shape = shape_at(view, np.arange(len(points)))
         return cls(view, points, shape.normals, shape.boundary, KdTree(points))
@@ -64,16 +64,16 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Points of view i and the closest points of view j to them.
+    """Points of view i and their closest points of view j.
 
     Attributes
     ----------
     i, j
-        Positions of the views.
+        Indices of the views.
     p_i, p_j
         (m, 3) the points, each in its own view's frame.
     n_j
-        (m, 3) unit normals of view j there, in its frame; may be NaN.
+        (m, 3) unit normals of view j at p_j, in its frame; may be NaN.
     """
 
     i: int
@@ -85,18 +85,18 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Relaxing(Refining):
-    """A refinement that moves all views by corresponding points.
+    """A joint refinement of all views by corresponding points.
 
     Attributes
     ----------
     points
-        Of each view that take part, at an even stride, at most.
+        Maximum number per view, at an even stride.
     reach
         Largest distance of paired points, in resolutions (the median distance of neighbours).
     rounds
-        How often the views are paired, at most.
+        Maximum number of pairing rounds.
     views
-        That take part, at most, spaced by the motion of the camera; the others follow them.
+        Maximum number of views, spaced by the camera's motion; the others follow them.
     """
 
     points: int = 2000
@@ -111,7 +111,7 @@ class Relaxing(Refining):
 
     @abstractmethod
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
-        """Return the poses (N, 4, 4) T_world_view that the pairs ask for; the first stays."""
+        """Return the poses (N, 4, 4) T_world_view determined by the pairs; the first is fixed."""
         ...
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
@@ -133,7 +133,7 @@ class _Relaxation(Refiner):
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
     ) -> Refinement:
-        """See `Refiner.finish`; kept unless the views' points are less near than before."""
+        """See `Refiner.finish`; rejected if the views' points are less close than before."""
         row = {int(index): k for k, index in enumerate(ids)}
         kept = [posed.view for posed in self._store.of(row)]
         kept = [k for k in kept if len(k.points) >= _FEWEST]
@@ -154,7 +154,7 @@ class _Relaxation(Refiner):
 
 
 def relaxed(method: Relaxing, clouds: Sequence[Cloud], poses: Float64) -> Float64:
-    """Pair and move views until they are at rest; poses (N, 4, 4) T_world_view, the first stays."""
+    """Pair and move views until convergence; poses (N, 4, 4) T_world_view, the first is fixed."""
     resolution = resolution_of(clouds)
     for _ in range(method.rounds):
         pairs = paired(clouds, poses, method.reach * resolution)
@@ -179,7 +179,7 @@ def resolution_of(clouds: Sequence[Cloud]) -> float:
 
 
 def paired(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list[Pairs]:
-    """Closest points, both ways, of all views that overlap; `reach` in m."""
+    """Closest points of all overlapping views, in both directions; `reach` in m."""
     out = []
     for i, source in enumerate(clouds):
         for j, target in enumerate(clouds):
@@ -205,7 +205,7 @@ def squared_error(poses: Float64, pairs: Sequence[Pairs]) -> float:
 
 
 def rotation_to(H: Float64) -> Float64:
-    """The rotation R (3, 3) that makes the trace of R H greatest (Arun 1987; Umeyama 1991)."""
+    """The rotation R (3, 3) that maximises the trace of R H (Arun 1987; Umeyama 1991)."""
     U, _, Vt = np.linalg.svd(H)
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     return np.asarray(Vt.T @ np.diag([1.0, 1.0, sign]) @ U.T)
@@ -214,7 +214,7 @@ def rotation_to(H: Float64) -> Float64:
 def _support(
     poses: Float64, pairs: Sequence[Pairs], reach: float, clouds: Sequence[Cloud]
 ) -> float:
-    """How near points lie to those of other views: up to 1 for each view that sees them too."""
+    """Closeness of points to those of other views: up to 1 per view that also sees them."""
     total = sum(len(c.points) for c in clouds)
     nearness = 0.0
     for p in pairs:

@@ -1,4 +1,4 @@
-"""The normal distributions transform, points to distributions (Magnusson 2009, chapter 6)."""
+"""The normal distributions transform, point-to-distribution (Magnusson 2009, chapter 6)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import at_most
 
-# Points that a cell needs, and the smallest variance of it, relative to the largest.
+# Min points of a cell, and its min variance relative to the largest.
 _FEWEST, _FLATTEST = 6, 1e-3
-# Share of points that lie anywhere (section 6.2.1: p_o).
+# Outlier ratio (section 6.2.1: p_o).
 _OUTLIERS = 0.55
 _HALVINGS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Normal distributions of the target's points, by cells of a grid."""
+    """Normal distributions of the target's points in grid cells."""
 
     size: float
     tree: KdTree
@@ -37,7 +37,7 @@ class _Cells:
 
     @property
     def constants(self) -> tuple[float, float]:
-        """d_1 and d_2 of eq 6.8: the Gaussian that is like a mixture with uniform outliers."""
+        """d_1 and d_2 of eq 6.8: Gaussian approximation of a mixture with uniform outliers."""
         c1, c2 = 10 * (1 - _OUTLIERS), _OUTLIERS / self.size**3
         d3 = -math.log(c2)
         d1 = -math.log(c1 + c2) - d3
@@ -47,16 +47,16 @@ class _Cells:
 @part("registration", "ndt", label="validated")
 @dataclass(frozen=True)
 class Ndt(Registrar):
-    """Points of the source against normal distributions of the target's, from coarse to fine.
+    """Coarse-to-fine alignment of the source's points to normal distributions of the target's.
 
-    The target is cut into cells, each with the mean and covariance of its points. The score ::
+    The target is divided into cells, each with the mean and covariance of its points. The score ::
 
         s(T) = -sum d_1 exp(-d_2 / 2 (T p - mu)^T Sigma^-1 (T p - mu))
 
-    of the points, each in the cell whose mean is nearest, is made large by Newton's method with its
-    analytic gradient and Hessian, shifted where that is not positive, and halved steps. Cells halve
-    from level to level. The cells' covariances are widened to a thousandth of their longest axis
-    (section 6.2.3).
+    of the points, each in the cell with the nearest mean, is minimised by Newton's method with the
+    analytic gradient and Hessian (shifted if not positive definite) and step halving. The cell size
+    is halved from level to level. Eigenvalues of the covariances are at least a thousandth of the
+    largest (section 6.2.3).
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Ndt(Registrar):
     points
         Random points of the source (None: all), against all of the target.
     coarsest, finest
-        Edges of the cells at first and at last, in resolutions.
+        First and last cell size, in resolutions.
     max_iterations
         Of each level.
     """
@@ -136,7 +136,7 @@ class Ndt(Registrar):
             shifted = np.maximum(np.abs(values), 1e-6 * np.abs(values).max())
             step = -units * (vectors @ ((vectors.T @ (g * units)) / shifted))
             length = float(np.linalg.norm(step / units))
-            # Farther than a cell the quadratic says nothing.
+            # The quadratic model is invalid beyond a cell.
             step *= min(1.0, cells.size / max(length, 1e-300))
             for _ in range(_HALVINGS):
                 moved = se3.orthonormalise(T @ se3.about(middle, se3.exp(step)))
@@ -153,7 +153,7 @@ class Ndt(Registrar):
 
 
 def _cells(points: Float64, size: float) -> _Cells:
-    """Cells of a grid with six points or more each."""
+    """Grid cells with six or more points each."""
     grid = np.floor((points - points.min(0)) / size).astype(np.int64)
     _, cell = np.unique(grid, axis=0, return_inverse=True)
     cell = cell.ravel()
@@ -174,7 +174,7 @@ def _cells(points: Float64, size: float) -> _Cells:
 
 
 def _placed(p: Float64, cells: _Cells, T: Float64) -> tuple[Int64, Float64, Float64, Float64]:
-    """Points (n, 3) in cells: which, squared Mahalanobis distances, residuals, inverses."""
+    """Cells of points (n, 3): indices, squared Mahalanobis distances, residuals, inverses."""
     x = transform_points(T, p)
     near, _ = cells.tree.nearest(x, cells.size)
     point = np.flatnonzero(near >= 0)

@@ -1,4 +1,4 @@
-"""The target's surface between its points: what is near, and how it bends."""
+"""Local geometry of the target's surface: neighbours and curvature."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.arrays import Float64, Int64
 from tofuse.kernels.kdtree import KdTree
 from tofuse.registration.interfaces import Alignment, Matches, Points
 
-# A quadric through a point has five coefficients.
+# A quadric through a point has five parameters.
 _FEWEST = 6
 
 
@@ -23,10 +23,9 @@ class Bending:
     Attributes
     ----------
     curvature
-        (n, 2) 1/m, positive where the surface bends towards the side of its normal; 0 where it
-        can't be told.
+        (n, 2) 1/m, positive where the surface bends towards its normal; 0 where unknown.
     directions
-        (n, 2, 3) unit tangents along which it bends so.
+        (n, 2, 3) principal directions, unit tangents.
     """
 
     curvature: Float64
@@ -34,24 +33,24 @@ class Bending:
 
 
 class Neighbourhood:
-    """The points of a target, with a tree and the shape of the surface at each."""
+    """The points of a target, with a tree and the local surface shape."""
 
     def __init__(self, points: Points) -> None:
         self._at, self._normals, self._count = points.points, points.normals, points.neighbours
 
     @cached_property
     def tree(self) -> KdTree:
-        """Of the points that take part."""
+        """Tree of the valid points."""
         return KdTree(self._at)
 
     @cached_property
     def near(self) -> Int64:
-        """(n, k) the nearest points of each, itself first."""
+        """(n, k) nearest neighbours of each point, itself first."""
         return self.tree.neighbours(self._at, min(self._count, len(self._at)))[0]
 
     @cached_property
     def tangents(self) -> Float64:
-        """(n, 2, 3) two unit vectors across each normal; NaN where there is no normal."""
+        """(n, 2, 3) two unit tangents per normal; NaN where there is no normal."""
         n = self._normals
         axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(n)), axis=1)]
         first = np.cross(n, axis)
@@ -60,7 +59,7 @@ class Neighbourhood:
 
     @cached_property
     def bending(self) -> Bending:
-        """By a quadric ``w = a u^2 / 2 + b u v + c v^2 / 2 + d u + e v`` through each point."""
+        """By the quadric ``w = a u^2 / 2 + b u v + c v^2 / 2 + d u + e v`` at each point."""
         n = len(self._at)
         away = self._at[self.near] - self._at[:, None]
         u, v = np.moveaxis(np.einsum("nki,nti->nkt", away, self.tangents), 2, 0)
@@ -85,7 +84,7 @@ class Neighbourhood:
 
     @cached_property
     def fans(self) -> Int64:
-        """(n, k) the neighbours of each point in the order of their angle about its normal."""
+        """(n, k) neighbours of each point, ordered by angle about its normal."""
         near = self.near[:, 1:]
         away = self._at[near] - self._at[:, None]
         u, v = np.moveaxis(np.einsum("nki,nti->nkt", away, np.nan_to_num(self.tangents)), 2, 0)
@@ -97,13 +96,13 @@ _known: WeakKeyDictionary[Points, Neighbourhood] = WeakKeyDictionary()
 
 
 def neighbourhood(points: Points) -> Neighbourhood:
-    """Return what is known of a target's surface; worked out once for each set of points."""
+    """Return the local geometry of a target, cached for each set of points."""
     if points not in _known:
         _known[points] = Neighbourhood(points)
     return _known[points]
 
 
 def with_normals(matches: Matches, alignment: Alignment) -> Matches:
-    """Return the matches of which `surface_pairs` makes pairs: those with a normal that count."""
+    """Return the matches used by `surface_pairs`: those with a normal and nonzero weight."""
     known = np.isfinite(alignment.target.normals[matches.target]).all(1)
     return matches.keep(known & (matches.weights() > 0))

@@ -19,37 +19,37 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.plane_detection import Plane, detect_planes
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
-# Sine of the angle that two normals must differ by to fix a rotation, and volume that three must
-# span to fix a point.
+# Min sine of the angle between two normals that determine a rotation, and min volume spanned by
+# three that determine a translation.
 _ACROSS, _SPANNED = 0.3, 0.15
-# Poses that what both images saw chooses from.
+# Pose candidates ranked by the agreement of the images.
 _JUDGED = 15
-# A direction that the normals share less than this of (mean square) is not held.
+# Min mean square of the normals along a direction that counts as constrained.
 _HELD = 0.005
 
 
 @part("registration", "planes")
 @dataclass(frozen=True)
 class PlaneSets(Registrar):
-    """Planes that RANSAC finds in both images, matched by the angles between them.
+    """RANSAC planes of both images, matched by the angles between them.
 
-    Two pairs of planes give a rotation, by their normals; three give a translation, by their
-    offsets. Poses under which most planes match are told apart by what both images saw
-    (`agreement`). What the planes that match do not hold, as all of a corridor's are along it, is
-    named in `unobservable` and stays as in the guess.
+    Two pairs of planes determine a rotation, by their normals; three a translation, by their
+    offsets. Among the poses under which most planes match, the agreement of both images decides
+    (`agreement`). Directions not constrained by the matched planes, such as along a corridor, are
+    reported in `unobservable` and keep the guess.
 
     Attributes
     ----------
     planes
-        Of each view, at most.
+        Maximum number per view.
     least_share
-        Of a view's points, that lie on a plane at least.
+        Minimum fraction of a view's points on a plane.
     sigmas, thickness
-        How far from the plane a point on it may be: standard deviations, plus a share of its depth.
+        Inlier distance of a plane: standard deviations, plus a fraction of the depth.
     angle, offset
-        How far two planes may be apart that match: rad, and a share of the views' depth.
+        Tolerances of matching planes: rad, and a fraction of the views' depth.
     surface
-        How the depth and its noise are prepared.
+        Preparation of the depth and its noise.
     """
 
     planes: int = 8
@@ -71,7 +71,7 @@ class PlaneSets(Registrar):
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
     ) -> Registration:
-        """See `Registrar.register`; points are the source's planes, correspondences those matched.
+        """See `Registrar.register`; points are the source's planes, correspondences the matches.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class PlaneSets(Registrar):
     def _poses(
         self, a: list[Plane], b: list[Plane], guess: Float64, depth: float
     ) -> list[tuple[float, list[tuple[int, int]], Float64]]:
-        """Share of what matches, the pairs that do, and the pose T_target_source; best first."""
+        """Matched fraction, matched pairs and T_target_source of each candidate, best first."""
         found = []
         normals = np.stack([plane.normal for plane in a]), np.stack([plane.normal for plane in b])
         for R in _rotations(*normals, guess[:3, :3], self.angle):
@@ -138,7 +138,7 @@ class PlaneSets(Registrar):
     def _matching(
         self, a: list[Plane], b: list[Plane], T: Float64, depth: float
     ) -> list[tuple[int, int]]:
-        """Pairs of planes that lie on each other, each plane in one pair at most."""
+        """Pairs of coincident planes, each plane in at most one pair."""
         pairs: list[tuple[int, int]] = []
         for i, plane in enumerate(a):
             normal = T[:3, :3] @ plane.normal
@@ -168,7 +168,7 @@ class PlaneSets(Registrar):
         turned = normals @ T[:3, :3].T
         offsets = np.array([a[i].offset for i, _ in pairs]) + turned @ T[:3, 3]
         missed = offsets - np.array([b[j].offset for _, j in pairs])
-        # What planes that match may be apart is three standard deviations.
+        # The matching tolerance is three standard deviations.
         sigma_m, sigma_rad = self.offset * depth / 3, self.angle / 3
         information = np.zeros((6, 6))
         along, across = np.zeros((3, 3)), np.zeros((3, 3))
@@ -197,9 +197,9 @@ class PlaneSets(Registrar):
 
 
 def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iterator[Float64]:
-    """Rotations (3, 3) under which two normals of a (n, 3) lie on two of b (m, 3).
+    """Rotations (3, 3) that align two normals of a (n, 3) with two of b (m, 3).
 
-    And those nearest to the guess under which one does, where there is nothing better.
+    If there are none, those nearest to the guess that align one.
     """
     between_a, between_b = (np.arccos(np.clip(x @ x.T, -1, 1)) for x in (a, b))
     for i, k in combinations(range(len(a)), 2):
@@ -214,9 +214,9 @@ def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iter
 
 
 def _aligned(a: Float64, b: Float64, near: Float64) -> Float64:
-    """(3, 3) the rotation that takes normals a (n, 3) to b (n, 3) best, `near` where they leave it.
+    """Rotation (3, 3) that best aligns normals a (n, 3) with b (n, 3); `near` if underdetermined.
 
-    Wahba's problem by the SVD (Arun et al. 1987); a little of `near` decides what is left.
+    Wahba's problem by the SVD (Arun et al. 1987); a small weight of `near` regularises it.
     """
     H = b.T @ a + 1e-4 * near
     U, _, Vt = np.linalg.svd(H)
@@ -224,7 +224,7 @@ def _aligned(a: Float64, b: Float64, near: Float64) -> Float64:
 
 
 def _independent(pairs: list[tuple[int, int]], normals: Float64) -> Iterator[list[tuple[int, int]]]:
-    """Pairs of planes that fix a translation: three, or two in part, or one where nothing else."""
+    """Pairs of planes that constrain the translation: three, or two or one if not available."""
     found = False
     for count in (3, 2, 1):
         if count == 1 and found:
@@ -238,14 +238,14 @@ def _independent(pairs: list[tuple[int, int]], normals: Float64) -> Iterator[lis
 
 
 def _volume(normals: Float64) -> float:
-    """Volume, area or length that unit normals (n, 3) span."""
+    """Volume, area or length spanned by unit normals (n, 3)."""
     return float(np.sqrt(max(np.linalg.det(normals @ normals.T), 0.0)))
 
 
 def _pose(
     a: list[Plane], b: list[Plane], pairs: list[tuple[int, int]], R: Float64, guess: Float64
 ) -> Float64:
-    """(4, 4) least squares over pairs of planes, the guess where they leave it."""
+    """Least-squares pose (4, 4) of pairs of planes; keeps the guess where unconstrained."""
     weight = np.sqrt([min(a[i].share, b[j].share) for i, j in pairs])[:, None]
     there, here = (
         np.stack([planes[k].normal for k in which])
@@ -266,7 +266,7 @@ def _pose(
 def _distinct(
     poses: list[tuple[float, list[tuple[int, int]], Float64]], depth: float
 ) -> list[tuple[float, list[tuple[int, int]], Float64]]:
-    """The poses in their order, without those that are nearly a better one."""
+    """The poses in their order, without near duplicates of better ones."""
     distinct: list[tuple[float, list[tuple[int, int]], Float64]] = []
     for one in poses:
         gaps = [se3.inverse(other[2]) @ one[2] for other in distinct]

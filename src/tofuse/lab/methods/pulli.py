@@ -1,4 +1,4 @@
-"""Pairwise alignments as constraints of the whole (Pulli 1999)."""
+"""Pairwise alignments as constraints of a global alignment (Pulli 1999)."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from tofuse.registration.selectors import All
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
 
-# Points of each pair that stand for its alignment, and how often a view may be moved.
+# Points that represent a pair's alignment, and max updates of a view.
 _MATES, _TURNS = 200, 200
 
 
 @part("refinement", "pulli", label="validated")
 @dataclass(frozen=True)
 class Pulli(Relaxing):
-    """Registers overlapping views two by two, once; then spreads what does not fit.
+    """Registers overlapping views pairwise, once; then distributes the residual errors.
 
-    The alignment of a pair is kept as *concrete pairs*: points of one view and where the alignment
-    puts them in the other. These are the constraints of the second phase, which looks at no
-    surface again and so can't be drawn into a wrong match. It begins with the view of the most
-    constraints, adds the dormant view with the most links to the active ones, and aligns it with
-    them in closed form; a view that moved by more than the tolerance puts its neighbours into the
-    queue, until the queue is empty. The error goes evenly to all pairs (section 4).
+    The alignment of a pair is stored as *concrete pairs*: points of one view and their transformed
+    positions in the other. These are the constraints of the second phase, which uses no surfaces
+    and so can't converge to a wrong match. It starts with the view of the most constraints, adds
+    the dormant view with the most links to the active ones, and aligns it with them in closed form;
+    a view that moved by more than the tolerance queues its neighbours, until the queue is empty.
+    The error is distributed evenly over all pairs (section 4).
 
     Attributes
     ----------
     rounds
-        One: the pairs are what was registered.
+        One: the pairs are the registered ones.
     tolerance
-        Motion of a view that its neighbours hear of, in resolutions.
+        Motion of a view above which its neighbours are updated, in resolutions.
     """
 
     rounds: int = 1
@@ -107,7 +107,7 @@ def _other(mates: Pairs, k: int) -> int:
 
 
 def _aligned(k: int, poses: Float64, mates: Sequence[Pairs]) -> Float64:
-    """Pose (4, 4) of view k that brings its points nearest to their mates."""
+    """Pose (4, 4) of view k that best aligns its points with their mates."""
     if not mates:
         return np.asarray(poses[k])
     own = np.concatenate([m.p_i if m.i == k else m.p_j for m in mates])

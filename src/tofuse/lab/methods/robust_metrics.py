@@ -1,4 +1,4 @@
-"""Robust least squares for pairs many of which are wrong."""
+"""Robust least squares for pairs with many outliers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.pairs import in_scales
 from tofuse.registration.surface_metrics import TangentPlanes
 
-# Each round makes the surrogate less convex by this factor (Yang et al. 2020, remark 5).
+# Factor of mu per round (Yang et al. 2020, remark 5).
 _FACTOR = 1.4
 _ROUNDS = 100
-# Where the general loss is cut off to have a distribution (Chebrolu et al. 2021), in scales.
+# Truncation of the general loss, for a proper distribution (Chebrolu et al. 2021), in scales.
 _CUT = 10.0
 
 
@@ -27,20 +27,20 @@ _CUT = 10.0
 class Graduated(Metric):
     """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas, Carlone 2020).
 
-    Pairs whose distance is above c count c^2, whatever it is. That sum has many minima; so a
-    convex surrogate is minimised first (mu small), and made less convex round by round, each time
-    from the last solution: point-to-point with the weights of eq 14, ::
+    Pairs with a distance above c contribute c^2. As that sum has many minima, a convex surrogate is
+    minimised first (mu small), and made less convex in each round, starting at the last solution:
+    point-to-point with the weights of eq 14, ::
 
         w = 0                                   if r^2 >= (mu + 1) / mu c^2
             c / r sqrt(mu (mu + 1)) - mu        between
             1                                   if r^2 <= mu / (mu + 1) c^2
 
-    No guess of which pairs are wrong is needed, and 70 to 80 % of them may be.
+    It needs no initial inlier set and tolerates 70 to 80 % outliers.
 
     Attributes
     ----------
     inlier
-        c: largest distance of a true pair, in resolutions.
+        c: largest distance of an inlier, in resolutions.
     """
 
     inlier: float = 2.0
@@ -54,7 +54,7 @@ class Graduated(Metric):
         return self._solved(matches, alignment)[0]
 
     def information(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.information`: that of the pairs that are taken for true."""
+        """See `Metric.information`; of the inliers."""
         _, weighted = self._solved(matches, alignment)
         return PointToPoint().information(weighted.keep(weighted.weights() > 0), alignment)
 
@@ -71,7 +71,7 @@ class Graduated(Metric):
             if mu == 0:
                 largest = float(r2.max())
                 if largest <= c2:
-                    break  # no pair is beyond c: least squares it is
+                    break  # no pair is beyond c: plain least squares
                 mu = c2 / (2 * largest - c2)
             w = np.sqrt(c2 / np.maximum(r2, 1e-300) * mu * (mu + 1)) - mu
             w = np.where(r2 >= (mu + 1) / mu * c2, 0.0, np.clip(w, 0.0, 1.0))
@@ -86,15 +86,15 @@ class Graduated(Metric):
 @part("metric", "adaptive", label="validated")
 @dataclass(frozen=True)
 class Adaptive(TangentPlanes):
-    """Point-to-plane with a loss that takes its shape from the residuals.
+    """Point-to-plane with a loss whose shape is estimated from the residuals.
 
     The general loss of Barron (2019), ::
 
         rho(r) = |a - 2| / a ((r^2 / |a - 2| + 1)^(a / 2) - 1),    r in scales
 
     is that of least squares for a = 2, Cauchy for 0, Geman-McClure for -2, Welsch for minus
-    infinity. Of its shapes the one is taken under which the residuals are most probable, with the
-    distribution cut off at ten scales so that shapes below zero have one (Chebrolu et al. 2021).
+    infinity. The shape maximises the likelihood of the residuals, with the distribution truncated
+    at ten scales so that it exists for negative shapes (Chebrolu et al. 2021).
     """
 
     def weights(self, residual: Float64, resolution: float) -> Float64:
@@ -115,7 +115,7 @@ def general_loss(x: Float64, shape: float) -> Float64:
 
 
 def shape_of(x: Float64) -> float:
-    """Return the shape under which residuals x (in scales) are most probable."""
+    """Return the maximum-likelihood shape for residuals x (in scales)."""
     shapes, normalisers = _distributions()
     inside = np.minimum(np.abs(x), _CUT)
     cost = [
@@ -127,7 +127,7 @@ def shape_of(x: Float64) -> float:
 
 @cache
 def _distributions() -> tuple[Float64, Float64]:
-    """Shapes, and the logarithm of the integral of exp(-rho) up to the cut for each."""
+    """Shapes, and the logarithm of the integral of exp(-rho) up to the truncation for each."""
     shapes = np.r_[np.arange(-10, -2, 1.0), np.arange(-2, 2.01, 0.25)]
     x = np.linspace(-_CUT, _CUT, 4001)
     step = x[1] - x[0]

@@ -1,4 +1,4 @@
-"""Selectors of the literature: which points of a view ICP uses (section 2.9.2)."""
+"""Selectors of the literature: the points of a view used by ICP (section 2.9.2)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tofuse.registration.shape import NEIGHBOURS, normals_at
 @part("selector", "random-each-iteration", label="validated")
 @dataclass(frozen=True)
 class RandomEachIteration(Random):
-    """A random subset, another one at each iteration (Masuda, Sakaue and Yokoya 1996).
+    """A random subset, redrawn at each iteration (Masuda, Sakaue and Yokoya 1996).
 
     Attributes
     ----------
     points
-        How many; a view with fewer gives all it has.
+        Number of points; all of a view with fewer.
     """
 
     each_iteration: ClassVar[bool] = True
@@ -33,12 +33,12 @@ class RandomEachIteration(Random):
 @part("selector", "voxel", label="validated")
 @dataclass(frozen=True)
 class Voxel(Selector):
-    """One point in each cube of space, that closest to its middle: evenly spread over surfaces.
+    """The point closest to the centre of each voxel: uniform density on surfaces.
 
     Attributes
     ----------
     size
-        Edge of the cubes in m.
+        Voxel size in m.
     """
 
     size: float = 0.05
@@ -62,20 +62,20 @@ class Voxel(Selector):
 @part("selector", "normal-space", label="validated")
 @dataclass(frozen=True)
 class NormalSpace(Selector):
-    """Points whose normals are spread as evenly as can be (Rusinkiewicz and Levoy 2001).
+    """Normal-space sampling (Rusinkiewicz and Levoy 2001).
 
-    Normals are sorted into buckets of like direction, and points are drawn from one bucket after
-    the other, at random, so that small features with rare directions are not outvoted by large
-    flat surfaces. Points without a normal are left out.
+    Points are binned by normal direction and drawn at random from the bins in turn, so that small
+    features with rare normals are not outweighed by large flat surfaces. Points without a normal
+    are excluded.
 
     Attributes
     ----------
     points
         How many.
     buckets
-        Along each side of a cube's faces, 6 buckets^2 in all.
+        Number along each side of a cube map's faces, 6 buckets^2 in total.
     neighbours
-        Points of each plane fit, where the view brings no normals.
+        Points per plane fit, if the view has no normals.
     """
 
     points: int = 1000
@@ -111,7 +111,7 @@ def _bucket(normals: Float64, side: int) -> Int64:
     n = np.arange(len(normals))
     axis = np.abs(normals).argmax(1)
     height = normals[n, axis]
-    # Equal steps of the angle, not of its tangent.
+    # Uniform in angle, not in its tangent.
     u = np.arctan(normals[n, (axis + 1) % 3] / np.abs(height)) / (np.pi / 2) + 0.5
     v = np.arctan(normals[n, (axis + 2) % 3] / np.abs(height)) / (np.pi / 2) + 0.5
     i = np.clip((u * side).astype(np.int64), 0, side - 1)
@@ -122,10 +122,10 @@ def _bucket(normals: Float64, side: int) -> Int64:
 @part("selector", "intensity-gradient", label="validated")
 @dataclass(frozen=True)
 class IntensityGradient(Selector):
-    """The points where the amplitude changes most (Weik 1997).
+    """The points of largest amplitude gradient (Weik 1997).
 
-    The gradient is that of the amplitude's logarithm between the neighbours of a pixel, all of
-    which must be valid. Needs a range image with amplitude.
+    The gradient of the logarithmic amplitude is taken between a pixel's neighbours, all of which
+    must be valid. Needs a range image with amplitude.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Corresponding point sets of many views, all at once (eq 2.8)."""
+"""Joint registration of corresponding point sets of many views (eq 2.8)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tofuse.kernels.icp import transform_points
 from tofuse.lab.methods.multiview import Cloud, Pairs, Relaxing, rotation_to
 from tofuse.parts import part
 
-# The first view stays: by so much it counts more than all pairs.
+# Weight of the fixed first view relative to all pairs.
 _FIXED = 1e6
-# A sweep over all rotations that lowers the error by a smaller share is the last.
+# Min relative decrease of the error per sweep over all rotations.
 _SAME = 1e-12
 
 
@@ -26,15 +26,15 @@ class WilliamsBennamoun(Relaxing):
     """Simultaneous registration of corresponding point sets (Williams and Bennamoun 2001).
 
     Minimises ``sum |R_i p_i + t_i - R_j p_j - t_j|^2`` over all pairs and all views. The
-    translations follow from the rotations by one linear system (their eq 11), which leaves a
-    trace of rotations alone; each rotation in turn is then the best for the others, by an SVD of
-    three by three numbers (section 4.3). The error falls at every step, no rotation is
-    linearised, and no view is preferred.
+    translations follow from the rotations by one linear system (their eq 11), which leaves a trace
+    in the rotations only; each rotation in turn is optimised given the others, by a 3 x 3 SVD
+    (section 4.3). The error decreases at every step, no rotation is linearised, and no view is
+    preferred.
 
     Attributes
     ----------
     sweeps
-        Over all rotations, in each round.
+        Sweeps over all rotations per round.
     """
 
     sweeps: int = 20
@@ -49,7 +49,7 @@ def corresponding(
 ) -> tuple[Float64, list[float]]:
     """Return the poses for given correspondences, and the error after each sweep.
 
-    The first of those views that pairs connect stays where it is.
+    The first view of the connected ones is fixed.
     """
     n = len(poses)
     count = np.zeros((n, n))  # Laplacian of the translations
@@ -85,7 +85,7 @@ def corresponding(
     out = np.tile(np.eye(4), (n, 1, 1))
     out[:, :3, :3] = R
     out[:, :3, 3] = -grounded @ np.einsum("kab,ikb->ia", R, first)
-    # What the pairs connect may move as a whole: the first of it stays.
+    # Gauge freedom of the connected views: the first one is fixed.
     part_of = connected_components(count != 0, directed=False)[1]
     stays = np.unique(part_of, return_index=True)[1][part_of]
     return poses[stays] @ se3.inverse(out[stays]) @ out, errors
@@ -96,10 +96,10 @@ def corresponding(
 class SmallAngles(Relaxing):
     """All views by one linear system of small angles: aprxICP (Artner 2009; Borrmann et al. 2008).
 
-    ``sum |x_i + v_i + w_i x x_i - x_j - v_j - w_j x x_j|^2`` over all pairs of points, x where
-    the poses put them, is quadratic in the motions (v, w) of all views, which are solved for
-    together; the pairs are then taken anew. It is one Gauss-Newton step of eq 2.8, the objective
-    of GraphSLAM (Thrun and Montemerlo 2005).
+    ``sum |x_i + v_i + w_i x x_i - x_j - v_j - w_j x x_j|^2`` over all pairs of points, with
+    transformed points x, is quadratic in the motions (v, w) of all views, which are solved for
+    jointly; then points are paired again. It is one Gauss-Newton step of eq 2.8, the objective of
+    GraphSLAM (Thrun and Montemerlo 2005).
     """
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:

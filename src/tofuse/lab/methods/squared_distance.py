@@ -26,11 +26,10 @@ class SquaredDistance(SurfaceMetric):
 
         F_d(x) = d / (d - rho_1) x_1^2 + d / (d - rho_2) x_2^2 + x_3^2
 
-    where coefficients below zero are set to zero, so that the sum has a minimum. On the surface
-    only the distance to the tangent plane is left, as in point-to-plane; far from it all three
-    count, as in point-to-point. Points move by the field of velocities c + c' x p that makes the
-    sum least (instantaneous kinematics), and then by the helical motion with the same axis and
-    pitch, through the angle atan |c'|, as the field is no rigid motion (section 3).
+    where negative coefficients are set to zero, so that the sum has a minimum. Close to the surface
+    this is the point-to-plane distance, far from it point-to-point. The velocity field c + c' x p
+    that minimises the sum (instantaneous kinematics) is not a rigid motion, and is replaced by the
+    helical motion with the same axis and pitch, through the angle atan |c'| (section 3).
     """
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
@@ -47,14 +46,14 @@ class SquaredDistance(SurfaceMetric):
         return pairs.motion(field * (math.atan(speed) / speed) if speed > 0 else field)
 
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
-        """See `SurfaceMetric.fit`: at the end the sum is that of point-to-plane."""
+        """See `SurfaceMetric.fit`: at convergence the sum is that of point-to-plane."""
         return PointToPlane().fit(pairs)
 
 
 def approximant(matches: Matches, alignment: Alignment) -> Float64:
     """Return F_d of each pair as a matrix (m, 3, 3) in the target's frame.
 
-    ``F_d(x) = (x - q)^T W (x - q)`` with q the target point.
+    ``F_d(x) = (x - q)^T W (x - q)`` with q the target point and W the result.
     """
     j = matches.target
     bending = neighbourhood(alignment.target).bending

@@ -17,22 +17,21 @@ from tofuse.posegraph.levenberg import check_graph
 @part("optimiser", "stochastic", label="validated")
 @dataclass(frozen=True)
 class Stochastic(Optimiser):
-    """Satisfy one edge after the other, less and less, by all poses between its ends.
+    """Satisfy edges sequentially with decreasing rate, by all poses between their ends.
 
     A pose is the sum of the steps before it (incremental poses), so that the error of an edge is
-    spread over all steps between its ends, each by its share of their compliance, and all poses
-    behind it come along. In round t an edge over n steps is satisfied by the share
-    ``n w / (t m)``, w its information and m the stiffness of the softest step, at most in full:
-    in full at first, whatever the error, and then less and less, which leads to the least squares.
-    Rotations are spread along the shortest
-    turn, as in TORO. The edges come in the order of their length, the longest first. The first
-    vertex of each connected part stays. It gets near quickly and to the end slowly: let
-    `levenberg-marquardt` follow. Gravity and anchors are not used.
+    distributed over all steps between its ends in proportion to their compliance, and all later
+    poses follow. In round t an edge over n steps is satisfied by the fraction ``n w / (t m)``, w
+    its information and m the stiffness of the softest step, limited to 1; the decreasing rate
+    converges to least squares. Rotations are distributed along the shortest rotation, as in TORO.
+    Edges are processed by length, the longest first. The first vertex of each connected component
+    is fixed. Initial progress is fast, final convergence slow: follow it by `levenberg-marquardt`.
+    Gravity and anchors are not used.
 
     Attributes
     ----------
     rounds
-        Over all edges.
+        Rounds over all edges.
     """
 
     rounds: int = 100
@@ -42,7 +41,7 @@ class Stochastic(Optimiser):
             raise ValueError(f"rounds is {self.rounds}, not 1 or more")
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
-        """See `Optimiser.optimise`; the best poses on the way. InputError as `lu-milios`."""
+        """See `Optimiser.optimise`; the best poses of all rounds. InputError as `lu-milios`."""
         check_graph(graph)
         best, history = graph, [graph.chi2()]
         if not len(graph.edges) or not free_vertices(graph).any():
@@ -54,7 +53,7 @@ class Stochastic(Optimiser):
                 best = here
             history.append(here.chi2())
         if history[-1] > min(history):
-            history.append(min(history))  # the step back to the best
+            history.append(min(history))  # return to the best
         return Optimisation(best, tuple(history), False)
 
 
@@ -70,7 +69,7 @@ class _Descent:
         trace = np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3
         turn = np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3
         self.weight = [(float(trace[k]), float(turn[k])) for k in order]
-        # Stiffness of each step: of the edges that bend it, all together.
+        # Stiffness of each step: the sum over the edges across it.
         self.stiff = np.zeros((n, 2))
         for (i, j, _), w in zip(self.edges, self.weight, strict=True):
             self.stiff[i + 1 : j + 1] += w
@@ -82,7 +81,7 @@ class _Descent:
         for (i, j, Z), (move, turn) in zip(self.edges, self.weight, strict=True):
             steps = slice(i + 1, j + 1)
             soft = 1 / self.stiff[steps]
-            # The share of the error that is the edge's to ask for, and how it is spread.
+            # The fraction of the error to correct, and its distribution.
             gain = np.minimum(1.0, rate * (j - i) * np.array([move, turn]) / self.softest)
             along = np.cumsum(soft, axis=0) / soft.sum(0)
             error = se3.so3_log(self.R[i] @ Z[:3, :3] @ self.R[j].T)
@@ -98,7 +97,7 @@ class _Descent:
         return np.asarray(se3.orthonormalise(poses))
 
     def _turn(self, steps: slice, turns: Float64) -> Float64:
-        """Turn poses by vectors (k, 3) of the world, and steps with them; returns the last turn."""
+        """Rotate poses by world vectors (k, 3), and steps with them; returns the last rotation."""
         R = se3.so3_exp(turns)
         before = np.concatenate([np.eye(3)[None], R[:-1]])
         steps_t = np.diff(self.t[steps.start - 1 : steps.stop], axis=0)

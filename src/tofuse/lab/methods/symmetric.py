@@ -28,26 +28,25 @@ from tofuse.registration.surface_metrics import SurfaceMetric
 class Symmetric(SurfaceMetric):
     """Distances along the sum of both normals (Rusinkiewicz 2019).
 
-    ``sum w_i ((R p_i - R^-1 q_i + t) . (n_pi + n_qi))^2``: half of the rotation is given to each
-    view. It is zero wherever two points and their normals lie on one circle, so that curved
-    surfaces may slide along themselves, and converges faster and from further away than
-    point-to-plane.
+    ``sum w_i ((R p_i - R^-1 q_i + t) . (n_pi + n_qi))^2``: each view gets half of the rotation. It
+    is zero wherever two points and their normals are consistent with a circle, so that curved
+    surfaces may slide, and has faster convergence and a larger basin than point-to-plane.
 
     Attributes
     ----------
     loss
-        "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
+        "square" as in the paper; "huber", "cauchy" or "tukey" downweight large residuals.
     """
 
     loss: Loss = "square"
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.motion`; no motion along directions that no plane holds."""
+        """See `Metric.motion`; no motion along unconstrained directions."""
         pairs = surface_pairs(matches, alignment, source=True)
         n = pairs.source_normals + pairs.target_normals
         r = (pairs.residual * n).sum(1)
         weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
-        # p and q in one frame, that of the source; centred between both.
+        # p and q in the source's frame, centred between both.
         p = pairs.points
         q = p - pairs.residual
         centre = (p.mean(0) + q.mean(0)) / 2

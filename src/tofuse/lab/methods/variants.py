@@ -1,4 +1,4 @@
-"""Named variants of ICP (section 1.3): each a choice of parts."""
+"""Named variants of ICP (section 1.3), each a combination of parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Variant(Registrar, Protocol):
-    """A registration that is described by the parts it is made of."""
+    """A registration composed of ICP parts."""
 
     def parts(self) -> Registrar:
         """Return the registration as its parts."""
@@ -36,7 +36,7 @@ class Variant(Registrar, Protocol):
 
     @property
     def takes(self) -> frozenset[str]:
-        """Kinds of view it works on."""
+        """Kinds of view it accepts."""
         return self.parts().takes
 
     def register(
@@ -62,7 +62,7 @@ def _surface_icp(
 @part("registration", "point-to-plane", label="validated")
 @dataclass(frozen=True)
 class PointToPlaneIcp(Variant):
-    """ICP with the distance to tangent planes (Chen and Medioni 1992), of closest points.
+    """Point-to-plane ICP (Chen and Medioni 1992) with closest points.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class PointToPlaneIcp(Variant):
     reach
         Largest distance of a pair, in resolutions.
     max_iterations
-        Iterations after which it ends in any case.
+        Maximum number of iterations.
     """
 
     resolution: float = 0.01
@@ -91,12 +91,12 @@ class PointToPlaneIcp(Variant):
 @part("registration", "symmetric", label="validated")
 @dataclass(frozen=True)
 class SymmetricIcp(Variant):
-    """ICP with the symmetric objective (Rusinkiewicz 2019), of closest points.
+    """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points.
 
     Attributes
     ----------
     resolution, points, reach, max_iterations
-        As of `PointToPlaneIcp`.
+        See `PointToPlaneIcp`.
     """
 
     resolution: float = 0.01
@@ -119,7 +119,7 @@ class GeneralizedIcp(Variant):
     Attributes
     ----------
     resolution, points, reach, max_iterations
-        As of `PointToPlaneIcp`.
+        See `PointToPlaneIcp`.
     epsilon
         Variance across a surface relative to that along it.
     """
@@ -141,10 +141,9 @@ class GeneralizedIcp(Variant):
 class Tricp(Registrar):
     """Trimmed ICP (Chetverikov, Stepanov and Krsek 2005).
 
-    Each iteration keeps the share xi of shortest pairs, at any distance. If the overlap xi isn't
-    known, it is that which makes ``psi(xi) = e(xi) xi^-(1 + preference)`` least, with e the mean
-    squared distance of the pairs kept when the registration with xi has ended: looked for on a
-    grid of six, and from the best of these by golden section.
+    Each iteration keeps the fraction xi of shortest pairs, at any distance. An unknown overlap xi
+    minimises ``psi(xi) = e(xi) xi^-(1 + preference)``, with e the mean squared distance of the
+    pairs kept by the converged registration: searched on a grid of six, then by golden section.
 
     Attributes
     ----------
@@ -155,11 +154,11 @@ class Tricp(Registrar):
     overlap
         xi, if it is known.
     smallest
-        Smallest overlap looked at.
+        Lower bound of the searched overlap.
     preference
-        lambda of the paper (2): how much a large overlap is preferred.
+        lambda of the paper (2): preference of large overlaps.
     tolerance
-        How well the overlap is found.
+        Accuracy of the overlap.
     max_iterations
         Of each registration.
     """
@@ -182,7 +181,7 @@ class Tricp(Registrar):
 
     @property
     def takes(self) -> frozenset[str]:
-        """Kinds of view it works on: all."""
+        """Kinds of view it accepts: all."""
         return frozenset({"range", "cloud"})
 
     def parts(self, overlap: float) -> Icp:
@@ -199,10 +198,10 @@ class Tricp(Registrar):
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
     ) -> Registration:
-        """See `Registrar.register`; the share of corresponding points is the overlap."""
+        """See `Registrar.register`; the fraction of corresponding points is the overlap."""
         if self.overlap is not None:
             return self.parts(self.overlap).register(source, target, guess, rng)
-        # The same points for every overlap, or psi would be noisy.
+        # The same points for every overlap, to keep psi free of sampling noise.
         seed = int(rng.integers(2**62))
         tried: dict[float, tuple[float, Registration]] = {}
 
@@ -233,8 +232,8 @@ class Tricp(Registrar):
 class Iccp(Variant):
     """Iterative Closest Compatible Point (Godin, Rioux and Baribeau 1994).
 
-    Only points of like amplitude are paired, so that texture holds what the shape doesn't. Needs
-    amplitude in both views, compensated for range if the range differs.
+    Only points of similar amplitude are paired, so that texture constrains what the shape does not.
+    Needs amplitude in both views, compensated for range if the range differs.
 
     Attributes
     ----------
@@ -247,7 +246,7 @@ class Iccp(Variant):
     reach
         Largest distance of a pair, in resolutions.
     max_iterations
-        Iterations after which it ends in any case.
+        Maximum number of iterations.
     """
 
     resolution: float = 0.01
@@ -274,8 +273,8 @@ class Iccp(Variant):
 class Icpif(Variant):
     """ICP using invariant features (Sharp, Lee and Wehe 2002).
 
-    Points are paired by their distance in space and in features that don't change with the pose.
-    Features bring the views together from far; plain ICP, from there, makes them fit.
+    Points are paired by their distance in space and in pose-invariant features, which enlarges the
+    basin of convergence; plain ICP refines the result.
 
     Attributes
     ----------
@@ -284,7 +283,7 @@ class Icpif(Variant):
     points
         Random points of the source (None: all), against all of the target.
     features, weight, radius
-        As of `ClosestInvariant`.
+        See `ClosestInvariant`.
     reach
         Largest distance of a pair in the plain ICP, in resolutions.
     max_iterations

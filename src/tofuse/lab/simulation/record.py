@@ -199,8 +199,9 @@ def simulate(
     seed
         Of scene and noise.
     effects
-        Simulated errors of the camera. every Stride over raw frames; that of the thesis if not
-        given. A raw frame does not depend on it.
+        Simulated errors of the camera.
+    every
+        Stride over raw frames; that of the thesis if not given. A raw frame does not depend on it.
     frames
         Maximum number of frames.
     first
@@ -219,7 +220,9 @@ def simulate(
     sigma_m
         Noise of "peaks" in m.
     progress
-        Called with the number of frames done and the total. Returns
+        Called with the number of frames done and the total.
+
+    Returns
     -------
     The folder.
 

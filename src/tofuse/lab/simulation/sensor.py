@@ -1,11 +1,11 @@
 """Sensor model, from per-pixel light to the reported data: four phase images and their sums.
 
 Phase image k correlates the light with the signal shifted by ``theta_k = k pi / 2`` in two buckets,
-whose difference is ``D_k = m sum s c(phase - theta_k)`` electrons with the correlation ``c(x) = cos
-x + h3 cos 3x + h5 cos 5x`` (Lange 2000; Lindner et al. 2010 for the harmonics). The phasor ``((D_0
-- D_2) + i (D_1 - D_3)) / 2`` has the range in its angle and the amplitude in its length (eq 2.2).
-As four samples alias the third and fifth harmonic onto the first, the range error has four periods
-per period of the phase: wiggling.
+whose difference is ``D_k = m sum s c(phase - theta_k)`` electrons with the correlation
+``c(x) = cos x + h3 cos 3x + h5 cos 5x`` (Lange 2000; Lindner et al. 2010 for the harmonics). The
+phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` has the range in its angle and the amplitude in its
+length (eq 2.2). As four samples alias the third and fifth harmonic onto the first, the range error
+has four periods per period of the phase: wiggling.
 """
 
 from __future__ import annotations
