@@ -71,7 +71,7 @@ class ProjectiveOptions:
         Largest sigma of a constrained direction, in units of 1 cm and 1 degree; others are taken
         from the prediction.
     common_tilt, common_slope
-        Errors fixed to the camera, which bend both views alike and so cause spurious information:
+        Errors fixed to the camera, which distort both views equally and cause spurious information:
         standard deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
     max_sigma_m
         Largest sigma of a typical distance where the views disagree, m. It covers noise that

@@ -219,7 +219,7 @@ class _View:
     frame: Float64
     points: Float32
     normals: Float32
-    light: Float32
+    albedo: Float32
     depth: float
 
     def some(self, count: int, less: Bool | None = None) -> tuple[Float32, Float32, Float32]:
@@ -228,7 +228,7 @@ class _View:
         if less is not None:
             keep = np.concatenate([keep[~less], keep[less][::4]])
         keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
-        return self.points[keep], self.normals[keep], self.light[keep]
+        return self.points[keep], self.normals[keep], self.albedo[keep]
 
 
 def search(
@@ -295,37 +295,37 @@ class Search:
         if options.mode != "full":
             floors = find_floors((self.source, self.target), options.floor, gravity)
             if floors is not None:
-                found = self._settled(_planar(s, t, floors[0], floors[1], options))
+                found = self._refined(_planar(s, t, floors[0], floors[1], options))
             convinced = bool(found) and max(c.score for c in found) >= options.convincing
             if options.mode == "planar" or (options.mode == "auto" and convinced):
                 return Match(self._ordered(found), "planar") if found else None
-        found += self._settled(_full(s, t, options))
+        found += self._refined(_full(s, t, options))
         return Match(self._ordered(found), "full")
 
     def among(self, poses: Float64, match: Match) -> Match:
         """Refine further poses T_target_source (N, 4, 4) and rank them among the candidates."""
         if not len(poses):
             return match
-        return replace(match, candidates=self._ordered([*match.candidates, *self._settled(poses)]))
+        return replace(match, candidates=self._ordered([*match.candidates, *self._refined(poses)]))
 
-    def _settled(self, poses: Float64) -> list[Candidate]:
+    def _refined(self, poses: Float64) -> list[Candidate]:
         """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
         s, t, options = self.s, self.t, self.options
         poses = poses.copy()
         floor = _noise_floor(s, t, options)
         depth = 0.5 * (s.depth + t.depth)
         reaches = np.maximum(0.25 * depth * _NARROWER, 3 * floor)
-        _settle(s, t, poses, reaches, options.settle_points, options)
-        judged = self._judged(poses)
+        _refine(s, t, poses, reaches, options.settle_points, options)
+        judged = self._evaluated(poses)
         best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
         finer = np.stack([candidate.T_target_source for candidate in best])
         reaches = np.maximum(8 * floor * _NARROWER, 1.3 * floor)
-        _settle(s, t, finer, reaches, _POLISH_POINTS, options)
-        return judged + self._judged(finer)
+        _refine(s, t, finer, reaches, _POLISH_POINTS, options)
+        return judged + self._evaluated(finer)
 
-    def _judged(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:
-        said = run_all([partial(self.compared.at, T) for T in poses])
-        return [Candidate(T, each) for T, each in zip(poses, said, strict=True)]
+    def _evaluated(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:
+        agreements = run_all([partial(self.compared.at, T) for T in poses])
+        return [Candidate(T, agreement) for T, agreement in zip(poses, agreements, strict=True)]
 
     def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
         """Rank candidates after photometric alignment of the best ones."""
@@ -341,7 +341,7 @@ class Search:
                 for candidate in best
             ]
         )
-        placed = self._judged([aligned.T_world_source for aligned in moved])
+        placed = self._evaluated([aligned.T_world_source for aligned in moved])
         # Along degenerate directions the geometric score may decrease slightly with photometric
         # alignment.
         kept = [
@@ -381,25 +381,25 @@ def _prepare(view: PreparedView) -> _View:
     grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
     grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
     seen = ViewPoints.of(view, _SEEN)
-    light = _around(np.where(known, view.albedo[v, u, 0], np.nan), _BLUR / spacing)
+    albedo = _low_pass(np.where(known, view.albedo[v, u, 0], np.nan), _BLUR / spacing)
     at = seen.points[:, :2] / seen.points[:, 2:] - (x[0], y[0])
     j, i = (at / spacing).round().astype(int).T
     i, j = np.clip(i, 0, len(y) - 1), np.clip(j, 0, len(x) - 1)
     return _View(
-        np.dstack([grid, light]).astype(np.float32),
+        np.dstack([grid, albedo]).astype(np.float32),
         np.array([x[0], y[0], 1 / spacing, 1 / spacing]),
         seen.points,
         seen.normals,
-        light[i, j],
+        albedo[i, j],
         float(np.median(seen.points[:, 2])),
     )
 
 
-def _around(light: Float64, sigma: float) -> Float32:
+def _low_pass(albedo: Float64, sigma: float) -> Float32:
     """Low-pass filter an image (H, W), ignoring NaN, to match the step of the coarse grid."""
-    known = np.isfinite(light)
+    known = np.isfinite(albedo)
     size = (0, 0)
-    total = cv2.GaussianBlur(np.where(known, light, 0), size, sigma, borderType=_NO_BORDER)
+    total = cv2.GaussianBlur(np.where(known, albedo, 0), size, sigma, borderType=_NO_BORDER)
     share = cv2.GaussianBlur(known.astype(float), size, sigma, borderType=_NO_BORDER)
     mean = total / np.maximum(share, 1e-9)
     return np.where(known, mean, np.nan).astype(np.float32)
@@ -542,7 +542,7 @@ def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
     return a.floor_m + a.floor_share * 0.5 * (s.depth + t.depth)
 
 
-def _settle(
+def _refine(
     s: _View, t: _View, poses: Float64, reaches: Float64, points: int, options: SearchOptions
 ) -> None:
     """Refine poses (N, 4, 4) in place by two-way ICP."""
