@@ -1,4 +1,4 @@
-"""``tofuse demo`` and ``tofuse simulate``: a recording made here, and what becomes of it."""
+"""``tofuse demo`` and ``tofuse simulate``: a simulated recording and its reconstruction."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from tofuse.pipeline.run import Options, resolve, run
 from tofuse.results.folder import RECORDING, OutputFolder
 from tofuse.results.types import Reconstruction
 
-# What the thesis set differently for a scene (section 4.1): points beyond the object are cut.
+# Settings of the thesis per scene (section 4.1): points beyond the object are removed.
 _SCENE_OPTIONS: dict[str, dict[str, Any]] = {
     "torso": {"object": True, "max_depth": 2.2},
     "box": {"object": True, "max_depth": 1.8},
 }
-# Along a corridor of one albedo every view is alike: the motion can't be observed. Without phase
-# wrapping there is nothing else to find.
+# Along a corridor of uniform albedo all views are equal and the motion is unobservable without
+# phase wrapping.
 FAILURE = "corridor"
 
 
@@ -47,7 +47,7 @@ def demo(
     Raises
     ------
     InputError, OutputError
-        If nothing could be written; see the message for the remedy.
+        For invalid options, or if the folder can't be written; see the message for the remedy.
     """
     progress = progress or Silent()
     options = Options(
@@ -58,13 +58,13 @@ def demo(
         overwrite=True,
         **_SCENE_OPTIONS.get(scene, {}),
     )
-    # Whatever is wrong with the options or the folder is said before the work begins.
+    # Validate options and folder before the simulation.
     resolve(options)
     with (
         OutputFolder(out, overwrite=overwrite) as folder,
         _replacing_recording(out / RECORDING) as fresh,
     ):
-        discard_states(out)  # of a recording that is made anew
+        discard_states(out)  # of the replaced recording
         fails = scene == FAILURE
         simulate_to(
             scene,
@@ -85,7 +85,7 @@ def demo(
 
 @contextmanager
 def _replacing_recording(path: Path) -> Iterator[Path]:
-    """Give a path to make a recording at, to be moved to `path`; a failure puts the old one back.
+    """Yield a temporary path, moved to `path` on success; a failure restores the old recording.
 
     Only a simulated recording is ever replaced.
     """
@@ -98,7 +98,7 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
                 remedy="move it away, or give another --out",
             )
     shutil.rmtree(fresh, ignore_errors=True)
-    if not path.exists() and old.exists():  # it was stopped in between
+    if not path.exists() and old.exists():  # interrupted in between
         os.replace(old, path)
     shutil.rmtree(old, ignore_errors=True)
     if path.exists():
@@ -114,7 +114,7 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
     shutil.rmtree(old, ignore_errors=True)
 
 
-# All that a simulated recording holds, in the end and while it is written.
+# All files of a simulated recording, complete or being written.
 _SIMULATED = re.compile(
     r"(truth/)?[a-z_]+/\.?\d{6}\.[\w.-]+|truth/[\w.-]+\.ply"
     r"|\.?(camera|correction|rays|timestamps|groundtruth|odometry|frames|imu|peaks)\.[\w.-]+"
@@ -122,7 +122,7 @@ _SIMULATED = re.compile(
 
 
 def _is_simulated(folder: Path) -> bool:
-    """Whether a folder holds a simulated recording, or a part of it, and nothing else."""
+    """Whether a folder contains a simulated recording, or a part of it, and nothing else."""
     if folder.is_symlink() or not folder.is_dir():
         return False
     for here, folders, names in os.walk(folder):
@@ -166,7 +166,7 @@ def simulate_to(
     sigma: float | None = None,
     progress: Progress | None = None,
 ) -> int:
-    """Write a simulated recording; returns how many frames it has.
+    """Write a simulated recording; returns its number of frames.
 
     `without` names effects to switch off, or is ("all",); see `Effects.without`.
 
@@ -175,7 +175,7 @@ def simulate_to(
     InputError
         For an unknown scene, camera or effect.
     OutputError
-        If the folder can't be written, or holds something already.
+        If the folder can't be written, or is not empty.
     """
     progress = progress or Silent()
     effects = Effects().without(*without)

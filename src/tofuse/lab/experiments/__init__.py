@@ -1,1 +1,1 @@
-"""Chapters 4 and 5 of the thesis, run again."""
+"""Reproduction of chapters 4 and 5 of the thesis."""

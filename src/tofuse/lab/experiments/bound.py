@@ -1,4 +1,4 @@
-"""The lowest error that unbiased estimates of poses can have from a surface that nobody knows."""
+"""Lower bounds of the error of unbiased pose estimates from an unknown surface."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ def joint_covariance(
 ) -> Float64:
     """Cramer-Rao bound of poses from the distances of their points from a surface.
 
-    Every point has isotropic noise, of which only the part along the normal counts: where on the
-    surface a point lies is not known. Nor is the height of the surface at any of the samples,
-    which is eliminated from the Fisher information; the first pose is known.
+    Every point has isotropic noise, of which only the normal component counts, as the position on
+    the surface is unknown. So is the height of the surface at the samples, which is eliminated from
+    the Fisher information; the first pose is known.
 
     Parameters
     ----------
     points, normals
         (S, 3) samples of the surface in the frame of the poses, and its unit normals.
     seen
-        (S, N) which sample each view sees.
+        (S, N) visibility of each sample in each view.
     poses
         (N, 4, 4) true poses, which map a view into the frame of the points.
     sigma
@@ -42,7 +42,7 @@ def joint_covariance(
         m = normals @ T[:3, :3]
         J[:, k] = np.hstack([m, np.cross(p, m)]) * seen[:, [k]]
         H[k, :, k] = J[:, k].T @ J[:, k]
-    # The height of a sample is best taken from all who see it.
+    # The height of a sample is estimated from all views that see it.
     J /= np.sqrt(np.maximum(seen.sum(1), 1))[:, None, None]
     rows = J.reshape(samples, -1)
     information = H.reshape(6 * views, 6 * views) - rows.T @ rows
@@ -61,10 +61,10 @@ def pose_covariances(
 
 
 def mean_distances(joint: Float64) -> Float64:
-    """(D,) mean distances of all positions from the truth, the first's 0, of drawn recordings.
+    """(D,) mean position errors of simulated recordings, including the first's 0.
 
-    `joint` is as from `joint_covariance`. What is wrong with the first view moves all the others,
-    so that single recordings differ much.
+    `joint` is that of `joint_covariance`. Errors of the first view move all the others, so that
+    single recordings vary strongly.
     """
     draws = np.random.default_rng([0]).normal(size=(len(joint), _DRAWS))
     errors = (np.linalg.cholesky(joint) @ draws).reshape(-1, 6, _DRAWS)[:, :3]

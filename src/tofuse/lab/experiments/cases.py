@@ -1,4 +1,4 @@
-"""The five cases of chapter 4 that a camera sees: every stride, method, guess and draw."""
+"""The five camera cases of chapter 4: every stride, method, guess and draw."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tofuse.recordings.recording import Recording
 
 METHODS = ("thesis", "default")
 GUESSES = ("identity", "previous")
-# Which 1000 points a registration draws decides much, so that one draw says little.
+# Results vary strongly with the 1000 points drawn, so that one draw is not significant.
 DRAWS = 3
 _MODEL_POINTS = 200_000
 CHEST = (0.88, 0.94)  # heights of a band around the torso, m above the floor
@@ -40,9 +40,9 @@ class Case:
     scene
         Of the simulator.
     section
-        Where the thesis gives its result.
+        Section of the thesis with its result.
     strides
-        Every how manieth raw frame is taken.
+        Strides over the raw frames.
     """
 
     scene: str
@@ -102,7 +102,7 @@ CASES = (
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Points of all frames put together by some poses, and what is measured on them.
+    """Points of all frames merged by a set of poses, and measurements on them.
 
     Attributes
     ----------
@@ -126,13 +126,13 @@ class Run:
     Attributes
     ----------
     draw
-        Which draw of the random points: the seed above that of the scene.
+        Index of the draw of the random points: its seed minus that of the scene.
     truth, before, after
         (N, 4, 4) T_world_camera: true, chained, and optimised; NaN where lost.
     loop
-        Whether the loop that was given by hand was confirmed, and why.
+        Whether the manually given loop was confirmed, and why.
     model_before, model_after
-        Models of the two; their points are kept of the first draw alone.
+        Models of the two; points are stored for the first draw only.
     """
 
     case: str
@@ -154,27 +154,27 @@ class Run:
 
     @property
     def posed(self) -> int:
-        """How many frames have a pose."""
+        """Number of frames with a pose."""
         return int(np.isfinite(self.before[:, 0, 0]).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class CaseResult:
-    """Everything that came out of one case.
+    """All results of one case.
 
     Attributes
     ----------
     perfect
-        The filtered frames of the thesis's stride put together by the true poses: what a perfect
-        registration would give.
+        The filtered frames of the thesis's stride merged by the true poses: the result of a perfect
+        registration.
     samples
-        Three of the frames, to look at.
+        Three of the frames, for display.
     T_truth_world
         (4, 4) from the world to the frame of the true surface.
     surface
         (K, 3) points on the true surface.
     facts
-        Numbers of the case that no run changes.
+        Numbers of the case that don't depend on the run.
     """
 
     case: Case
@@ -199,7 +199,7 @@ class CaseResult:
 def run_case(
     case: Case, seed: int, progress: Progress, *, limit: int | None = None, draws: int = DRAWS
 ) -> CaseResult:
-    """Simulate a case once and reconstruct it in every way.
+    """Simulate a case once and reconstruct it with every configuration.
 
     Parameters
     ----------
@@ -208,8 +208,8 @@ def run_case(
     limit
         Stop after so many raw frames.
     draws
-        How often each run with the previous guess, and each at the thesis's stride, is repeated
-        with other random points.
+        Number of repetitions with other random points of each run with the previous guess, and of
+        each at the thesis's stride.
     """
     start = perf_counter()
 
@@ -263,7 +263,7 @@ def configuration(method: str, recorded: Recorded) -> Config:
     changes = {
         "filters": filters,
         "loops": {"per_frame" if method == "thesis" else "per_view": 0},
-        # The fused cloud is not looked at; coarse, it costs little.
+        # The fused cloud is unused; a coarse one is cheap.
         "fusion": {"voxel_m": 0.1},
     }
     return changed(config, changes, where="experiments")
@@ -305,7 +305,7 @@ def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int,
 def build_model(
     case: Case, recorded: Recorded, frames: list[Frame], poses: Float64 | None, *, keep: bool
 ) -> Model:
-    """Put frames together by poses (N, 4, 4), NaN where lost, and measure the model."""
+    """Merge frames by poses (N, 4, 4), NaN where lost, and measure the model."""
     assert poses is not None
     total = sum(len(f) for f in frames)
     step = max(1, -(-total // _MODEL_POINTS))
@@ -352,7 +352,7 @@ def _facts(
 
 
 def corner_in_view(recorded: Recorded, stride: int) -> Bool:
-    """(N,) mask: which frames of a stride see a corner of the room, by the true poses."""
+    """(N,) mask of the frames of a stride with a visible corner of the room, by the true poses."""
     from tofuse.lab.simulation.scenes import room
 
     recording = recorded.every(stride)
@@ -369,13 +369,13 @@ def corner_in_view(recorded: Recorded, stride: int) -> Bool:
         cosine = (towards * ahead).sum(1) / (
             np.linalg.norm(towards, axis=1) * np.linalg.norm(ahead, axis=1)
         )
-        # A few degrees inside the image, so that there is something to see of both walls.
+        # A few degrees inside the image, so that both walls are visible.
         seen |= np.arccos(np.clip(cosine, -1, 1)) < half - np.radians(4)
     return seen
 
 
 def _door(recorded: Recorded, recording: Recording) -> dict[str, float]:
-    """Points per frame on the glossy door, and on the same wall as far to the other side."""
+    """Points per frame on the glossy door, and on the section of that wall at -x."""
     from tofuse.lab.simulation.scenes import room
 
     counts = {"door": 0, "wall": 0}

@@ -21,7 +21,7 @@ _MARGINS = (50.0, 36.0, 12.0, 26.0)  # left, bottom, right, top, in pixels
 
 
 def plan_limits(*groups: Float64) -> Float64:
-    """(2, 2) low and high corners around the bulk of groups of (N, 2) points."""
+    """(2, 2) low and high corners around most of the points of groups (N, 2)."""
     return plots.limits(*groups, outer=0.5)
 
 
@@ -44,9 +44,9 @@ def plan(
     points, cameras
         (N, 2) points and camera positions in the plan, m; lost cameras are NaN.
     box
-        (2, 2) corners of the picture, so that pictures compare.
+        (2, 2) corners of the picture, for a common scale.
     true, measured
-        Closed outlines (K, 2) as they are, and as they were measured.
+        True and measured closed outlines (K, 2).
     """
     extent = box[1] - box[0]
     inner = width - 62.0
@@ -65,7 +65,7 @@ def plan(
     image = np.zeros((rows, columns, 4), np.uint8)
     image[..., :3] = _POINTS_RGB
     shade = (np.log1p(density) / np.log1p(top)).clip(0, 1)
-    # In few steps, which keeps the picture small.
+    # Few levels keep the file small.
     image[..., 3] = np.where(density > 0, 60 + 13 * np.round(15 * shade), 0).astype(np.uint8)
     axes.imshow(image, extent=(x0, x1, y0, y1), origin="lower", interpolation="none", aspect="auto")
     for outline, color, style in (
@@ -100,7 +100,7 @@ def drift(
 ) -> str:
     """Plot the error of the position along one axis (figures 5.2, 5.6).
 
-    `beside` is the same of the other method, drawn with dots.
+    `beside` is that of the other method, dotted.
     """
     return plots.lines(
         np.arange(len(before), dtype=float),

@@ -1,4 +1,4 @@
-"""What is measured on trajectories and on models: sizes, angles, girth, distances from the truth.
+"""Measurements on trajectories and models: sizes, angles, girth, distances from the truth.
 
 Models are points in the frame of the true surface, which has z up; see `Recorded.T_truth_world`.
 """
@@ -14,21 +14,21 @@ from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry import se3
 
-_FITTED = 20_000  # points of a model that walls are fitted to
+_FITTED = 20_000  # max points of a wall fit
 
 
 @dataclass(frozen=True, eq=False)
 class PathScore:
-    """How far a trajectory is from the truth; lost frames do not count.
+    """Errors of a trajectory; lost frames are ignored.
 
     Attributes
     ----------
     ate_m, rotation_deg
         Root mean square errors of positions and orientations after alignment.
     end_m, end_deg
-        Error of the last pose in the frame of the first camera, which nothing aligns.
+        Error of the last pose in the frame of the first camera, without alignment.
     drift
-        (N, 3) error of the position along x, y, z of the first camera, m, which nothing aligns:
+        (N, 3) error of the position along x, y, z of the first camera, m, without alignment:
         the cumulative error of figures 5.2 and 5.6. NaN where lost.
     step_m, step_deg
         (N,) error of the motion since the frame before; NaN for the first and where lost.
@@ -79,7 +79,7 @@ def motions(poses: Float64) -> Float64:
 def turned_deg(poses: Float64, axis: Float64) -> Float64:
     """(N,) angle in degrees turned since the first pose about an axis (3,) of the camera.
 
-    Whole turns are counted. A lost frame is where the one before it was.
+    Angles are unwrapped. A lost frame takes the angle of the previous one.
     """
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     angle = np.zeros(len(poses))
@@ -88,7 +88,7 @@ def turned_deg(poses: Float64, axis: Float64) -> Float64:
 
 
 def straightness_m(positions: Float64) -> float:
-    """Root mean square distance of positions (N, 3) from the straight line that fits them best."""
+    """RMS distance of positions (N, 3) from their best-fit line."""
     known = positions[np.isfinite(positions[:, 0])]
     centred = known - known.mean(0)
     across = np.linalg.svd(centred, compute_uv=False)[1:]
@@ -96,7 +96,7 @@ def straightness_m(positions: Float64) -> float:
 
 
 def circle_radius_m(positions: Float64) -> float:
-    """Radius of the circle that fits positions (N, 3) best, in the plane that does (Kasa 1976)."""
+    """Radius of the best-fit circle of positions (N, 3), in their best-fit plane (Kasa 1976)."""
     known = positions[np.isfinite(positions[:, 0])]
     centred = known - known.mean(0)
     flat = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
@@ -120,13 +120,13 @@ def surface_error_m(points: Float64, surface: Any, most: int = 10_000) -> float:
 def girth_m(points: Float64, low: float, high: float, sectors: int = 36) -> float:
     """Length around a body between two heights, m; NaN if a sector is empty.
 
-    The median distance from the middle is taken in each sector, so that double walls of a poor
-    model count with their mean place.
+    Each sector contributes its median distance from the centre, so that double walls of a poor
+    model are averaged.
     """
     flat = points[(points[:, 2] >= low) & (points[:, 2] <= high), :2]
     if len(flat) == 0:
         return float("nan")
-    # The middle of the outline, not of the points, which may be denser on one side.
+    # The centre of the outline; the points may be denser on one side.
     low_xy, high_xy = np.percentile(flat, [2, 98], axis=0)
     arm = flat - (low_xy + high_xy) / 2
     sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) % 1) * sectors).astype(int) % sectors
@@ -162,7 +162,7 @@ class BoxFit:
 
 
 def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxFit:
-    """Fit the walls and the top of a box that stands roughly where it should.
+    """Fit the walls and the top of a box near its expected position.
 
     All is NaN where a wall has no points.
 
@@ -171,12 +171,12 @@ def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxF
     points
         (N, 3) model.
     bottom, height, width
-        True heights above the floor and about the true width, m: where to look.
+        True heights above the floor and approximate width, m: the search region.
     """
     z = points[:, 2]
     sides = points[(z > bottom + 0.15 * height) & (z < bottom + 0.85 * height), :2]
     sides = sides[:: -(-len(sides) // _FITTED)]
-    # The middle of the outline: the side that is seen best must not draw it to itself.
+    # The centre of the outline, not biased towards the side with most points.
     middle = (np.percentile(sides, 3, axis=0) + np.percentile(sides, 97, axis=0)) / 2
     fits = [_walls(sides, middle, turn, width) for turn in np.radians([-30, -15, 0, 15, 30])]
     normals, offsets, _ = min(fits, key=lambda fit: fit[2])
@@ -200,12 +200,12 @@ def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxF
 def _walls(
     flat: Float64, middle: Float64, turn: float, width: float
 ) -> tuple[Float64, Float64, float]:
-    """Fit four lines, n . p = d, from a square turned by an angle; returns n, d, and the misfit.
+    """Fit four lines, n . p = d, starting at a square at angle `turn` (rad); returns n, d, misfit.
 
-    d is NaN for a line that no points decided.
+    d is NaN for a line without points.
 
-    Points belong to the nearest line; those further off than a fifth of the width count as that
-    far, so that a model with double walls keeps four lines.
+    Points are assigned to the nearest line, with distances truncated at a fifth of the width, so
+    that a model with double walls keeps four lines.
     """
     angle = turn + np.pi / 2 * np.arange(4)
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -223,7 +223,7 @@ def _walls(
             mean = own.mean(0)
             n = np.linalg.svd(own - mean, full_matrices=False)[2][1]
             n *= np.sign(n @ (mean - middle)) or 1.0
-            # A wall of the box, not one that runs across it.
+            # Reject lines that cross the box.
             if n @ normals[k] > 0.8:
                 normals[k], offsets[k], fitted[k] = n, n @ mean, True
     misfit = np.minimum(np.abs(flat @ normals.T - offsets).min(1), reach)
@@ -231,9 +231,9 @@ def _walls(
 
 
 def displacement_m(a: Float64, b: Float64, ahead: float = 2.0) -> Float64:
-    """(N,) distance between where two poses (N, 4, 4) put a point `ahead` m in front of a camera.
+    """(N,) distance of a point `ahead` m in front of a camera between poses a and b (N, 4, 4).
 
-    Position and orientation in one length: how far the model moves. NaN where a pose is.
+    It combines position and orientation errors in one length. NaN where a pose is NaN.
     """
     point = np.array([0.0, 0.0, ahead, 1.0])
     return np.linalg.norm(((a - b) @ point)[:, :3], axis=1)

@@ -1,4 +1,4 @@
-"""`tofuse experiments`: run the cases, judge the statements, write one page and the numbers."""
+"""`tofuse experiments`: run the cases, test the statements, write one page and the numbers."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ def run_experiments(
     limit: int | None = None,
     draws: int = DRAWS,
 ) -> Path:
-    """Run chapters 4 and 5 of the thesis again, and write ``index.html`` and ``results.json``.
+    """Reproduce chapters 4 and 5 of the thesis, and write ``index.html`` and ``results.json``.
 
     Parameters
     ----------
     cases
         Some of `NAMES`; all if empty.
     seeds
-        How many noise seeds the synthetic case gets.
+        Number of noise seeds of the synthetic case.
     seed
         The first of them, and the seed of the other cases.
     overwrite
         Replace the result of earlier experiments in `out`.
     limit
-        Stop simulated sequences after so many raw frames.
+        Maximum number of raw frames of simulated sequences.
     draws
         See `run_case`.
 
@@ -68,9 +68,9 @@ def run_experiments(
     Raises
     ------
     InputError
-        For a case that there is not.
+        For an unknown case.
     OutputError
-        If the folder is not empty and not ours, or can't be written.
+        If the folder contains other files, or can't be written.
     """
     progress = progress or Silent()
     for name in cases:
@@ -81,7 +81,7 @@ def run_experiments(
     chosen = cases or NAMES
     start = perf_counter()
     with OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
-        # BLAS sums differ with its number of threads; ours don't.
+        # BLAS sums depend on its number of threads; ours don't.
         with threadpool_limits(1):
             results = _run_all(chosen, seeds, seed, progress, limit, draws)
             judged = judge_all(results, METHODS)
@@ -99,7 +99,7 @@ def run_experiments(
 
 
 def is_experiments(folder: Path) -> bool:
-    """Say whether a folder holds the result of earlier experiments."""
+    """Whether a folder contains the result of earlier experiments."""
     data = read_json_object(folder / _MARKER)
     return data is not None and data.get("kind") == KIND
 
@@ -228,7 +228,7 @@ def render(
     parameters: Mapping[str, Any],
     seconds: float,
 ) -> str:
-    """Return the page as HTML, without outside resources."""
+    """Return the page as HTML, without external resources."""
     counts = Counter(j.findings[METHODS[0]].outcome for j in judged)
     return _template().render(
         version=__version__,

@@ -40,7 +40,7 @@ AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """How far estimated cameras are from the true ones.
+    """Errors of estimated camera poses.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class PoseErrors:
 
     @classmethod
     def of(cls, estimate: Float64, truth: Float64) -> PoseErrors:
-        """Compare (N, 4, 4) poses in the same world frame; nothing is aligned."""
+        """Compare poses (N, 4, 4) in the same world frame, without alignment."""
         shift = estimate[:, :3, 3] - truth[:, :3, 3]
         R = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
         angles = np.stack(
@@ -118,9 +118,9 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
 
 
 def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
-    """Errors after registration from coarse to fine, and after the refinement of all views.
+    """Errors after coarse-to-fine registration, and after the joint refinement of all views.
 
-    Nothing is told of the closing motion.
+    The closing motion is not given.
     """
     views, truth = peaks_views(sigma, seed)
     tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
@@ -137,9 +137,9 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
 
 
 def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
-    """Errors of what `tofuse run` makes of a folder of the views, and how many have a pose.
+    """Errors of `tofuse run` on a folder of the views, and the number of views with a pose.
 
-    Beside the first of these, whose pose is taken to be the true one.
+    Relative to the first of these, whose pose is set to the true one.
     """
     views, truth = peaks_views(sigma, seed)
     recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
@@ -150,19 +150,19 @@ def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
 
 
 def peaks_bound(sigma: float) -> float:
-    """Lowest mean error (m) of the 20 positions that the surface alone allows; see `bound`."""
+    """Lower bound of the mean error (m) of the 20 positions from the surface only; see `bound`."""
     C = pose_covariances(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
     return mean_distance(C[:, :3, :3])
 
 
 def peaks_bound_of_one(sigma: float, shares: Sequence[float]) -> Float64:
-    """Quantiles (m) of the mean error of a single recording by a method that is at the bound."""
+    """Quantiles (m) of the mean error of single recordings for a method at the bound."""
     C = joint_covariance(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
     return np.asarray(np.quantile(mean_distances(C), shares), np.float64)
 
 
 def _seen() -> Bool:
-    """(points, cameras) what each camera sees."""
+    """(points, cameras) visibility mask."""
     seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
     for k, rows in enumerate(peaks_seen()):
         seen[rows, k] = True
@@ -171,7 +171,7 @@ def _seen() -> Bool:
 
 @dataclass(frozen=True, eq=False)
 class PeaksSweep:
-    """Mean errors over all cameras and seeds, a row for each sigma.
+    """Mean errors over all cameras and seeds, one row per sigma.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class PeaksSweep:
     axes
         (S, 2, 6) mean absolute error for each of `AXES`, m and rad: the panels of figure 5.12.
     axes_spread
-        (S, 2, 6) standard deviation over the seeds of what `axes` is the mean of.
+        (S, 2, 6) standard deviation over the seeds of the values averaged in `axes`.
     runs
         Every run.
     """
@@ -202,7 +202,7 @@ def sweep_peaks(
     sigmas: Sequence[float] = SIGMAS_M,
     told: Callable[[], None] = lambda: None,
 ) -> PeaksSweep:
-    """Run every sigma with every seed, and take means; calls `told` after every run."""
+    """Run every sigma with every seed, and average; calls `told` after every run."""
     runs = []
     for sigma in sigmas:
         for seed in seeds:

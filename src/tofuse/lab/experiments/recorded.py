@@ -1,4 +1,4 @@
-"""A simulated scene in memory: just the raw frames that some strides need."""
+"""A simulated scene in memory: only the raw frames of given strides."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
 
-# About 1 cm apart in a room, so that distances from them are good to half of that.
+# About 1 cm apart in a room, so that distances are accurate to half of that.
 _SURFACE_POINTS = 500_000
 
 
@@ -29,9 +29,9 @@ class Recorded:
     Attributes
     ----------
     made
-        What was recorded; `made.raw` are the numbers of the raw frames.
+        The recording's plan; `made.raw` are the numbers of the raw frames.
     frames
-        What the camera gave, after its factory correction.
+        The camera's frames, after its factory correction.
     poses
         (N, 4, 4) true T_world_camera; the first is the identity.
     """
@@ -41,15 +41,15 @@ class Recorded:
     poses: Float64
 
     def every(self, stride: int) -> Recording:
-        """Return every so manieth raw frame as a recording."""
+        """Return every `stride`-th raw frame as a recording."""
         chosen = np.flatnonzero(self.made.raw % stride == 0)
         source = ArraySource(self.frames, self.poses)
         return Recording(source, f"simulated {self.made.scene.name}", "simulated", chosen)
 
     def filtered(self, config: Config) -> tuple[Recorded, Config]:
-        """Filter all frames once, for runs that share the filters; return what is left to do.
+        """Filter all frames once, for runs with common filters; return the remaining configuration.
 
-        A filter that looks at the frames before is left in the configuration.
+        Filters that depend on previous frames remain in the configuration.
         """
         if config.window > 1:
             return self, config
@@ -83,16 +83,16 @@ def record_scene(
     limit: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recorded:
-    """Simulate the raw frames of a scene that the strides need; a frame is taken once only.
+    """Simulate the raw frames of a scene for a set of strides, each frame once.
 
     Parameters
     ----------
     scene
-        One of the simulator's, all effects switched on.
+        One of the simulator's, with all effects switched on.
     limit
-        Stop after so many raw frames.
+        Maximum number of raw frames.
     progress
-        Is told how many frames are done, and of how many.
+        Called with the number of frames done and the total.
     """
     made = plan(scene, seed=seed, every=1, frames=limit)
     needed = np.any([made.raw % stride == 0 for stride in strides], axis=0)
@@ -108,7 +108,7 @@ def record_scene(
 
 
 def sample_surface(triangles: Float64, count: int) -> Float64:
-    """Draw points (count, 3) evenly from triangles (F, 3, 3); always the same ones."""
+    """Sample points (count, 3) uniformly from triangles (F, 3, 3), with a fixed seed."""
     a, b, c = np.swapaxes(triangles, 0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     rng = np.random.default_rng([0, count])

@@ -1,9 +1,9 @@
-"""The lowest error that a trajectory can have from what a simulated camera sees of a still scene.
+"""Lower bound of the trajectory error for a simulated camera in a static scene.
 
-The Cramer-Rao bound for all poses together from the distances and the albedo of all pixels, with
-the noise of their electrons. What is seen is not known: the surface is cut into cells of about a
-pixel's size, and the height and the albedo of each are unknowns as well, and so is the exposure of
-each view. The shape within a cell is taken as known, and what outlines tell is left out.
+The joint Cramer-Rao bound of all poses from the distances and the albedo of all pixels, with shot
+noise. The scene is unknown: the surface is divided into cells of about a pixel's size, and the
+height and the albedo of each are estimated as well, and so is the exposure of each view. The shape
+within a cell is assumed known, and occlusion boundaries are not used.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from tofuse.sensor.models import CameraModel
 
 # Unknowns of a view: its pose, and the logarithm of its exposure.
 _UNKNOWNS = 7
-# Neighbours that are not on one plane, as a share of the distance, are two surfaces.
+# Max deviation of neighbours from a plane, relative to the distance, on one surface.
 _JUMP = 0.02
-# Cells are drawn by a hash of where they are.
+# Cells are sampled by a hash of their position.
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791, 2_654_435_761], np.int64)
 _DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a camera sees from one pose: the V pixels with a surface around them.
+    """The view from one pose: the V pixels on a locally smooth surface.
 
     Attributes
     ----------
     points, normals
         (V, 3) in the camera's frame; normals have length 1.
     slopes
-        (V, 2) of the log albedo by x/z and y/z.
+        (V, 2) gradient of the log albedo by x/z and y/z.
     phase
-        (V,) standard deviation of the phase in rad, which is that of the log amplitude as well.
+        (V,) standard deviation of the phase in rad, equal to that of the log amplitude.
     """
 
     points: Float64
@@ -51,12 +51,12 @@ class Seen:
 
 @dataclass(frozen=True)
 class TrajectoryBound:
-    """Root mean square errors of all positions after the best rigid alignment, m.
+    """RMS errors of all positions after the best rigid alignment, m.
 
     Attributes
     ----------
     mean
-        The lowest that an unbiased estimate can have, over many recordings.
+        Lower bound for unbiased estimates, over many recordings.
     low, high
         Quantiles of 5 and 95 % of single recordings at the bound.
     """
@@ -69,7 +69,7 @@ class TrajectoryBound:
 def phase_noise(
     model: CameraModel, strength: Float64, diffuse: Float64, effects: Effects, ambient: float
 ) -> Float64:
-    """Standard deviation (H, W) of the phase, rad, by the electrons of four phase images.
+    """Standard deviation (H, W) of the phase, rad, by the shot noise of four phase images.
 
     Parameters
     ----------
@@ -81,14 +81,14 @@ def phase_noise(
     signal = model.signal_electrons * strength * model.transmission
     background = effects.ambient * model.ambient_electrons * ambient
     other = background * diffuse * np.sqrt(model.transmission)
-    # Both parts of the phasor are halves of the difference of two of the images.
+    # Each part of the phasor is half the difference of two of the images.
     variance = (signal + other + 2 * model.read_noise_electrons**2) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(variance) / (model.modulation_contrast * signal)
 
 
 def seen_by(plan: Plan, raw: int) -> Seen:
-    """What the camera sees in raw frame `raw`."""
+    """Return the camera's view of raw frame `raw`."""
     model, time_s = plan.model, raw / plan.sequence.frame_rate_hz
     T_room_camera = plan.sequence.T_room_camera(time_s)
     grid = optics.ray_grid(model, plan.effects.mixed_pixels)
@@ -108,7 +108,7 @@ def seen_by(plan: Plan, raw: int) -> Seen:
     normals = (found.normals @ T_room_camera[:3, :3]).reshape(*fine, 3)[grid.centre]
     points = np.where(np.isfinite(distance), distance, 0.0)[..., None] * directions
     blur = model.blur_px if plan.effects.mixed_pixels else 0.0
-    # Light of the whole pixel, as the lens shows it.
+    # Light of the whole pixel, with the lens blur.
     strength, diffuse = (
         optics.blurred(of(grid, found, model.modulation_hz)[..., 0], blur)
         for of in (optics.pixel_phasors, optics.bounce_weights)
@@ -134,12 +134,12 @@ def seen_by(plan: Plan, raw: int) -> Seen:
 
 
 def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, TrajectoryBound]:
-    """Bound of a whole recording: from distances alone, and from distances and albedo.
+    """Bounds of a recording: from distances only, and from distances and albedo.
 
     Parameters
     ----------
     share
-        One of so many cells is looked at, and stands for the others.
+        One of `share` cells is evaluated and represents the others.
     """
     poses, period = plan.poses, plan.model.period_m
     n = len(poses)
@@ -154,7 +154,7 @@ def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, T
         some = np.abs(cells * _PRIMES[0]) % share == 0
         p, m, cells = p[some], m[some], cells[some]
         phase, slopes, z = view.phase[some], view.slopes[some], view.points[some, 2:]
-        # An error of the distance along the ray is one across the surface times the cosine.
+        # Error normal to the surface = error along the ray times the cosine.
         cosine = np.maximum(np.abs((p * m).sum(1)) / np.linalg.norm(p, axis=1), 1e-3)
         sigma = phase / (2 * np.pi) * period * cosine
         height.add(k, cells, _rows(m, p, 0.0), share / sigma**2)
@@ -163,7 +163,7 @@ def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, T
     of_distances = height.information()
     of_both = of_distances + light.information()
     unknowns = np.arange(n * _UNKNOWNS)
-    # The first view's pose and exposure are given. Exposures matter to albedo alone.
+    # The first view's pose and exposure are given. Exposures affect albedo only.
     moving = unknowns >= _UNKNOWNS
     return (
         _after_alignment(of_distances, poses, moving & (unknowns % _UNKNOWNS != 6)),
@@ -172,12 +172,12 @@ def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, T
 
 
 def _rows(direction: Float64, p: Float64, exposure: float) -> Float64:
-    """(M, UNKNOWNS) by which residuals move with the pose and the exposure."""
+    """Jacobian (M, UNKNOWNS) of the residuals by pose and exposure."""
     return np.hstack([direction, np.cross(p, direction), np.full((len(p), 1), exposure)])
 
 
 class _Cells:
-    """Unknowns of the surface, one for each cell, and what each view says of them."""
+    """Unknowns of the surface, one per cell, and their observations by each view."""
 
     def __init__(self, views: int) -> None:
         self._views = views
@@ -199,7 +199,7 @@ class _Cells:
         self._own.append(np.bincount(at, weight, len(found)).astype(np.float64))
 
     def information(self) -> Float64:
-        """(N UNKNOWNS, N UNKNOWNS) of the views, the surface eliminated."""
+        """(N UNKNOWNS, N UNKNOWNS) information of the views, with the surface eliminated."""
         _, cell = np.unique(np.concatenate(self._cells), return_inverse=True)
         cell = cell.ravel()
         own = np.bincount(cell, np.concatenate(self._own))
@@ -214,7 +214,7 @@ class _Cells:
 
 
 def _cells(points: Float64, normals: Float64, size: float) -> Int64:
-    """(M,) number of the cell of each point of the world: by place, and which way it faces."""
+    """(M,) cell index of each point in the world, by position and normal direction."""
     axis = np.argmax(np.abs(normals), axis=1)
     side = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0)
     place = np.floor(points / size).astype(np.int64)
@@ -223,7 +223,7 @@ def _cells(points: Float64, normals: Float64, size: float) -> Int64:
 
 
 def _after_alignment(information: Float64, poses: Float64, free: Bool) -> TrajectoryBound:
-    """Draw errors of what is free, take out the best rigid motion, and take the rms."""
+    """RMS of random errors of the free unknowns after the best rigid alignment."""
     n, at = len(poses), poses[:, :3, 3]
     L = np.linalg.cholesky(information[np.ix_(free, free)])
     drawn = np.random.default_rng([0]).normal(size=(len(L), _DRAWS))

@@ -1,4 +1,4 @@
-"""What the page shows of each case: tables and figures, ready for the template."""
+"""Tables and figures of each case for the page's template."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _EXAMPLE_SIGMA = 0.09
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what it says."""
+    """A drawing and its caption."""
 
     svg: str
     caption: str = ""
 
 
 def case_section(result: CaseResult) -> dict[str, Any]:
-    """Return what the template needs for one case of the simulator."""
+    """Return the template's values for one case of the simulator."""
     case = result.case
     shown = {m: result.select(m)[0] for m in METHODS}
     crude = {m: result.select(m, "identity")[0] for m in METHODS}
@@ -148,7 +148,7 @@ _SIZES = {
 
 
 def _sizes(result: CaseResult) -> list[list[str]]:
-    """Rows of what is measured on the models: true, by the true poses, then each method."""
+    """Rows of the model measurements: true, by the true poses, then each method."""
     true = {
         "length_m": room.LENGTH,
         "width_m": room.WIDTH,
@@ -188,7 +188,7 @@ def _plans(
     outlines = _outlines(result)
     groups = [about(r.model_after) for r in shown.values()]
     groups += [about(r.model_before) for r in shown.values()]
-    # Cameras around an object stay outside the picture, or the object would be small in it.
+    # Cameras around an object are left out of the picture, to show the object larger.
     seen = [] if shown[METHODS[0]].case in ("torso", "box") else [truth]
     frame = figures.plan_limits(*groups, about(result.perfect), *outlines, *seen)
 
@@ -222,7 +222,7 @@ def _plans(
 
 
 def _outlines(result: CaseResult) -> list[Float64]:
-    """True outlines in the plan, where the thesis drew them or they say something."""
+    """True outlines in the plan, where the thesis drew them or they are informative."""
     name = result.case.scene
     if name in ("room", "empty-room"):
         return [_rectangle(room.LENGTH, room.WIDTH)]
@@ -244,7 +244,7 @@ def _hull(points: Float64) -> Float64:
 
 
 def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
-    """Return what the template needs for the synthetic case."""
+    """Return the template's values for the synthetic case."""
     sigma = sweep.sigmas[np.abs(sweep.sigmas - _EXAMPLE_SIGMA).argmin()]
     run = next(r for r in sweep.runs if r.sigma == sigma)
     views, _ = peaks_views(run.sigma, run.seed)

@@ -1,7 +1,7 @@
-"""What the thesis states about its results, and whether it came out here, decided by the numbers.
+"""Statements of the thesis about its results, each tested against the numbers measured here.
 
-A statement is graded for every draw of the random points (every noise seed for the synthetic
-data), as the share of its parts that hold, and the mean grade decides.
+A statement is graded for every draw of the random points (every noise seed for the synthetic data)
+by the fraction of its parts that are true; the mean grade decides.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Y_DOWN = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Finding:
-    """How a statement came out, and the numbers behind it."""
+    """Outcome of a statement, and the numbers behind it."""
 
     outcome: Outcome
     numbers: str
@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Results:
-    """What there is to judge by; a statement about a case that was not run is left out."""
+    """Results to test statements with; statements about cases that were not run are skipped."""
 
     cases: Mapping[str, CaseResult]
     peaks: PeaksSweep | None
@@ -54,11 +54,11 @@ class Statement:
     section
         Of the thesis.
     needs
-        Cases that it is about.
+        Cases required by the statement.
     quote
         The words of the thesis, shortened.
     judge
-        Decides from the results of one method.
+        Function that decides from the results of one method.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Statement:
     judge: Callable[[Results, str], Finding]
 
     def possible(self, results: Results) -> bool:
-        """Say whether all cases that it needs were run."""
+        """Whether all required cases were run."""
         return all(
             results.peaks is not None if case == "peaks" else case in results.cases
             for case in self.needs
@@ -76,7 +76,7 @@ class Statement:
 
 
 def graded(grades: Iterable[float], numbers: str, what: str = "draw") -> Finding:
-    """Decide by the mean of grades between 0 (does not hold) and 1 (holds)."""
+    """Decide by the mean of grades between 0 (false) and 1 (true)."""
     given = [float(g) for g in grades]
     mean = float(np.mean(given))
     outcome: Outcome = "partly"
@@ -110,7 +110,7 @@ def _deg(values: Iterable[float]) -> str:
 
 
 def _legs(run: Run) -> tuple[Float64, Float64]:
-    """Length of the way out and of the way back between their ends: estimated, and true, m."""
+    """End-to-end lengths in m of the outward and the return path: estimated, and true."""
     known = np.flatnonzero(np.isfinite(run.before[:, 0, 0]))
     turn = known[np.linalg.norm(run.truth[known, :3, 3], axis=1).argmax()]
     ends = [0, turn, known[-1]]
@@ -326,7 +326,7 @@ def _first_in_middle(results: Results, method: str) -> Finding:
 
 
 def _heap(poses: Float64) -> tuple[float, float]:
-    """Root mean square distance of the cameras from their middle, and that of the first."""
+    """RMS distance of the cameras from their centroid, and distance of the first one."""
     known = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
     away = np.linalg.norm(known - known.mean(0), axis=1)
     return float(np.sqrt(np.mean(away**2))), float(away[0])
@@ -379,7 +379,7 @@ def _picks_up(results: Results, method: str) -> Finding:
 
 
 def _corner_steps(case: CaseResult, run: Run) -> Bool:
-    """(N - 1,) mask of the motions between frames that both see a corner."""
+    """(N - 1,) mask of the motions between two frames with a visible corner."""
     seen: Bool = case.facts["corners"][run.stride]
     return seen[1:] & seen[:-1]
 
@@ -430,7 +430,7 @@ def _objects_matter(results: Results, method: str) -> Finding:
 
 
 def _overlap_deg(case: CaseResult, run: Run) -> tuple[float, float]:
-    """How much further than the truth the cameras go round, before and after, degrees."""
+    """Excess of the cameras' total rotation over the truth, before and after, degrees."""
     axis = case.T_truth_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
     end = [float(measures.turned_deg(p, axis)[-1]) for p in (run.before, run.after, run.truth)]
     sign = np.sign(end[2]) or 1.0
@@ -674,7 +674,7 @@ def _sweep(results: Results) -> PeaksSweep:
 
 
 def _gain(results: Results) -> Float64:
-    """(S, 6) by how much optimisation lowers the mean error of each parameter."""
+    """(S, 6) decrease of the mean error of each parameter by the optimisation."""
     axes = _sweep(results).axes
     return axes[:, 0] - axes[:, 1]
 
@@ -691,7 +691,7 @@ def _previous_is_better(results: Results, method: str) -> Finding:
             for g, found in runs.items()
         }
         posed = {g: _mid(r.posed for r in found) for g, found in runs.items()}
-        # A model of the frames that were not lost flatters the guess that lost many.
+        # Models omit lost frames, which favours the guess that lost many.
         better.append(
             posed["previous"] > 1.1 * posed["identity"]
             or (
@@ -951,7 +951,7 @@ STATEMENTS = (
 
 @dataclass(frozen=True)
 class Judged:
-    """A statement with what came out of each method; peaks knows one method only."""
+    """A statement with its outcome for each method; peaks has only one method."""
 
     statement: Statement
     findings: Mapping[str, Finding]
