@@ -253,15 +253,15 @@ def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
     assert np.linalg.norm(first, axis=1).max() < 4
 
 
-def test_an_object_is_told_from_its_background(tmp_path) -> None:
+def test_an_object_is_segmented_from_its_background(tmp_path, full_report) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=9, effects=effects)
     run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
     made = run_json(tmp_path / "out")
-    assert made["config"]["filters"][0] == {"part": "background", "sigmas": 4.0, "share": 0.02}
+    assert made["config"]["filters"][0] == {"part": "background", "sigmas": 4.0, "fraction": 0.02}
     *_, scattering, multipath = made["config"]["corrections"]
     assert (scattering["part"], multipath["part"]) == ("scattering", "multipath")
-    assert 0.01 < sum(scattering["shares"]) < 0.04
+    assert 0.01 < sum(scattering["fractions"]) < 0.04
     assert 0.5 < made["filters"]["background"]["removed"] < 0.95
     # The wall is 4 m away.
     assert np.linalg.norm(read_ply(tmp_path / "out/cloud.ply").points, axis=1).max() < 2

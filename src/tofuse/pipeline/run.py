@@ -18,7 +18,7 @@ from tofuse.filters.base import apply_filters
 from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
-from tofuse.parts import name_of
+from tofuse.parts import name_of, to_dict
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
@@ -419,9 +419,15 @@ def _title(path: Path) -> str:
 
 
 def _final_config(config: Config, result: Reconstruction) -> Config:
-    """Return the configuration with the corrections of the result, after self-calibration."""
+    """Return the configuration with the corrections of the result, after self-calibration.
+
+    Parts keep what they estimated from the recording, which their options don't state.
+    """
     final = {"corrections": result.config["corrections"]}
-    return changed(config, final, where="the result's config")
+    corrections = changed(config, final, where="the result's config").corrections
+    estimated = {str(to_dict(part)): part for part in config.corrections}
+    kept = tuple(estimated.get(str(to_dict(part)), part) for part in corrections)
+    return replace(config, corrections=kept)
 
 
 def _filter_steps(
