@@ -19,6 +19,7 @@ from tofuse.live.device import DeviceError, Stream
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 
+_PATIENCE_S = 5.0  # for a camera's last frame
 QUEUE_FRAMES = 64  # that may wait for the disk
 FINEST_SIGMA_M = 1e-5
 
@@ -124,7 +125,8 @@ class _Reader:
         self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
     ) -> None:
         self._stop.set()
-        self._thread.join()
+        # A camera that has gone silent may never return from `read`; the thread is a daemon.
+        self._thread.join(_PATIENCE_S)
 
     def _work(self) -> None:
         index = 0
