@@ -179,7 +179,7 @@ def test_scans_of_one_e57(clouds, tmp_path, capfd) -> None:
     status, said = told(capfd, f"{path}#0", f"{path}#1")
     assert status == 0
     near(said["T_target_source"], T_SMALL)
-    refuses(capfd, "register", path, f"{path}#1", says=("scans.e57", "holds 2 frames", "#0"))
+    refuses(capfd, "register", path, f"{path}#1", says=("scans.e57", "contains 2 frames", "#0"))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las"])
@@ -355,7 +355,7 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
             path.write_bytes(b"junk")
             return path, ("bad.ply", "PLY")
         case "several frames":
-            return room, (str(room), "holds 8 frames", f"{room}#0 to {room}#7")
+            return room, (str(room), "contains 8 frames", f"{room}#0 to {room}#7")
         case "out of range":
             return f"{room}#8", (str(room), "has no frame 8", "0 to 7")
         case "out of range of one":

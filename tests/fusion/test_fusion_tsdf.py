@@ -600,11 +600,11 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
     views = [RangeView.of(f) for f in frames]
     options = Fusion(voxel_m=0.012, island=0)
     turned = Volume.around(views, poses, 0.012, options)
-    assert turned.turns == 2
+    assert turned.free_space_stride == 2
     found = fuse_surface(views, poses, options)
     monkeypatch.setattr(layout, "_MAX_STRIDE", 1)
     full = Volume.around(views, poses, 0.012, options)
-    assert full.turns == 1
+    assert full.free_space_stride == 1
     assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over
     assert np.isin(turned.keys, full.keys).all()
     expected = fuse_surface(views, poses, options)

@@ -210,7 +210,10 @@ def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
     changed_run_json(again, frames=frames)
     refused(
-        [results["here"], again], "does not match the frames", "by now", "run `tofuse run` again"
+        [results["here"], again],
+        "does not match the frames",
+        "has changed",
+        "run `tofuse run` again",
     )
 
 

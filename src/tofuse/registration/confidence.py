@@ -113,11 +113,12 @@ class Evidence:
             said.append(f"only {self.support:.0%} of the points of both views support the pose")
         if self.margin is not None and self.margin < _SMALL_LEAD:
             lead = max(self.margin, 0.0)
-            said.append(f"another pose fits nearly as well, less {lead:.1%} of the points")
+            said.append(f"another pose fits nearly as well, with {lead:.1%} less support")
         if self.contradiction > CONTRADICTION:
             said.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
         if self.degenerate:
-            said.append(f"{self.degenerate} directions are degenerate")
+            plural = "direction is" if self.degenerate == 1 else "directions are"
+            said.append(f"{self.degenerate} {plural} degenerate")
         return "; ".join(said) or f"the pose is right with a probability of {self.probability:.0%}"
 
 
