@@ -11,9 +11,10 @@ import pytest
 
 from tofuse.cli import main
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import write_glb
+from tofuse.files.glb import read_glb, write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
+from tofuse.files.ply import read_ply
 from tofuse.fusion import atlas as atlas_module
 from tofuse.fusion.atlas import MARGIN, plain_atlas, unwrap
 from tofuse.fusion.colors import UNSEEN
@@ -202,7 +203,7 @@ def test_frames_without_light_give_no_view() -> None:
     assert TextureView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
 
 
-def test_what_has_no_colour_darkens_nothing() -> None:
+def test_what_has_no_colour_darkens_nothing(tmp_path) -> None:
     wall = sheet(40, 40, 0.05)
     dark = wall.vertices[:, 0] > 0
     wall = replace(wall, color=np.where(dark[:, None], 0, [180, 180, 180]).astype(np.uint8))
@@ -210,9 +211,10 @@ def test_what_has_no_colour_darkens_nothing() -> None:
     assert set(np.unique(small.color).tolist()) == {0, 180}
     shown = baked(wall, 400, 256).image
     assert set(np.unique(shown).tolist()) == {UNSEEN[0], 180}
-    turned = small.shape().turned(np.eye(3))["color"]
-    assert set(np.unique(turned).tolist()) == {UNSEEN[0], 180}
-    assert set(np.unique(small.shape().color).tolist()) == {0, 180}  # a file of data keeps it
+    small.save(tmp_path / "shown.glb")
+    assert set(np.unique(read_glb(tmp_path / "shown.glb").color).tolist()) == {UNSEEN[0], 180}
+    small.save(tmp_path / "data.ply")
+    assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
 
 
 def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:

@@ -80,7 +80,7 @@ def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
         recording = open_recording(folder)
         assert recording.format == "ply"
         assert isinstance(recording[0], CloudFrame)
-        with pytest.raises(InputError, match=r"point for each pixel .*--format ply"):
+        with pytest.raises(InputError, match=r"one point per pixel .*--format ply"):
             open_recording(folder, format="grid")
 
 
