@@ -12,7 +12,7 @@ import tofuse
 from tofuse.corrections.multipath import Multipath
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.pipeline.adaptation import adapted
+from tofuse.pipeline.adaptation import adapted, with_recording_defaults
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.trial import Trial, trial
@@ -167,5 +167,6 @@ def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
             assert isinstance(frame, RangeFrame)
             return replace(frame, amplitude_image=None)
 
-    config = adapted(from_method("default"), replace(straight, source=Dark()), 1)
+    known = with_recording_defaults(from_method("default"), straight)
+    config = adapted(known, replace(straight, source=Dark()), 1)
     assert multipath_of(config) == Multipath(trial=False)
