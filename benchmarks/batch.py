@@ -36,7 +36,7 @@ OUT = Path(__file__).parent / "out" / "batch"
 # What a report says of times.
 _TIMES = re.compile(
     r'<tr><td>[\w ]+</td><td class="number">[^<]*</td><td class="bars">.*?</tr>'
-    r'|<strong>[^<]*</strong></td><td class="muted">[^<]* a frame'
+    r'|<strong>[^<]*</strong></td><td class="muted">[^<]* per frame'
 )
 # A cluster as a person starts it in Python; it ends with its standard input.
 _LOCAL_CLUSTER = """

@@ -33,7 +33,7 @@ def measured() -> Iterator:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(BENCHMARKS))
         # Workers look up the functions of this module by their names.
-        known = [str(HELPERS), os.environ.get("PYTHONPATH", "")]
+        known = [str(Path(__file__).parent), str(HELPERS), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(known))
         import batch
 
