@@ -154,12 +154,12 @@ class _Limits(Bounded):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"count": 0}, "count is 0, not 1 or more"),
-        ({"fraction": 1.5}, "fraction is 1.5, not 0 to 1"),
-        ({"fraction": math.nan}, "fraction is nan, not 0 to 1"),
-        ({"length_m": 0.0}, "length_m is 0.0, not above 0"),
-        ({"length_m": math.inf}, "length_m is inf, not above 0"),
-        ({"probability": 1.0}, "probability is 1.0, not between 0 and 1"),
+        ({"count": 0}, "count must be 1 or more, not 0"),
+        ({"fraction": 1.5}, "fraction must be 0 to 1, not 1.5"),
+        ({"fraction": math.nan}, "fraction must be 0 to 1, not nan"),
+        ({"length_m": 0.0}, "length_m must be above 0, not 0.0"),
+        ({"length_m": math.inf}, "length_m must be above 0, not inf"),
+        ({"probability": 1.0}, "probability must be between 0 and 1, not 1.0"),
     ],
 )
 def test_numbers_outside_of_declared_bounds_are_refused(wrong, message) -> None:

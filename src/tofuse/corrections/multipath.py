@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import above, at_least, whole, within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction, Corrector
 from tofuse.corrections.raw_amplitude import modulation_period, tof_image
 from tofuse.parts import part
@@ -25,7 +25,7 @@ from tofuse.sensor.multipath_map import ReflectorMap
 
 @part("correction", "multipath", label="validated")
 @dataclass(frozen=True)
-class Multipath(Correction):
+class Multipath(Bounded, Correction):
     """Compensate the light that surfaces reflect onto each other (Fuchs 2010).
 
     See `tofuse.sensor.multipath`. Works on cameras with one modulation frequency that record
@@ -60,13 +60,13 @@ class Multipath(Correction):
         standard error; None without a trial, or if too little could be compared.
     """
 
-    gain: float | None = None
-    period_m: float | None = None
+    gain: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     bounces: Bounces = "one"
-    iterations: int = 3
-    columns: int = 44
-    lamp: float = 1.2
-    relative_sigma: float = 0.2
+    iterations: Annotated[int, Bounds(1, 10)] = 3
+    columns: Annotated[int, Bounds(8, 200)] = 44
+    lamp: Annotated[float, Bounds(1)] = 1.2
+    relative_sigma: Annotated[float, Bounds(0, 10)] = 0.2
     trial: bool = True
     applied: bool = True
     seen: tuple[float, ...] | None = None
@@ -74,14 +74,7 @@ class Multipath(Correction):
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        if self.gain is not None:
-            above("gain", self.gain, 0)
-        if self.period_m is not None:
-            above("period_m", self.period_m, 0)
-        whole("iterations", self.iterations, 1, 10)
-        whole("columns", self.columns, 8, 200)
-        at_least("lamp", self.lamp, 1)
-        within("relative_sigma", self.relative_sigma, 0, 10)
+        super().__post_init__()
         if self.seen is not None and not (len(self.seen) == 2 and np.isfinite(self.seen).all()):
             raise ValueError(f"seen is {self.seen}, not a strength and its standard error")
 

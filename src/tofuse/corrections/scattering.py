@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
 
 from tofuse.arrays import Bool, Float64
-from tofuse.bounds import above, within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction, Corrector
 from tofuse.corrections.raw_amplitude import frame_phasor, phasor, tof_image
 from tofuse.errors import InputError
@@ -30,7 +30,7 @@ _STILL = 0.9
 
 @part("correction", "scattering", label="validated")
 @dataclass(frozen=True)
-class LensScattering(Correction):
+class LensScattering(Bounded, Correction):
     """Compensate lens scattering (Mure-Dubois and Huegli 2007), see `tofuse.sensor.scattering`.
 
     Works on cameras with one modulation frequency that record amplitude. Other views are passed
@@ -49,25 +49,23 @@ class LensScattering(Correction):
 
     fractions: tuple[float, ...] | None = None
     widths: tuple[float, ...] = (0.04, 0.1, 0.3)
-    period_m: float | None = None
+    period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.widths:
             raise ValueError("widths is empty: give one or more")
-        for width in self.widths:
-            above("widths", width, 0.005)
-            within("widths", width, 0, 2)
+        if not all(width in Bounds(0.005, 2) and width > 0.005 for width in self.widths):
+            raise ValueError(f"widths is {self.widths}, not each above 0.005 and at most 2")
         if self.fractions is not None:
             if len(self.fractions) != len(self.widths):
                 raise ValueError(
                     f"fractions has {len(self.fractions)} numbers, widths {len(self.widths)}"
                 )
-            for fraction in self.fractions:
-                within("fractions", fraction, 0, 0.5)
-        if self.period_m is not None:
-            above("period_m", self.period_m, 0)
+            if not all(fraction in Bounds(0, 0.5) for fraction in self.fractions):
+                raise ValueError(f"fractions is {self.fractions}, not each 0 to 0.5")
 
     @property
     def needs_fit(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import above
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction, Corrector
 from tofuse.corrections.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.parts import part
@@ -21,7 +21,7 @@ _ROUNDS = 4
 
 @part("correction", "unwrap", label="validated")
 @dataclass(frozen=True)
-class Unwrap(Correction):
+class Unwrap(Bounded, Correction):
     """Unwrap the phase by amplitude and continuity, see `tofuse.sensor.unwrap`.
 
     Works on cameras with one modulation frequency that record amplitude; other views are passed
@@ -38,17 +38,11 @@ class Unwrap(Correction):
         Of the unwrapping.
     """
 
-    white: float | None = None
-    period_m: float | None = None
+    white: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     options: UnwrapOptions = field(default_factory=UnwrapOptions)
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if self.white is not None:
-            above("white", self.white, 0)
-        if self.period_m is not None:
-            above("period_m", self.period_m, 0)
 
     @property
     def needs_fit(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.bounds import above, at_least
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
@@ -17,7 +17,7 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 @part("filter", "amplitude")
 @dataclass(frozen=True)
-class Amplitude(Filter):
+class Amplitude(Bounded, Filter):
     """Keep points whose amplitude lies in a window (section 2.8).
 
     Saturated pixels are always removed. Views without amplitude are unchanged.
@@ -30,15 +30,15 @@ class Amplitude(Filter):
         Highest amplitude that is kept; None for no limit below saturation.
     """
 
-    minimum: float = 0.0
-    maximum: float | None = None
+    minimum: Annotated[float, Bounds(0)] = 0.0
+    maximum: Annotated[float | None, Bounds()] = None
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        at_least("minimum", self.minimum, 0)
-        if self.maximum is not None:
-            above("maximum", self.maximum, self.minimum)
+        super().__post_init__()
+        if self.maximum is not None and not self.maximum > self.minimum:
+            raise ValueError(f"maximum must be above {self.minimum:g}, not {self.maximum!r}")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.bounds import within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.geometry.cameras import unknown_rays
 from tofuse.kernels.neighbourhood import is_steeper, largest_angle
@@ -21,7 +21,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "neighbourhood_angle", label="validated")
 @dataclass(frozen=True)
-class NeighbourhoodAngle(Filter):
+class NeighbourhoodAngle(Bounded, Filter):
     """Remove points at jump edges by the neighbourhood angle (eq 2.6; May et al. 2009).
 
     A flying pixel, or a point on the rim of the foreground, has a neighbour far behind it along
@@ -38,12 +38,9 @@ class NeighbourhoodAngle(Filter):
         Largest angle that is kept, rad.
     """
 
-    threshold: float = math.radians(170)
+    threshold: Annotated[float, Bounds(math.pi / 2, math.pi)] = math.radians(170)
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        within("threshold", self.threshold, math.pi / 2, math.pi)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

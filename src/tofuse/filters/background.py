@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from tofuse.arrays import Bool
-from tofuse.bounds import above, within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
 from tofuse.parts import part
@@ -17,7 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "background")
 @dataclass(frozen=True)
-class Background(Filter):
+class Background(Bounded, Filter):
     """Keep points in front of the background of a static camera.
 
     The background of a pixel is the farthest surface that it sees in several frames, sampled over
@@ -31,14 +31,10 @@ class Background(Filter):
         deviations of the background's depth, and this fraction of it.
     """
 
-    sigmas: float = 4.0
-    fraction: float = 0.02
+    sigmas: Annotated[float, Bounds(0, exclusive=True)] = 4.0
+    fraction: Annotated[float, Bounds(0, 1)] = 0.02
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        above("sigmas", self.sigmas, 0)
-        within("fraction", self.fraction, 0, 1)
 
     @property
     def needs_fit(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.bounds import whole
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -17,7 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "confidence", label="validated")
 @dataclass(frozen=True)
-class Confidence(Filter):
+class Confidence(Bounded, Filter):
     """Keep points of at least a level of the camera's confidence map (section 2.8).
 
     The SR4000 gives levels 0 to 7; chapter 4 keeps level 7 only. For cameras with other levels see
@@ -31,14 +31,13 @@ class Confidence(Filter):
         The camera's highest level, 1 to 255.
     """
 
-    minimum: int = 7
-    highest: int = 7
+    minimum: Annotated[int, Bounds(0)] = 7
+    highest: Annotated[int, Bounds(1)] = 7
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        whole("minimum", self.minimum, 0)
-        whole("highest", self.highest, 1)
+        super().__post_init__()
         if not self.minimum <= self.highest <= 255:
             raise ValueError(
                 f"minimum must be at most highest and that at most 255, not {self.minimum} of "

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.bounds import above, at_least, finite
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -17,7 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "distance")
 @dataclass(frozen=True)
-class Distance(Filter):
+class Distance(Bounded, Filter):
     """Keep points at a distance from `minimum` to `maximum` (section 2.8).
 
     Attributes
@@ -29,16 +29,16 @@ class Distance(Filter):
         its distance is always that to its origin.
     """
 
-    minimum: float = 0.0
-    maximum: float | None = None
+    minimum: Annotated[float, Bounds(0)] = 0.0
+    maximum: Annotated[float | None, Bounds()] = None
     measure: Literal["z", "range"] = "z"
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        at_least("minimum", self.minimum, 0)
-        if self.maximum is not None:
-            above("maximum", self.maximum, self.minimum)
+        super().__post_init__()
+        if self.maximum is not None and not self.maximum > self.minimum:
+            raise ValueError(f"maximum must be above {self.minimum:g}, not {self.maximum!r}")
         if self.measure not in ("z", "range"):
             raise ValueError(f"measure must be 'z' or 'range', not {self.measure!r}")
 
@@ -77,7 +77,8 @@ class Box(Filter):
             if len(corner) != 3:
                 raise ValueError(f"{name} must have 3 numbers, not {len(corner)}")
             for axis, value in zip("xyz", corner, strict=True):
-                finite(f"{name} {axis}", value)
+                if value not in Bounds():
+                    raise ValueError(f"{name} {axis} must be a finite number, not {value!r}")
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
             raise ValueError("lower must be below upper on every axis")
         if self.remove not in ("outside", "inside"):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.bounds import above, within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -19,7 +19,7 @@ _BINS = 256
 
 @part("filter", "foreground")
 @dataclass(frozen=True)
-class Foreground(Filter):
+class Foreground(Bounded, Filter):
     """Keep points nearer than a limit, by default Otsu's threshold on the histogram of z.
 
     For an object that turns in front of a static background (Otsu 1979). Frames whose depths don't
@@ -34,15 +34,10 @@ class Foreground(Filter):
         1). A uniform distribution has 0.75, a normal distribution 0.64.
     """
 
-    limit: float | None = None
-    separability: float = 0.8
+    limit: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    separability: Annotated[float, Bounds(0, 1)] = 0.8
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        if self.limit is not None:
-            above("limit", self.limit, 0)
-        within("separability", self.separability, 0, 1)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.bounds import above, whole
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.kernels.neighbourhood import window_median
 from tofuse.kernels.threads import run_chunks
@@ -19,7 +19,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "median")
 @dataclass(frozen=True)
-class Median(Filter):
+class Median(Bounded, Filter):
     """Remove pixels whose z is further than a threshold from the local median (section 2.8).
 
     Kept depths are not smoothed.
@@ -32,14 +32,13 @@ class Median(Filter):
         Width and height of the window in pixels, odd.
     """
 
-    threshold: float = 0.1
-    size: int = 5
+    threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.1
+    size: Annotated[int, Bounds(3)] = 5
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def __post_init__(self) -> None:
-        above("threshold", self.threshold, 0)
-        whole("size", self.size, 3)
+        super().__post_init__()
         if self.size % 2 == 0 or self.size > 31:
             raise ValueError(f"size must be odd and at most 31, not {self.size}")
 

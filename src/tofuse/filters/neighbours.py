@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
-from tofuse.bounds import above, whole, within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
@@ -21,7 +21,7 @@ _MAX_NEIGHBOURS = 1000
 
 @part("filter", "neighbour_distance")
 @dataclass(frozen=True)
-class NeighbourDistance(Filter):
+class NeighbourDistance(Bounded, Filter):
     """Remove points whose k nearest neighbours are on average too far away (section 2.8).
 
     Attributes
@@ -32,14 +32,10 @@ class NeighbourDistance(Filter):
         Number of neighbours.
     """
 
-    threshold: float = 0.05
-    k: int = 3
+    threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.05
+    k: Annotated[int, Bounds(1, _MAX_NEIGHBOURS)] = 3
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        above("threshold", self.threshold, 0)
-        whole("k", self.k, 1, _MAX_NEIGHBOURS)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
@@ -48,7 +44,7 @@ class NeighbourDistance(Filter):
 
 @part("filter", "neighbour_share")
 @dataclass(frozen=True)
-class NeighbourShare(Filter):
+class NeighbourShare(Bounded, Filter):
     """Remove a fraction of the points: those with the largest mean distance to their neighbours.
 
     Chapter 4 removes half of them, with 3 neighbours. Of equal distances later points are removed
@@ -62,14 +58,10 @@ class NeighbourShare(Filter):
         Number of neighbours.
     """
 
-    fraction: float = 0.5
-    k: int = 3
+    fraction: Annotated[float, Bounds(0, 1)] = 0.5
+    k: Annotated[int, Bounds(1, _MAX_NEIGHBOURS)] = 3
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        within("fraction", self.fraction, 0, 1)
-        whole("k", self.k, 1, _MAX_NEIGHBOURS)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
-from tofuse.bounds import above, whole
+from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -17,7 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "temporal", label="validated")
 @dataclass(frozen=True)
-class TemporalDeviation(Filter):
+class TemporalDeviation(Bounded, Filter):
     """Remove pixels whose z varied too much over the last frames (section 2.8).
 
     The thesis calls it a "z-variance threshold" and gives a length, 25 mm: here that is the sample
@@ -33,14 +33,10 @@ class TemporalDeviation(Filter):
         Length of the window, the current frame included.
     """
 
-    threshold: float = 0.025
-    frames: int = 4
+    threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.025
+    frames: Annotated[int, Bounds(2, 1000)] = 4
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        above("threshold", self.threshold, 0)
-        whole("frames", self.frames, 2, 1000)
 
     @property
     def window(self) -> int:

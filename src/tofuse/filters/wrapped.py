@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.bounds import within
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.filters.base import Filter
 from tofuse.parts import part
@@ -22,7 +22,7 @@ _ASKED = 10_000
 
 @part("filter", "wrapped")
 @dataclass(frozen=True)
-class Wrapped(Filter):
+class Wrapped(Bounded, Filter):
     """Remove pixels whose phase wrapped, see `tofuse.sensor.unwrap`.
 
     Wrapped surfaces appear in free space, and consistently in consecutive views, so that they are
@@ -43,15 +43,11 @@ class Wrapped(Filter):
         Of the unwrapping.
     """
 
-    min_albedo: float = 0.02
-    fraction: float = 0.001
+    min_albedo: Annotated[float, Bounds(0, 1)] = 0.02
+    fraction: Annotated[float, Bounds(0, 1)] = 0.001
     options: UnwrapOptions = field(default_factory=lambda: UnwrapOptions(iterations=20))
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        within("min_albedo", self.min_albedo, 0, 1)
-        within("fraction", self.fraction, 0, 1)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
