@@ -253,10 +253,11 @@ def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
     assert np.linalg.norm(first, axis=1).max() < 4
 
 
-def test_an_object_is_segmented_from_its_background(tmp_path, full_report) -> None:
+def test_an_object_is_segmented_from_its_background(tmp_path, full_report, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=9, effects=effects)
     run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
+    assert "checkpoint" not in capsys.readouterr().err
     made = run_json(tmp_path / "out")
     assert made["config"]["filters"][0] == {"part": "background", "sigmas": 4.0, "fraction": 0.02}
     *_, scattering, multipath = made["config"]["corrections"]

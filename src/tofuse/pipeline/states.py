@@ -52,6 +52,7 @@ _ROOMS = (
     "pipeline.progress",
     "pipeline.reconstruct",
     "posegraph",
+    "recordings.background",
     "recordings.frames",
     "registration",
     "results.samples",
@@ -187,7 +188,7 @@ class _Encoder:
         if known_types().get(_name(kind)) is kind:
             state = item.__getstate__() or {}
             return ["object", _name(kind), *(v for k in state for v in (k, value(state[k])))]
-        raise StateError(f"{_name(kind)} is no part of a state")
+        raise StateError(f"objects of type {_name(kind)} can't be stored")
 
     def _pieces(self, file: SpillFile) -> list[str]:
         """Return names of the pieces of a temporary file: arrays read when they are written."""
@@ -201,7 +202,7 @@ class _Encoder:
     def _placed(self, flat: NDArray[Any]) -> list[Any]:
         """Return the written array that contains the values, their start, and their number."""
         if flat.dtype.kind not in _KINDS:
-            raise StateError(f"an array of {flat.dtype} is no part of a state")
+            raise StateError(f"arrays of {flat.dtype} can't be stored")
         if flat.nbytes > _SMALL:
             name = f"array-{len(self._arrays)}"
             self._arrays[name] = flat
@@ -226,7 +227,7 @@ class _Decoder:
     ) -> None:
         self._piece = piece
         if not isinstance(nodes, list) or not nodes:
-            raise StateError("it is no list of nodes")
+            raise StateError("the list of nodes is missing")
         self._nodes = nodes
         self._arrays = arrays
         self._left = sum(array.nbytes for array in arrays.values())  # each is taken once
@@ -241,11 +242,11 @@ class _Decoder:
         except StateError:
             raise
         except RecursionError:
-            raise StateError("it is nested too deeply") from None
+            raise StateError("the data is nested too deeply") from None
         except InputError as error:
             raise StateError(str(error)) from error
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise StateError(f"it is none ({type(error).__name__}: {error})") from error
+            raise StateError(f"the data is invalid ({type(error).__name__}: {error})") from error
         return state
 
     def _value(self, value: Any) -> Any:
@@ -254,13 +255,13 @@ class _Decoder:
             return self._item(number)
         if value is None or type(value) in (bool, int, float, str):
             return value
-        raise StateError("it holds no plain value")
+        raise StateError("a value is of an unexpected type")
 
     def _item(self, number: int) -> Any:
         if number in self._made:
             return self._made[number]
         if type(number) is not int or not 0 <= number < len(self._nodes) or number in self._begun:
-            raise StateError("its nodes lead nowhere")
+            raise StateError("a reference between nodes is invalid")
         kind, *rest = self._nodes[number]
         self._begun.add(number)
         if kind in ("tuple", "frozenset"):
@@ -289,19 +290,19 @@ class _Decoder:
     def _object(self, number: int, name: str, *rest: Any) -> None:
         cls = known_types().get(name)
         if cls is None:
-            raise StateError(f"{name!r:.80} is no part of a state")
+            raise StateError(f"the type {name!r:.80} is unknown")
         made: Any = object.__new__(cls)
         self._made[number] = made
         state = {key: self._value(value) for key, value in zip(rest[::2], rest[1::2], strict=True)}
         if not all(type(key) is str for key in state):
-            raise StateError("it has no attributes")
+            raise StateError("names of attributes are invalid")
         if is_dataclass(cls):
             names = {field.name for field in fields(cls)}
             more = {key for key in state if not isinstance(_member(cls, key), cached_property)}
             frozen: bool = cls.__dataclass_params__.frozen  # type: ignore[attr-defined]
             lacking = [n for n in names - set(state) if _member(cls, n) is None]
             if lacking or (frozen and more - names):
-                raise StateError(f"it has not the fields of {name}")
+                raise StateError(f"the fields do not match those of {name}")
         if hasattr(made, "__setstate__"):
             made.__setstate__(state)
         else:
@@ -309,12 +310,12 @@ class _Decoder:
 
     def _file(self, folder: str | None, *names: str) -> SpillFile:
         if folder is not None and not isinstance(folder, str):
-            raise StateError("a temporary file is nowhere")
+            raise StateError("the folder of a temporary file is invalid")
         made = SpillFile(folder)
         for name in names:
             data = self._piece(name) if name.startswith(PIECE) else None
             if data is None or data.dtype != np.uint8:
-                raise StateError("a temporary file is not whole")
+                raise StateError("a temporary file is incomplete")
             made.append(data)
         return made
 
@@ -336,10 +337,10 @@ class _Decoder:
                 return flat[0]
             turned, *sizes = shape
             if any(type(size) is not int or size < 0 for size in sizes):
-                raise StateError("an array has no shape")
+                raise StateError("the shape of an array is invalid")
             array = flat.reshape(sizes)
             return array.T if turned else array
-        raise StateError(f"it holds a {kind!r:.80}")
+        raise StateError(f"the kind of node {kind!r:.80} is unknown")
 
 
 _FILLED: dict[str, type] = {
