@@ -1,20 +1,19 @@
-"""Whether what runs for long, or often, ends up holding more: memory, file handles, threads.
+"""Leaks of memory, file descriptors and threads in long recordings and repeated runs.
 
     python benchmarks/soak.py frames [--columns 64] [--count 20000]
     python benchmarks/soak.py runs [--count 1000]
     python benchmarks/soak.py live [--hours 1] [--rate 10] [--no-mapper]
 
-`frames` reads a recording of so many images, which goes forth and back through a made room, and
-maps it in one go. `runs` makes whole runs in one process, of clouds and of images by turns, with
-all of their files. `live` takes what a camera sends in an hour of its own time, of which some is
-missing, some comes twice and some after its successor: once into a recording, once into a mapper.
+`frames` maps one recording of `--count` images, in which the camera moves back and forth through a
+simulated room. `runs` executes whole runs in one process, alternately of clouds and of images, with
+all output files. `live` processes the stream of a camera for `--hours` of the camera's own time,
+with missing, duplicate and late frames: it is recorded first, then fed into a mapper.
 
-Each prints the resident memory, open file handles and threads at ten places on the way, and how
-much of the memory is in stores that may keep a share of `--memory`. A store that is not full yet
-grows by right, and by as much as it says; it must stay within its share. All other memory must not
-grow, from the middle on, by more than what is kept of a frame on purpose (its record and how it was
-tracked) or by 1 MB for 100 runs; handles and threads must not grow at all. Ends with 1 if any does.
-Linux only.
+Each prints, at ten points, the resident memory, open file descriptors and threads, and how much of
+the memory is in stores with a budget out of `--memory`. A store may grow until it reaches its
+budget. Over the second half, all other memory may not grow by more than what is retained of a frame
+by design (its record and its tracking), or by 1 MB per 100 runs; descriptors and threads may not
+grow at all. Exits with 1 if any does. Linux only.
 """
 
 from __future__ import annotations
@@ -46,86 +45,100 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 
-FRAME_BYTES = 6000  # of its record, how it was tracked, and the list that holds them
-RUN_BYTES = 10_000  # 1 MB for 100 runs
-NOISE_BYTES = 8 << 20  # by which the C library's memory comes and goes
+FRAME_BYTES = 6000  # its record, its tracking, and their entries in lists
+RUN_BYTES = 10_000  # 1 MB per 100 runs
+NOISE_BYTES = 8 << 20  # fluctuation of the C library's heap
 MEMORY_MB = 500
 SAMPLES = 10
 
 
 @dataclass(frozen=True)
-class Held:
-    """What the process holds: bytes of memory, open file handles, threads.
+class Usage:
+    """Resources of this process: resident memory in bytes, file descriptors, threads.
 
-    Of the memory, `stored` bytes are in stores of a mapper, which may keep `allowed`. `blocks` are
-    those that Python has allocated: what is left of a run or a frame is among them, while memory is
-    blurred by the gaps between them.
+    `stored` bytes of the memory are in a mapper's stores, whose budgets sum to `budget` bytes.
+    `blocks` counts the blocks allocated by Python, which shows a leak of objects more clearly than
+    the memory does, as that depends on fragmentation.
     """
 
     after: int
     memory: int
-    handles: int
+    descriptors: int
     threads: int
     stored: int = 0
-    allowed: int = 0
+    budget: int = 0
     blocks: int = 0
 
     @property
     def other(self) -> int:
-        """Bytes of memory that no store holds."""
+        """Bytes of memory outside the stores."""
         return self.memory - self.stored
 
     @staticmethod
-    def now(after: int) -> Held:
-        """Look, after so many frames or runs."""
+    def measured(after: int) -> Usage:
+        """Measure, after that many frames or runs."""
         gc.collect()
         give_back()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
-        handles, tasks = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
+        descriptors, threads = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
         stores = [o for o in gc.get_objects() if isinstance(o, Spill) and len(o)]
-        stored, allowed = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
+        stored, budget = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
         memory = pages * os.sysconf("SC_PAGE_SIZE")
         blocks = sys.getallocatedblocks()
-        return Held(after, memory, handles, tasks, stored, allowed, blocks)
+        return Usage(after, memory, descriptors, threads, stored, budget, blocks)
 
 
-def growth(held: list[Held]) -> float:
-    """Bytes by which memory outside of stores grows each time, from the middle on.
+class Trace:
+    """Samples of the usage, printed as they are taken."""
 
-    That is the median of all slopes (Sen).
+    def __init__(self, title: str, count: int, samples: int = SAMPLES) -> None:
+        self.samples: list[Usage] = []
+        self._every = max(1, count // samples)
+        columns = (f"{'descriptors':>13}", f"{'threads':>9}", f"{'blocks':>10}")
+        print(f"\n{title}\n{'after':>8}{'MB':>9}{'in stores':>11}{''.join(columns)}", flush=True)
+
+    def step(self, done: int) -> None:
+        """Take a sample if one is due after that many frames or runs."""
+        if done % self._every:
+            return
+        one = Usage.measured(done)
+        self.samples.append(one)
+        row = f"{one.after:>8}{one.memory / 1e6:>9.1f}{one.stored / 1e6:>11.1f}"
+        print(f"{row}{one.descriptors:>13}{one.threads:>9}{one.blocks:>10}", flush=True)
+
+
+def growth(samples: list[Usage]) -> float:
+    """Bytes per frame or run by which memory outside the stores grows in the second half.
+
+    That is the median of all slopes (Theil-Sen).
     """
-    late = held[len(held) // 2 :]
+    late = samples[len(samples) // 2 :]
     slopes = [
         (b.other - a.other) / (b.after - a.after) for k, a in enumerate(late) for b in late[k + 1 :]
     ]
     return float(np.median(slopes)) if slopes else 0.0
 
 
-def judged(what: str, held: list[Held], each: float) -> bool:
-    """Print what was held, and return whether it stayed within bounds."""
-    head = f"{'after':>8}{'MB':>9}{'in stores':>11}{'handles':>9}{'threads':>9}{'blocks':>10}"
-    print(f"\n{what}\n{head}")
-    for one in held:
-        row = f"{one.after:>8}{one.memory / 1e6:>9.1f}{one.stored / 1e6:>11.1f}"
-        print(f"{row}{one.handles:>9}{one.threads:>9}{one.blocks:>10}")
-    late = held[len(held) // 2 :]
-    slope, count = growth(held), late[-1].after - late[0].after
+def bounded(samples: list[Usage], each: float) -> bool:
+    """Whether usage stayed within its bounds: `each` bytes per frame or run."""
+    late = samples[len(samples) // 2 :]
+    slope, count = growth(samples), late[-1].after - late[0].after
     flat = slope * count <= each * count + NOISE_BYTES
-    steady = all(max(v) <= v[0] for v in ([h.handles for h in late], [h.threads for h in late]))
-    within = all(h.stored <= h.allowed for h in held)
+    steady = all(max(v) <= v[0] for v in ([u.descriptors for u in late], [u.threads for u in late]))
+    within = all(u.stored <= u.budget for u in samples)
     good = flat and steady and within
-    told = f"{slope / 1e3:.2f} kB each from the middle on, but for stores"
-    print(f"{told}: {'held' if good else 'DID NOT HOLD'}", flush=True)
+    rate = f"{slope / 1e3:.2f} kB each in the second half, outside the stores"
+    print(f"{rate}: {'passed' if good else 'FAILED'}", flush=True)
     return good
 
 
 def small(kind: str = "range") -> Config:
-    """The default, within the least memory that can be asked for."""
+    """The default method with the smallest memory budget that is accepted."""
     return changed(from_method("default", kind), {"memory_mb": MEMORY_MB}, where="soak")
 
 
 def frames(columns: int, count: int, base: Path, samples: int = SAMPLES) -> bool:
-    """Map a recording of so many images."""
+    """Map a recording of `count` images."""
     short = base / "short"
     some = made_frames(columns, LENGTH)
     writer = RecordingWriter(
@@ -136,19 +149,18 @@ def frames(columns: int, count: int, base: Path, samples: int = SAMPLES) -> bool
     writer.finish()
     recording = open_recording(there_and_back(short, count, base / "long"))
     mapper = Mapper(with_recording_defaults(small(), recording))
-    held: list[Held] = []
+    trace = Trace(f"{count} frames of {columns} x {columns * 3 // 4}", count, samples)
     for k, frame in enumerate(recording):
         mapper.push(frame)
-        if (k + 1) % (count // samples) == 0:
-            held.append(Held.now(k + 1))
-    good = judged(f"{count} frames of {columns} x {columns * 3 // 4}", held, FRAME_BYTES)
+        trace.step(k + 1)
+    good = bounded(trace.samples, FRAME_BYTES)
     posed = len(mapper.finish().trajectory)
     print(f"{posed} of {count} frames have a pose")
     return good and posed == count
 
 
 def runs(count: int, base: Path, samples: int = SAMPLES) -> bool:
-    """Whole runs in this process."""
+    """Execute `count` runs in this process."""
     clouds = simulate("peaks", base / "peaks", frames=2)
     images = base / "images"
     some = made_frames(64, 3)
@@ -159,18 +171,17 @@ def runs(count: int, base: Path, samples: int = SAMPLES) -> bool:
         writer.add(frame)
     writer.finish()
     kinds = ((clouds, "thesis"), (images, "default"))
-    held: list[Held] = []
+    trace = Trace(f"{count} runs in one process", count, samples)
     for k in range(count):
         recording, method = kinds[k % 2]
         run([recording], Options(base / "out", method=method, overwrite=True))
-        if (k + 1) % (count // samples) == 0:
-            held.append(Held.now(k + 1))
-    return judged(f"{count} runs in one process", held, RUN_BYTES)
+        trace.step(k + 1)
+    return bounded(trace.samples, RUN_BYTES)
 
 
 @dataclass
 class Sent:
-    """How many frames a camera sent, and how many of them were no news or came too late."""
+    """How many frames a camera sent, and how many were missing, duplicate or late."""
 
     frames: int = 0
     missing: int = 0
@@ -179,9 +190,9 @@ class Sent:
 
 
 class Camera(Stream):
-    """A camera of made images that sends as fast as it is read, by a clock of its own.
+    """A camera of simulated images, with timestamps of its own, that sends as fast as it is read.
 
-    Of a hundred images two are missing, one comes twice, and one comes after its successor.
+    Of a hundred images two are missing, one is sent twice, and one after its successor.
     """
 
     def __init__(self, columns: int, count: int, rate: float, ahead: int | None = None) -> None:
@@ -190,11 +201,11 @@ class Camera(Stream):
         self.sent = Sent()
         self._rate = rate
         self._feed = self._frames(count)
-        # Whoever reads it on another thread says how many are done, so that none need be dropped.
+        # Limits how far ahead another thread reads, so that no frame is dropped.
         self._free = None if ahead is None else threading.Semaphore(ahead)
 
     def done(self, _count: int) -> None:
-        """One more frame was taken."""
+        """Let the reader proceed by one frame."""
         if self._free is not None:
             self._free.release()
 
@@ -233,7 +244,7 @@ class Camera(Stream):
 
 
 def place(k: int) -> int:
-    """Which image comes k-th, there and back."""
+    """Index of the k-th image, back and forth."""
     period = 2 * LENGTH - 2
     return min(k % period, period - k % period)
 
@@ -241,20 +252,19 @@ def place(k: int) -> int:
 def live(
     columns: int, seconds: float, rate: float, base: Path, mapped: bool, samples: int = SAMPLES
 ) -> bool:
-    """Record from a camera, and map from it."""
+    """Record a camera, and map it."""
     count = round(seconds * rate)
-    held: list[Held] = []
+    what = f"{seconds / 3600:.2g} h at {rate:g} frames per second, {columns} columns wide"
+    trace = Trace(f"recording of {what}", count, samples)
     with Camera(columns, count, rate, ahead=32) as camera:
 
-        def told(written: int) -> None:
+        def progress(written: int) -> None:
             camera.done(written)
-            if written % (count // samples) == 0:
-                held.append(Held.now(written))
+            trace.step(written)
 
-        done = record(camera, base / "recorded", progress=told)
+        done = record(camera, base / "recorded", progress=progress)
         sent = camera.sent
-    what = f"{seconds / 3600:.2g} h at {rate:g} frames a second, {columns} columns wide"
-    good = judged(f"recording of {what}", held, 0)
+    good = bounded(trace.samples, 0)
     print(f"{sent}, {done.frames} recorded, {done.dropped} dropped; ended: {done.ended_by}")
     good &= (done.frames, done.dropped) == (sent.frames, 0)
     recording = open_recording(base / "recorded")
@@ -262,21 +272,20 @@ def live(
     good &= len(recording) == sent.frames and warned == (sent.late > 0)
     if not mapped:
         return good
-    held.clear()
+    trace = Trace(f"mapping of {what}", count, samples)
     mapper = Mapper(small())
     with Camera(columns, count, rate) as camera:
         try:
             for k, frame in enumerate(camera):
                 mapper.push(frame)
-                if (k + 1) % (count // samples) == 0:
-                    held.append(Held.now(k + 1))
+                trace.step(k + 1)
         except DeviceError:
             pass
         sent = camera.sent
-    good &= judged(f"mapping of {what}", held, FRAME_BYTES)
+    good &= bounded(trace.samples, FRAME_BYTES)
     result = mapper.finish()
     repeated = len(mapper.log.repeated)
-    print(f"{len(result.trajectory)} of {sent.frames} frames have a pose, {repeated} came twice")
+    print(f"{len(result.trajectory)} of {sent.frames} frames have a pose, {repeated} duplicates")
     return good and len(result.trajectory) == sent.frames and repeated == sent.doubled
 
 

@@ -1,4 +1,4 @@
-"""A little of each soak of `benchmarks/soak.py`, and whether it would notice a leak."""
+"""Short soaks of `benchmarks/soak.py`, and whether they would detect a leak."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ def soak(monkeypatch):
     return soak
 
 
-def held(soak, memory, handles=7, threads=3):
-    return [soak.Held(100 * (k + 1), m, handles, threads) for k, m in enumerate(memory)]
+def usages(soak, memory, descriptors=7, threads=3):
+    return [soak.Usage(100 * (k + 1), m, descriptors, threads) for k, m in enumerate(memory)]
 
 
-def test_a_leak_is_noticed(soak, capsys) -> None:
+def test_a_leak_is_detected(soak, capsys) -> None:
     flat = [int(5e8 + 1e5 * (-1) ** k) for k in range(10)]
-    assert soak.judged("some", held(soak, flat), soak.RUN_BYTES)
+    assert soak.bounded(usages(soak, flat), soak.RUN_BYTES)
     filled = [int(1e8 * min(k + 1, 4)) for k in range(10)]  # caches fill at the beginning
-    assert soak.judged("some", held(soak, filled), soak.RUN_BYTES)
+    assert soak.bounded(usages(soak, filled), soak.RUN_BYTES)
     growing = [int(1e8 + 5e6 * k) for k in range(10)]  # 50 kB each
-    assert soak.growth(held(soak, growing)) == pytest.approx(5e4)
-    assert not soak.judged("some", held(soak, growing), soak.RUN_BYTES)
-    more = [*held(soak, flat[:9]), soak.Held(1000, flat[9], 8, 3)]
-    assert not soak.judged("some", more, soak.RUN_BYTES)
-    more = [*held(soak, flat[:9]), soak.Held(1000, flat[9], 7, 4)]
-    assert not soak.judged("some", more, soak.RUN_BYTES)
-    assert capsys.readouterr().out.count("DID NOT HOLD") == 3
+    assert soak.growth(usages(soak, growing)) == pytest.approx(5e4)
+    assert not soak.bounded(usages(soak, growing), soak.RUN_BYTES)
+    more = [*usages(soak, flat[:9]), soak.Usage(1000, flat[9], 8, 3)]
+    assert not soak.bounded(more, soak.RUN_BYTES)
+    more = [*usages(soak, flat[:9]), soak.Usage(1000, flat[9], 7, 4)]
+    assert not soak.bounded(more, soak.RUN_BYTES)
+    assert capsys.readouterr().out.count("FAILED") == 3
 
 
 def test_a_store_may_fill_but_not_overflow(soak) -> None:
-    def filling(allowed: int) -> list:
+    def filling(budget: int) -> list:
         return [
-            soak.Held(100 * k, int(5e8 + 1e7 * k), 7, 3, stored=int(1e7 * k), allowed=allowed)
+            soak.Usage(100 * k, int(5e8 + 1e7 * k), 7, 3, stored=int(1e7 * k), budget=budget)
             for k in range(10)
         ]
 
-    assert soak.judged("some", filling(10**8), soak.RUN_BYTES)
-    assert not soak.judged("some", filling(5 * 10**7), soak.RUN_BYTES)
+    assert soak.bounded(filling(10**8), soak.RUN_BYTES)
+    assert not soak.bounded(filling(5 * 10**7), soak.RUN_BYTES)
 
 
-def test_what_a_live_camera_sends_is_recorded(soak, tmp_path: Path, capsys) -> None:
-    """Two minutes of its time, of which some is missing, some comes twice, and some late."""
+def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) -> None:
+    """Two minutes of camera time with missing, duplicate and late frames."""
     assert soak.live(32, 120.0, 10.0, tmp_path, mapped=False)
     sent = soak.Camera(32, 1200, 10.0)
     times = [frame.timestamp for frame in sent._frames(1200)]
@@ -64,5 +64,5 @@ def test_what_a_live_camera_sends_is_recorded(soak, tmp_path: Path, capsys) -> N
     assert "1200" not in capsys.readouterr().err
 
 
-def test_a_mapper_takes_frames_that_are_late_missing_and_doubled(soak, tmp_path: Path) -> None:
+def test_a_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
     assert soak.live(32, 15.0, 10.0, tmp_path, mapped=True, samples=3)

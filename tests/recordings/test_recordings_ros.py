@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import gc
 import importlib
 import os
+import sqlite3
 import struct
+import tempfile
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -341,16 +346,16 @@ def test_damage_gives_only_our_errors(tmp_path: Path, kind: str) -> None:
     assert seen[2] + seen[1] > 0
 
 
-def queue(path: Path) -> None:
+def fifo(path: Path) -> None:
     if not hasattr(os, "mkfifo"):
-        pytest.skip("queues of other systems")
+        pytest.skip("no FIFOs on this system")
     path.unlink()
     os.mkfifo(path)
 
 
 HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "metadata is a queue": ("no ordinary file", lambda bag: queue(bag / "metadata.yaml")),
-    "data is a queue": ("no ordinary file", lambda bag: queue(bag / "a.db3")),
+    "metadata is a FIFO": ("not a regular file", lambda bag: fifo(bag / "metadata.yaml")),
+    "data is a FIFO": ("not a regular file", lambda bag: fifo(bag / "a.db3")),
     "parts that double": (
         "refers to its own parts",
         lambda bag: (bag / "metadata.yaml").write_text(
@@ -367,7 +372,9 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_folders_that_rosbags_would_read_for_ever_are_refused(tmp_path: Path, name: str) -> None:
+def test_folders_that_rosbags_would_not_finish_reading_are_rejected(
+    tmp_path: Path, name: str
+) -> None:
     bag = Bag(tmp_path, "ros2")
     bag.info("/camera/depth/camera_info")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
@@ -384,7 +391,7 @@ def test_folders_that_rosbags_would_read_for_ever_are_refused(tmp_path: Path, na
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
      ("ros2", "MESSAGE")],
 )  # fmt: skip
-def test_chunks_that_expand_beyond_all_bounds_are_refused(
+def test_chunks_that_expand_too_much_are_rejected(
     tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag = Bag(tmp_path, kind, packed)
@@ -395,9 +402,119 @@ def test_chunks_that_expand_beyond_all_bounds_are_refused(
     frame = open_recording(path)[2]
     assert isinstance(frame, RangeFrame)
     np.testing.assert_allclose(frame.z, COUNTS[2] / 1000, rtol=1e-6)
-    monkeypatch.setattr(bags, "_MAX_CHUNK_BYTES", 100)
+    monkeypatch.setattr(bounded_bags(), "MAX_CHUNK_BYTES", 100)
+    monkeypatch.setattr(bounded_bags(), "MAX_RATIO", 10**6)
     with pytest.raises(InputError, match="more than 100 bytes"):
         open_recording(path)
+
+
+def bounded_bags() -> Any:
+    return importlib.import_module("tofuse.recordings.bounded_bags")
+
+
+@pytest.mark.parametrize("kind", ["ros2", "mcap"])
+def test_compressed_files(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are decompressed into a temporary folder, which is removed, up to a limit."""
+    (temporary := tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    bag = Bag(tmp_path, kind, "FILE")
+    depth_bag(bag)
+    path = bag.close()
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    recording = open_recording(path)
+    frame = recording[2]
+    assert isinstance(frame, RangeFrame)
+    np.testing.assert_allclose(frame.z, COUNTS[2] / 1000, rtol=1e-6)
+    assert len(list(temporary.iterdir())) == 1
+    del recording
+    gc.collect()
+    assert list(temporary.iterdir()) == []
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+
+    limits = bounded_bags()
+    (file,) = path.glob("*.zstd")
+    monkeypatch.setattr(limits, "MAX_CHUNK_BYTES", 4 << 20)
+    content = file.read_bytes()
+    file.write_bytes(limits.zstd.compress(bytes(300 << 20)))
+    assert file.stat().st_size * limits.MAX_RATIO < 8 << 20
+    for format_ in ("ros", "realsense-bag", None):
+        with pytest.raises(InputError, match=r"GB; convert it to a bag without compression"):
+            open_recording(path, format=format_)
+        assert list(temporary.iterdir()) == []
+
+    # A small file that is listed many times is limited as well.
+    file.write_bytes(content)
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text()
+    (line,) = (line for line in text.splitlines(True) if line.strip() == f"- {file.name}")
+    metadata.write_text(text.replace(line, line * 2000))
+    with pytest.raises(InputError, match="expands to more than"):
+        open_recording(path)
+    assert list(temporary.iterdir()) == []
+
+
+def test_no_space_for_decompressed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = Bag(tmp_path, "ros2", "FILE")
+    depth_bag(bag)
+    path = bag.close()
+
+    def full(*_words: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(bounded_bags(), "TemporaryDirectory", full)
+    with pytest.raises(InputError, match=r"no space for the decompressed files .* TMPDIR"):
+        open_recording(path)
+
+
+def test_chunks_that_expand_too_much_together_are_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chunks with forged times would all be in memory at once."""
+    bag = Bag(tmp_path, "mcap", "STORAGE")
+    bag.info("/camera/depth/camera_info")
+    for k in range(8):
+        bag.image(TOPIC, 10 + k, np.zeros((1200, 1600), np.uint16), "16UC1")
+    path = bag.close()
+    (file,) = path.glob("*.mcap")
+    assert file.stat().st_size < 50_000
+    monkeypatch.setattr(bounded_bags(), "MAX_CHUNK_BYTES", 10 << 20)
+    for each in (path, file):
+        with pytest.raises(InputError, match=r"\.mcap: expands to more than 0.0105 GB"):
+            open_recording(each)
+
+
+DATABASES = {
+    "a view": "CREATE VIEW more AS WITH RECURSIVE c(x) AS"
+    " (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c",
+    "a virtual table": "CREATE VIRTUAL TABLE more USING fts5(x)",
+    "topics twice": "CREATE TABLE t AS SELECT * FROM topics; DROP TABLE topics;"
+    "ALTER TABLE t RENAME TO topics; INSERT INTO topics SELECT * FROM topics",
+}
+
+
+@pytest.mark.parametrize("name", DATABASES)
+def test_databases_whose_queries_yield_more_rows_than_messages_are_rejected(
+    tmp_path: Path, name: str
+) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    path = bag.close()
+    (file,) = path.glob("*.db3")
+    with closing(sqlite3.connect(file)) as db:
+        db.executescript(DATABASES[name])
+        db.commit()
+    for each in (path, file):
+        with pytest.raises(InputError, match="is not a database of ROS messages"):
+            open_recording(each)
+
+
+def test_other_users_of_rosbags_keep_its_decompressors() -> None:
+    mcap = pytest.importorskip("rosbags.rosbag2.storage_mcap")
+    limits = bounded_bags()
+    assert set(limits._mcap.DECOMPRESSORS) == set(mcap.DECOMPRESSORS)
+    for name in ("lz4", "zstd"):
+        assert mcap.DECOMPRESSORS[name].__module__ == mcap.__name__
+        assert limits._mcap.DECOMPRESSORS[name].__module__ == limits.__name__
 
 
 def test_without_rosbags_it_is_said_how_to_get_it(
@@ -408,7 +525,7 @@ def test_without_rosbags_it_is_said_how_to_get_it(
     found = importlib.import_module
 
     def missing(name: str) -> Any:
-        if name.startswith("rosbags"):
+        if name == "tofuse.recordings.bounded_bags":  # which imports rosbags
             raise ImportError(name)
         return found(name)
 

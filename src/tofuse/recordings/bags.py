@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import bz2
+import errno
 import importlib
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,6 @@ MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
 _MAX_METADATA_BYTES = 16 << 20
-_MAX_CHUNK_BYTES = 1 << 30  # rosbag writes chunks of 768 kB, MCAP of 4 MB
 _MAX_DEPTH = 100  # of brackets in metadata.yaml, of which rosbag2 writes 5
 
 
@@ -37,15 +34,10 @@ def open_bag(path: Path) -> Any:
     InputError
         If rosbags is missing, or can't open it.
     """
-    highlevel, typesys = _rosbags(path, "highlevel", "typesys")
+    rosbags = _rosbags(path)
     if is_folder(path):
         _check_folder(path)
-    return _opened(
-        path,
-        lambda: highlevel.AnyReader(
-            [path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)
-        ),
-    )
+    return _opened(path, rosbags.AnyReader)
 
 
 def open_container(path: Path) -> Any:
@@ -53,46 +45,14 @@ def open_container(path: Path) -> Any:
 
     The message definitions in the bags of some makers are incomplete.
     """
-    (rosbag1,) = _rosbags(path, "rosbag1")
-    return _opened(path, lambda: rosbag1.Reader(path))
+    return _opened(path, _rosbags(path).Rosbag1)
 
 
-def _rosbags(path: Path, *modules: str) -> list[ModuleType]:
+def _rosbags(path: Path) -> Any:
     try:
-        found = [importlib.import_module(f"rosbags.{name}") for name in modules]
-    except ImportError as error:
+        return importlib.import_module("tofuse.recordings.bounded_bags")
+    except (ImportError, AttributeError) as error:  # the latter of another version
         raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
-    # Without effect on versions of rosbags that are organised differently.
-    with suppress(ImportError, AttributeError):
-        _limit_chunks()
-    return found
-
-
-@cache
-def _limit_chunks() -> None:
-    """Limit what rosbags decompresses of one chunk or message.
-
-    A compressed kilobyte may expand to gigabytes, and rosbags has no limit.
-    """
-    frames = importlib.import_module("lz4.frame")
-    bag = importlib.import_module("rosbags.rosbag1.reader")
-    bag2: Any = importlib.import_module("rosbags.rosbag2.reader")
-    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
-    lz4, zstd = _limited(frames.LZ4FrameDecompressor), _limited(mcap.zstd.ZstdDecompressor)
-    bag.decompressors.update({"bz2": _limited(bz2.BZ2Decompressor), "lz4": lz4})
-    mcap.DECOMPRESSORS.update({"lz4": lambda d, _: lz4(d), "zstd": lambda d, _: zstd(d)})
-    bag2.zstd = SimpleNamespace(decompress=zstd, open=mcap.zstd.open)
-
-
-def _limited(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    def decompress(data: bytes) -> bytes:
-        decompressor = make()
-        found: bytes = decompressor.decompress(data, _MAX_CHUNK_BYTES)
-        if not decompressor.eof:
-            raise ValueError(f"a chunk is cut off, or has more than {_MAX_CHUNK_BYTES} bytes")
-        return found
-
-    return decompress
 
 
 def _check_folder(path: Path) -> None:
@@ -105,7 +65,7 @@ def _check_folder(path: Path) -> None:
         for entry in path.iterdir():
             if entry.exists() and not (entry.is_file() or entry.is_dir()):
                 raise InputError(
-                    "is no ordinary file", where=entry, remedy="take it out of the bag"
+                    "is not a regular file", where=entry, remedy="remove it from the bag"
                 )
     except OSError as error:
         raise input_error(error, path) from error
@@ -124,15 +84,23 @@ def _check_folder(path: Path) -> None:
                     remedy="reindex the bag",
                 )
     except (yaml.error.YAMLError, ValueError, RecursionError):
-        return  # which rosbags says better
+        return  # rosbags raises a better error
 
 
-def _opened(path: Path, make: Callable[[], Any]) -> Any:
+def _opened(path: Path, make: Callable[[Path], Any]) -> Any:
     try:
-        bag = make()
+        bag = make(path)
         bag.open()
         return bag
+    except InputError:
+        raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            raise InputError(
+                "has no space for the decompressed files of a bag",
+                where=tempfile.gettempdir(),
+                remedy="free some space, or set TMPDIR to another folder",
+            ) from error
         raise InputError(
             f"can't be opened as a bag ({type(error).__name__}: {str(error)[:200]})",
             where=path,

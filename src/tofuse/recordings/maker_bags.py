@@ -45,7 +45,9 @@ def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
     """See `topics`; cached, as several readers ask and opening a large bag is slow."""
     try:
         if is_folder(path):
-            is_bag = is_file(path / "metadata.yaml") and bool(files_with(path, ".db3", ".mcap"))
+            is_bag = is_file(path / "metadata.yaml") and bool(
+                files_with(path, ".db3", ".mcap", ".zstd")
+            )
             old = False
         else:
             head = read_head(path, 16)

@@ -63,7 +63,7 @@ class Ros:
         """See `Reader.sniff`."""
         try:
             if is_folder(path):
-                if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap"):
+                if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
                     return Sniff(0.95, "metadata.yaml and a bag")
                 return None
             head = read_head(path, 16)
