@@ -144,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         mapped(frames, 30)
         ends = [prepare_view(frames[k], Keyframes().surface) for k in (0, -1)]
-        search(ends[0], ends[1], SearchOptions(mode="both"))
+        search(ends[0], ends[1], SearchOptions())
         for count in options.frames:
             result, watch = mapped(frames, count)
             print(row(result, watch), flush=True)

@@ -200,7 +200,7 @@ def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
     """The pose that the exhaustive search finds, if it is believed."""
     options = SurfaceOptions()
     views = prepare_view(source, options), prepare_view(target, options)
-    found = register_pair(*views, options=SearchOptions(), always_search=True)
+    found = register_pair(*views, options=SearchOptions(mode="auto"), always_search=True)
     return found.T_target_source if found is not None and found.believed else None
 
 

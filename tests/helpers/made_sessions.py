@@ -21,7 +21,7 @@ from tofuse.registration.search import SearchOptions
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 
-QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
+QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
 # Two walks that see the same corner of the room from opposite sides.
 HERE = [at(0.2 * np.sin(0.2 * k), 0.2 * np.cos(0.2 * k), 0.06 * k) for k in range(12)]
 THERE = [
@@ -39,7 +39,7 @@ def quick(config: Config | None = None) -> Config:
         model_filters=(),
         fusion=Fusion(voxel_m=0.05),
         loops=replace(config.loops, searches=0, appearance=Appearance(most=0)),
-        joining=replace(config.joining, search=QUICK),
+        search=QUICK,
         self_calibration=False,
     )
 

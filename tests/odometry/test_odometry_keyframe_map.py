@@ -128,7 +128,7 @@ def test_the_one_that_looks_most_alike_is_found(around) -> None:
 
 
 def relocalizer():
-    return Relocalizer(SearchOptions(mode="both"), UsualFit())
+    return Relocalizer(SearchOptions(), UsualFit())
 
 
 def counted(monkeypatch):

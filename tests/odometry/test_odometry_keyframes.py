@@ -426,8 +426,6 @@ def test_clouds_are_refused():
         ("alignment.prior_m", -1),
         ("unusual", 0),
         ("unusual", float("nan")),
-        ("search.reach", -1),
-        ("search.mode", "thorough"),
         ("searches", "often"),
         ("minimum_points", -5),
         ("keyframe_angle", float("nan")),

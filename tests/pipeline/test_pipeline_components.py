@@ -20,7 +20,7 @@ from tofuse.posegraph.joining import Joining
 from tofuse.registration.search import SearchOptions
 
 DEFAULT = from_method("default")
-QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
+QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
 # Coarse and quick: it is about poses.
 CONFIG = replace(
     DEFAULT,
@@ -28,8 +28,8 @@ CONFIG = replace(
     model_filters=(),
     fusion=Fusion(voxel_m=0.05),
     loops=replace(DEFAULT.loops, searches=0, appearance=Appearance(most=0)),
-    odometry=replace(DEFAULT.odometry, search=QUICK),
-    joining=Joining(QUICK, searches=2, searches_per_frame=0.0),
+    search=QUICK,
+    joining=Joining(searches=2, searches_per_frame=0.0),
 )
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
 PATH = [at(0.2 * np.sin(0.2 * k), 0.2 * np.cos(0.2 * k), 0.06 * k) for k in range(40)]

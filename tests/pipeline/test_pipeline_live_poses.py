@@ -37,7 +37,7 @@ class Drifting:
     part_name: ClassVar[str] = "drifting"
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def start(self, seed):
+    def start(self, seed, search=None):
         return _Drifting()
 
 

@@ -20,7 +20,7 @@ from tofuse.registration.search import SearchOptions
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)
-QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
+QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
 # Boxes (centre, half size, turned about y by rad) in a room of 5 x 2.4 x 4 m, y down.
 BOXES = [
     ((1.3, 0.9, 1.2), (0.3, 0.5, 0.25), 0.3),
@@ -89,7 +89,7 @@ def drifted(truth, degrees):
 
 def found_in(views, poses, sigma=0.0, **options):
     store = ViewStore(ALL)
-    loops = Revisits(spacing=ALL, search=QUICK, **options).start(0, (), store)
+    loops = Revisits(spacing=ALL, **options).start(0, (), store, QUICK)
     frame = room(0.0, 0)
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)

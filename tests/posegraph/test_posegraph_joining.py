@@ -14,6 +14,7 @@ from tofuse.posegraph import joining
 from tofuse.posegraph.joining import Joining, Stretch
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
+from tofuse.registration.search import SearchOptions
 from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
@@ -267,7 +268,7 @@ def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) ->
     """Without a motion between them, a single link need not wait; but not where it says one."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
-    joiner = joining._Joiner(Joining(), three[:2])
+    joiner = joining._Joiner(Joining(), three[:2], SearchOptions())
     joiner.decide()
     a, b = joiner._islands
     right = se3.inverse(PATH[0]) @ PATH[12]
@@ -377,7 +378,7 @@ def test_who_tries_often_finds_something_by_chance(three, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
     a, b = three[0].views, three[1].views
     right = probable(a[-1], b[0], 0.96)
-    joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2])
+    joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2], SearchOptions())
     joiner.add(right)
     assert joiner._probability(*joiner._islands, [right]) == pytest.approx(0.96)
     joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found

@@ -17,10 +17,17 @@ from tofuse.lab.simulation.record import simulate_recording
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
-from tofuse.registration.floor import FloorOptions, find_floor, find_floors
+from tofuse.registration.floor import find_floor, find_floors
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.rough import with_rough_planes
-from tofuse.registration.search import Candidate, SearchOptions, _distinct, search
+from tofuse.registration.search import (
+    DISTINCT_M,
+    Candidate,
+    SearchOptions,
+    _distinct,
+    differ,
+    search,
+)
 
 
 def view(*arguments, **options):
@@ -270,7 +277,7 @@ def test_views_back_to_back_share_nothing(pair):
 def test_floor_is_found_below_a_table():
     table = [((0.0, 0.2, 1.6), (1.2, 0.02, 0.5), 0.0)]
     T = camera(0.0, 0.0, 0.0)
-    floor = find_floor(view(T, boxes=table), np.array([0.0, 1.0, 0.0]), FloorOptions())
+    floor = find_floor(view(T, boxes=table), np.array([0.0, 1.0, 0.0]))
     assert floor is not None
     assert floor.height == pytest.approx(1.0, abs=0.01)
     down = T[:3, :3].T @ [0, 1, 0]
@@ -305,7 +312,6 @@ def test_the_lowest_plane_is_the_one_with_most_points_and_few_below():
 
 
 def test_of_poses_that_differ_the_best_stay():
-    options = SearchOptions()
     rng = np.random.default_rng(1)
     said = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
     poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
@@ -314,11 +320,11 @@ def test_of_poses_that_differ_the_best_stay():
     ]
     kept = []
     for one in sorted(found, key=lambda c: -c.score):
-        if all(options.differ(one.T_target_source, c.T_target_source) for c in kept):
+        if all(differ(one.T_target_source, c.T_target_source) for c in kept):
             kept.append(one)
     assert 3 < len(kept) < 50
-    assert _distinct(found, options) == tuple(kept)
-    assert _distinct([], options) == ()
+    assert _distinct(found, DISTINCT_M) == tuple(kept)
+    assert _distinct([], DISTINCT_M) == ()
 
 
 def test_no_floor_where_the_camera_looks_at_a_wall():
@@ -391,7 +397,7 @@ def test_a_box_alone_looks_alike_turned_by_a_quarter():
 def test_views_of_different_places_have_little_in_common(pair):
     other = [((-0.3, 0.4, 1.4), (0.15, 0.6, 0.3), 0.1), ((0.6, 0.85, 1.9), (0.4, 0.15, 0.3), 0.0)]
     elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
-    found = search(elsewhere, pair[1], SearchOptions(mode="both"))
+    found = search(elsewhere, pair[1], SearchOptions())
     assert found.score < 0.8 * agreement(*pair, TRUE).score
     assert found.margin < 0.1
 
@@ -458,7 +464,7 @@ def test_the_tracker_connects_a_view_after_a_large_step_by_a_search():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"mode": "none"}, {"reach": -1.0}, {"full_points": 0}, {"planar_step": 0.0}, {"turn": 4.0}],
+    [{"mode": "none"}, {"reach": -1.0}, {"full_candidates": 0}, {"turn": 4.0}],
 )
 def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

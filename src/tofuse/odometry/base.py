@@ -10,6 +10,7 @@ from tofuse.odometry.motion import Moment
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.search import SearchOptions
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
 
@@ -101,6 +102,14 @@ class Odometry(Protocol):
         """Kinds of view it works on: "range", "cloud"."""
         ...
 
-    def start(self, seed: int) -> Tracker:
-        """Return a tracker for a new recording; random choices derive from `seed`."""
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
+        """Return a tracker for a new recording.
+
+        Parameters
+        ----------
+        seed
+            Of its random choices.
+        search
+            Range and effort of exhaustive searches for the pose; the default ones unless given.
+        """
         ...

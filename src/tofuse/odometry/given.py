@@ -19,6 +19,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align, registration_of
+from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
 
@@ -47,7 +48,7 @@ class GivenPoses(Bounded, Odometry):
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`. There is nothing random in it."""
         return _GivenTracker(self)
 
@@ -140,7 +141,7 @@ class StatedPoses(Odometry):
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`. There is nothing random in it."""
         return _StatedTracker(self)
 

@@ -19,6 +19,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import registration_of
+from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit, comparable
 
@@ -26,12 +27,11 @@ from tofuse.registration.verification import UsualFit, comparable
 class KeyframeTracker(Tracker):
     """See `Keyframes`."""
 
-    def __init__(self, options: Keyframes) -> None:
+    def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
         self._usual = UsualFit(options.unusual)
-        search = options.search if options.searches else None
-        self._relocalizer = Relocalizer(search, self._usual)
+        self._relocalizer = Relocalizer(search if options.searches else None, self._usual)
         self._motion = MotionModel()
         self._segmentation = MotionSegmentation(self._relocalizer)
         self._selector = HypothesisSelector(

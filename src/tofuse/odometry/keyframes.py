@@ -38,10 +38,8 @@ class Keyframes(Bounded, Odometry):
     unusual
         Number of standard deviations above its median at which a statistic of an alignment is
         unusual.
-    search
-        Extent and resolution of the search for a lost frame.
     searches
-        Whether lost frames are searched for while frames arrive.
+        Whether lost frames are relocalized by exhaustive search while frames arrive.
     guess
         Where an alignment starts: "previous" (constant velocity), "identity" (the last pose),
         "odometry" (the motion between the poses of an odometry file).
@@ -55,7 +53,6 @@ class Keyframes(Bounded, Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     unusual: Annotated[float, Bounds(0.5, 100)] = 3.0
-    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     searches: bool = True
     guess: Guess = "previous"
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
@@ -64,8 +61,8 @@ class Keyframes(Bounded, Odometry):
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`. There is nothing random in it."""
         from tofuse.odometry.keyframe_tracker import KeyframeTracker
 
-        return KeyframeTracker(self)
+        return KeyframeTracker(self, search or SearchOptions())

@@ -22,6 +22,7 @@ from tofuse.registration.base import PROBABLE, Link, Registration
 from tofuse.registration.confidence import CERTAIN
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.reduce import extent
+from tofuse.registration.search import SearchOptions
 
 # The prediction replaces the search once it has agreed with 2 of the last 3 searches.
 _MIN_CONFIRMED = 2
@@ -64,7 +65,7 @@ class Pairwise(Bounded, Odometry):
         """Kinds of view it works on: those of the registration."""
         return self.registration.takes
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`."""
         return _PairwiseTracker(self, seed)
 

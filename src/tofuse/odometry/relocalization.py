@@ -6,7 +6,7 @@ from tofuse.arrays import Float64
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.search import SearchOptions
+from tofuse.registration.search import SearchOptions, differ
 from tofuse.registration.verification import UsualFit, comparable
 from tofuse.registration.view_pair import register_pair
 
@@ -23,7 +23,7 @@ class Relocalizer:
     Parameters
     ----------
     search
-        Extent and resolution of the search; None never searches.
+        Range and effort of the search; None never searches.
     usual
         How views of this camera usually fit.
     """
@@ -87,7 +87,7 @@ class Relocalizer:
         registration = self._probable(view, keyframe)
         if registration is None or self._search is None:
             return None
-        return not self._search.differ(registration.T_target_source, T)
+        return not differ(registration.T_target_source, T)
 
     def _probable(self, view: PreparedView, keyframe: Keyframe) -> Registration | None:
         """Register a view to a keyframe, each pair once, if the budget allows."""

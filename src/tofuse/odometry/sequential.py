@@ -17,6 +17,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar
 from tofuse.registration.icp import algorithm_1
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.search import SearchOptions
 
 Guess = Literal["identity", "previous", "odometry"]
 
@@ -61,7 +62,7 @@ class Sequential(Bounded, Odometry):
         """Kinds of view it works on: those of the registration."""
         return self.registration.takes
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`."""
         return _SequentialTracker(self, seed)
 

@@ -67,7 +67,7 @@ class Assembly:
         if len(stretches) > 1:
             self.progress.stage("joining components")
         with self.watch.timing("joining"):
-            groups = self.config.joining.join(stretches, log.links)
+            groups = self.config.joining.join(stretches, log.links, self.config.search)
         stages.save("joining", (groups, dict(self.watch.seconds)))
         return groups
 

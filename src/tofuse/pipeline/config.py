@@ -22,6 +22,7 @@ from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.loops import LoopDetector
 from tofuse.posegraph.refinement import NoRefinement, Refining
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.search import SearchOptions
 from tofuse.results.output import read_run_json
 
 ViewKind = Literal["range", "cloud"]
@@ -54,6 +55,8 @@ class Config(Bounded):
         noise and loses accuracy without noisy pixels, which a clean model must leave out.
     outside
         External sensors whose measurements are used.
+    search
+        Exhaustive searches for the pose of a view: of lost frames, loops and components.
     joining
         Connects components that were tracked separately.
     self_calibration
@@ -77,6 +80,7 @@ class Config(Bounded):
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
     outside: tuple[ExternalSensor, ...] = ()
+    search: SearchOptions = SearchOptions()  # noqa: RUF009 - immutable
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True
     tolerance_m: Annotated[float | None, Bounds(0, exclusive=True)] = None

@@ -75,7 +75,7 @@ class Mapper:
 
     def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
-        self._tracker = self.config.odometry.start(self.seed)
+        self._tracker = self.config.odometry.start(self.seed, self.config.search)
         self._observations = Observations(self.config, self.seed, self._given)
         self._live_poses = LivePoses(self._observations.loops)
         self._component = 0
@@ -222,7 +222,7 @@ class Mapper:
         self._tracker.interrupt()
         if config is not None:
             self._preparation = Preparation(config, self._preparation.counts)
-            self._tracker = config.odometry.start(self.seed)
+            self._tracker = config.odometry.start(self.seed, config.search)
 
     @property
     def log(self) -> FrameLog:

@@ -46,7 +46,7 @@ class Observations:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
         self.views: ViewStore[PreparedView] = ViewStore(Spacing(), always=ends, scratch=scratch)
-        self.loops = config.loops.start(seed, given, self.views)
+        self.loops = config.loops.start(seed, given, self.views, config.search)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)

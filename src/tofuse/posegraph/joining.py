@@ -40,7 +40,7 @@ from tofuse.registration.likeness import (
 )
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import ProjectiveOptions, Target, align
-from tofuse.registration.search import SearchOptions
+from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD, SearchOptions, differ
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -163,8 +163,6 @@ class Joining:
 
     Attributes
     ----------
-    search
-        Range and resolution of the exhaustive search.
     searches, searches_per_frame
         Largest number of searches: a constant, plus one for each component, plus this for each
         frame.
@@ -180,7 +178,6 @@ class Joining:
         number ("first").
     """
 
-    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     searches: int = 12
     searches_per_frame: float = 0.02
     bridge: bool = True
@@ -200,7 +197,12 @@ class Joining:
         if self.main not in ("largest", "first"):
             raise ValueError(f"main is {self.main!r}, not largest or first")
 
-    def join(self, stretches: Sequence[Stretch], links: Sequence[Link]) -> list[Group]:
+    def join(
+        self,
+        stretches: Sequence[Stretch],
+        links: Sequence[Link],
+        search: SearchOptions | None = None,
+    ) -> list[Group]:
         """Join components as far as possible; the main group first, then by decreasing size.
 
         Parameters
@@ -209,11 +211,13 @@ class Joining:
             The components.
         links
             Between frames of different components, from relocalization during tracking.
+        search
+            Range and effort of exhaustive searches for a pose; the default ones unless given.
         """
         if len(stretches) == 1:
             only = stretches[0]
             return [Group({only.component: np.eye(4)}, (), len(only.frames))]
-        joiner = _Joiner(self, stretches)
+        joiner = _Joiner(self, stretches, search or SearchOptions())
         for link in sorted(
             links, key=lambda link: (not link.certain, -(link.registration.probability or 0.0))
         ):
@@ -236,8 +240,10 @@ class _Island:
 
 
 class _Joiner:
-    def __init__(self, options: Joining, stretches: Sequence[Stretch]) -> None:
-        self._options = options
+    def __init__(
+        self, options: Joining, stretches: Sequence[Stretch], search: SearchOptions
+    ) -> None:
+        self._options, self._search = options, search
         self._stretches = {s.component: s for s in stretches}
         self._component_of = {int(f): s.component for s in stretches for f in s.frames}
         self._views = {v.index: v for s in stretches for v in s.views}
@@ -451,9 +457,7 @@ class _Joiner:
 
     def _registered(self, first: View, second: View) -> Link | None:
         """Register two similar views; only an exhaustive search counts against the budget."""
-        found = register_pair(
-            second.view, first.view, usual=self._usual, options=self._options.search
-        )
+        found = register_pair(second.view, first.view, usual=self._usual, options=self._search)
         if found is None or found.margin is not None:
             self._searches -= 1
         return _link(first, second, found)
@@ -515,10 +519,10 @@ class _Joiner:
         drift = _DRIFT * (self._path(a, i).get(k, np.inf) + self._path(b, j).get(m, np.inf))
         at = self._T_island(b, j)
         between = se3.inverse(T @ at) @ other @ at
-        search, depth = self._options.search, self._depth_of(j)
+        depth = self._depth_of(j)
         return bool(
-            np.linalg.norm(between[:3, 3]) <= search.distinct_m + drift * depth
-            and se3.angle(between) <= search.distinct_rad + drift
+            np.linalg.norm(between[:3, 3]) <= DISTINCT_M + drift * depth
+            and se3.angle(between) <= DISTINCT_RAD + drift
         )
 
     def _ends(self, a: _Island, link: Link) -> tuple[int, int]:
@@ -732,7 +736,7 @@ class _Joiner:
             link = _link(first, second, made)
             if link is None or len(link.registration.unobservable):
                 continue
-            if not self._options.search.differ(link.T_i_j, T):
+            if not differ(link.T_i_j, T):
                 found.append(replace(link, certain=False))
         return found
 

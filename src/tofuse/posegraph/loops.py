@@ -16,6 +16,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.search import SearchOptions
 
 # Separates the random streams of loops from those of other stages that register the same pair.
 SEED_STAGE = 2
@@ -133,7 +134,13 @@ class LoopDetector(Protocol):
 
     part_kind: ClassVar[str] = "loops"
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
+    def start(
+        self,
+        seed: int,
+        given: Sequence[GivenLoop],
+        views: ViewStore[PreparedView],
+        search: SearchOptions | None = None,
+    ) -> Loops:
         """Begin a new recording.
 
         Parameters
@@ -144,6 +151,8 @@ class LoopDetector(Protocol):
             Loops given by the user.
         views
             Prepared views of frames with a pose; each is stored before its frame is pushed.
+        search
+            Range and effort of exhaustive searches for a pose; the default ones unless given.
         """
         ...
 

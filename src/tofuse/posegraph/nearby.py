@@ -22,6 +22,7 @@ from tofuse.posegraph.loops import (
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.search import SearchOptions
 
 
 @part("loops", "nearby", label="validated")
@@ -59,7 +60,13 @@ class Nearby(LoopDetector):
         if self.per_frame < 0:
             raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
+    def start(
+        self,
+        seed: int,
+        given: Sequence[GivenLoop],
+        views: ViewStore[PreparedView],
+        search: SearchOptions | None = None,
+    ) -> Loops:
         """See `LoopDetector.start`. What a person gives takes the place of what is found."""
         return _NearbyLoops(self, seed, given)
 

@@ -107,8 +107,6 @@ class Revisits(LoopDetector):
     searches
         Largest number of rejected candidates that are searched, those with the largest overlap,
         for each 200 views.
-    search
-        Range and resolution of the search.
     same_m, same_rad
         Largest difference of the poses of two consistent loops.
     appearance
@@ -123,7 +121,6 @@ class Revisits(LoopDetector):
     unusual: float = 3.0
     max_degenerate: int = 2
     searches: int = 6
-    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     same_m: float = 0.15
     same_rad: float = 0.1
     appearance: Appearance = Appearance()  # noqa: RUF009 - immutable
@@ -139,9 +136,15 @@ class Revisits(LoopDetector):
         if not 0.5 <= self.unusual <= 100:
             raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
+    def start(
+        self,
+        seed: int,
+        given: Sequence[GivenLoop],
+        views: ViewStore[PreparedView],
+        search: SearchOptions | None = None,
+    ) -> Loops:
         """See `LoopDetector.start`; draws nothing."""
-        return _RevisitLoops(self, given, views)
+        return _RevisitLoops(self, given, views, search or SearchOptions())
 
     def candidates(
         self, views: Sequence[Outlined], poses: Float64, *, first: int = 0
@@ -177,9 +180,13 @@ class _RevisitLoops(Loops):
     points: ClassVar[bool] = False
 
     def __init__(
-        self, options: Revisits, given: Sequence[GivenLoop], views: ViewStore[PreparedView]
+        self,
+        options: Revisits,
+        given: Sequence[GivenLoop],
+        views: ViewStore[PreparedView],
+        search: SearchOptions,
     ) -> None:
-        self._options = options
+        self._options, self._search = options, search
         self._store = views
         self._chosen: ViewStore[PreparedView] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
@@ -378,7 +385,7 @@ class _RevisitLoops(Loops):
             lambda k: (
                 *(posed[n].view for n in reversed(pairs[k])),
                 self._usual,
-                self._options.search,
+                self._search,
             ),
             large=True,
         )

@@ -49,22 +49,6 @@ class AgreementOptions:
     violation_weight: float = 2.0
     clash_weight: float = 1.0
 
-    def __post_init__(self) -> None:
-        if not 1e-6 <= self.albedo <= 1e6:
-            raise ValueError(f"albedo is {self.albedo}, not above 0")
-        if not 10 <= self.points <= 10_000_000:
-            raise ValueError(f"points is {self.points}, not 10 or more")
-        for name in (
-            "sigmas",
-            "floor_m",
-            "floor_share",
-            "max_angle",
-            "violation_weight",
-            "clash_weight",
-        ):
-            if not 0 <= getattr(self, name) <= 1e6:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
-
 
 @dataclass(frozen=True)
 class Agreement:

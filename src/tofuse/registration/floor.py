@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,35 +10,6 @@ from tofuse.arrays import Bool, Float32, Float64
 from tofuse.kernels import search as kernels
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints
-
-
-@dataclass(frozen=True)
-class FloorOptions:
-    """Options of floor detection.
-
-    Attributes
-    ----------
-    max_tilt
-        Largest angle between its normal and down, rad.
-    angle, band_m, band_share
-        Inlier tolerances: angle of the normals in rad, distance in m plus a fraction of the depth.
-    min_share
-        Minimum fraction of the view's points on it.
-    below
-        Largest fraction of the view's points below it.
-    """
-
-    max_tilt: float = 0.9
-    angle: float = 0.15
-    band_m: float = 0.02
-    band_share: float = 0.01
-    min_share: float = 0.04
-    below: float = 0.02
-
-    def __post_init__(self) -> None:
-        for name in ("max_tilt", "angle", "band_m", "band_share", "min_share", "below"):
-            if not 0 <= getattr(self, name) <= 100:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 100")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +23,22 @@ class Floor:
 
 # Number of sampled points, and of plane hypotheses.
 _POINTS, _TRIED = 1200, 200
+# Inlier tolerances: angle between the normals, rad, and distance from the plane, m plus a fraction
+# of the depth. They cover the systematic errors of ToF cameras, which exceed their noise.
+_ANGLE, _BAND_M, _BAND_FRACTION = 0.15, 0.02, 0.01
+# Minimum fraction of the view's points on the floor, and maximum fraction below it.
+_MIN_INLIERS, _MAX_BELOW = 0.04, 0.02
 # Bands below a plane from which on a point counts as below it.
 _BELOW = 3.0
-
-
 # Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
 _DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-_KNOWN_TILT = np.radians(10.0)
+# Maximum angle between the floor's normal and down, rad: for a camera that is held in any way, and
+# if gravity is known.
+_MAX_TILT, _KNOWN_TILT = 0.9, np.radians(10.0)
 
 
 def find_floors(
     views: tuple[PreparedView, PreparedView],
-    options: FloorOptions | None = None,
     gravity: tuple[Float64, Float64] | None = None,
 ) -> tuple[Floor, Floor] | None:
     """Find the floor in two views of one camera, on the same side of both images, or None.
@@ -76,42 +51,43 @@ def find_floors(
         (3,) direction of gravity in the frames of the two views, if known; the planes' normals
         must then be within 10 degrees of it.
     """
-    options = FloorOptions() if options is None else options
-    if gravity is not None:
-        options = replace(options, max_tilt=min(options.max_tilt, _KNOWN_TILT))
+    max_tilt = _MAX_TILT if gravity is None else _KNOWN_TILT
     for down in [gravity] if gravity is not None else [(d, d) for d in _DOWN]:
-        first = find_floor(views[0], down[0], options)
-        second = first and find_floor(views[1], down[1], options)
+        first = find_floor(views[0], down[0], max_tilt)
+        second = first and find_floor(views[1], down[1], max_tilt)
         if first is not None and second is not None:
             return first, second
     return None
 
 
-def find_floor(view: PreparedView, down: Float64, options: FloorOptions) -> Floor | None:
-    """Find the largest plane perpendicular to `down` (3,) without points below it, or None."""
+def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -> Floor | None:
+    """Find the largest plane perpendicular to `down` (3,) without points below it, or None.
+
+    Its normal is within `max_tilt`, rad, of `down`.
+    """
     seen = ViewPoints.of(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)
     if len(p) < 20:
         return None
     down = np.asarray(down, float) / np.linalg.norm(down)
-    least = np.cos(options.max_tilt)
+    least = np.cos(max_tilt)
     facing = np.flatnonzero(n @ down > least)
-    if len(facing) < options.min_share * len(p):
+    if len(facing) < _MIN_INLIERS * len(p):
         return None
     tried = facing[:: max(1, len(facing) // _TRIED)]
-    band = options.band_m + options.band_share * p[:, 2]
+    band = _BAND_M + _BAND_FRACTION * p[:, 2]
     # A table may be larger than the visible floor, but has points below it.
-    cosine, most = float(np.cos(options.angle)), options.below * len(p)
+    cosine, most = float(np.cos(_ANGLE)), _MAX_BELOW * len(p)
     best = kernels.lowest_plane(p, n, band, tried, cosine, most, _BELOW)
     normal, height = n[best], float(p[best] @ n[best])
     mine = _on(p, n, band, normal, height, cosine)
     for _ in range(3):  # least squares over the inliers
         normal, height = _fit(p[mine], seen.sigma[mine])
         mine = _on(p, n, band, normal, height, cosine)
-        if mine.sum() < max(20, options.min_share * len(p)):
+        if mine.sum() < max(20, _MIN_INLIERS * len(p)):
             return None
     below = np.count_nonzero(p @ normal > height + _BELOW * band)
-    if below > options.below * len(p) or normal @ down < least or height <= 0:
+    if below > _MAX_BELOW * len(p) or normal @ down < least or height <= 0:
         return None
     return Floor(normal, height, float(mine.mean()))
 

@@ -8,14 +8,15 @@ grid is yaw and two translations; else it has all six dimensions. The search is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import cv2
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_all, run_chunks
@@ -25,7 +26,7 @@ from tofuse.registration.agreement import (
     Comparison,
     nearest_depth,
 )
-from tofuse.registration.floor import Floor, FloorOptions, find_floors
+from tofuse.registration.floor import Floor, find_floors
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.rough import with_rough_planes
@@ -42,6 +43,17 @@ _PHOTOMETRIC = ProjectiveOptions(
 _POLISHED, _POLISH_POINTS = 10, 2500
 # Maximum score that a candidate may lose in photometric alignment.
 _GIVEN_UP = 0.05
+# Poses that differ by more, m or rad, are distinct hypotheses: beyond the error of a coarse
+# alignment (10 cm, 5 degrees).
+DISTINCT_M, DISTINCT_RAD = 0.1, 0.0873
+# Steps of the two grids: rad, and as a fraction of the depth. Projective ICP converges from
+# neighbouring poses of either; six dimensions allow only a coarser one.
+_PLANAR_ANGLE, _PLANAR_STEP = 0.07, 0.06
+_FULL_ANGLE, _FULL_STEP = 0.13, 0.1
+# Pixels of each image that score a pose of the grids, and that refine a candidate by ICP.
+_PLANAR_POINTS, _FULL_POINTS, _ICP_POINTS = 200, 150, 700
+# Minimum score of a planar result at which "auto" skips the full search.
+_CONVINCING = 0.4
 # Sigma of the albedo's low-pass filter for the coarse grid, in the plane z = 1, and difference in
 # log albedo at which a point counts neither for nor against a pose.
 _BLUR, _ALBEDO = 0.04, 0.12
@@ -64,97 +76,46 @@ _NARROWER = 0.85 ** np.arange(28)
 
 
 @dataclass(frozen=True)
-class SearchOptions:
-    """Range and resolution of the search.
-
-    Lengths are relative to the depth of the views (the mean of their medians), so that the search
-    is independent of the scene's scale.
+class SearchOptions(Bounded):
+    """Range and effort of the search.
 
     Attributes
     ----------
     mode
         "planar" (yaw, and translation along the floor), "full" (six dimensions), "both" (planar
         where both views see a floor, and full: slow, but the margin counts all rivals), or "auto"
-        (full only if there is no floor, or the planar result scores below `convincing`).
+        (full only if there is no floor, or the planar result scores low).
     yaw
-        Largest rotation about the vertical in the planar search, rad.
+        Maximum rotation about the vertical in the planar search, rad.
     turn, roll
-        Largest rotation in the full search, and largest one about the optical axis, rad.
+        Maximum rotation in the full search, and about the optical axis, rad.
     reach
-        Largest translation.
-    planar_yaw_step, planar_step
-        Steps of the planar grid, rad and relative to the depth.
-    full_angle_step, full_step
-        Steps of the full grid.
-    planar_points, full_points
-        Pixels of each image that score the poses of the grid.
+        Maximum translation, as a fraction of the depth of the views (the mean of their medians).
     planar_candidates, full_candidates
-        Number of the grid's poses that are refined by ICP.
-    settle_points
-        Pixels of each image used by ICP.
-    photo_candidates
+        Number of best poses of the planar and of the full grid that are refined by ICP.
+    photometric_candidates
         Number of best candidates with photometric alignment, where both views have albedo.
-    convincing
-        Minimum score at which "auto" skips the full search.
-    distinct_m, distinct_rad
-        Poses that differ by more are distinct hypotheses.
-    floor, agreement
-        Options of floor detection and of the comparison of the two images.
     """
 
-    mode: Mode = "auto"
-    yaw: float = 1.1
-    turn: float = 0.9
-    roll: float = 0.5
-    reach: float = 0.6
-    planar_yaw_step: float = 0.07
-    planar_step: float = 0.06
-    full_angle_step: float = 0.13
-    full_step: float = 0.1
-    planar_points: int = 200
-    full_points: int = 150
-    planar_candidates: int = 20
-    full_candidates: int = 60
-    settle_points: int = 700
-    photo_candidates: int = 30
-    convincing: float = 0.4
-    distinct_m: float = 0.1
-    distinct_rad: float = 0.0873
-    floor: FloorOptions = field(default_factory=FloorOptions)
-    agreement: AgreementOptions = field(default_factory=AgreementOptions)
+    mode: Mode = "both"
+    yaw: Annotated[float, Bounds(0, 3.1416)] = 1.1
+    turn: Annotated[float, Bounds(0, 3.1416)] = 0.9
+    roll: Annotated[float, Bounds(0, 3.1416)] = 0.5
+    reach: Annotated[float, Bounds(0, 10)] = 0.6
+    planar_candidates: Annotated[int, Bounds(1, 1_000_000)] = 20
+    full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 60
+    photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.mode not in get_args(Mode):
-            raise ValueError(f"mode is {self.mode!r}, not one of {', '.join(get_args(Mode))}")
-        for name in ("planar_yaw_step", "planar_step", "full_angle_step", "full_step"):
-            if not 0.005 <= getattr(self, name) <= 3.2:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0.005 to 3.2")
-        for name in ("yaw", "turn", "roll"):
-            if not 0 <= getattr(self, name) <= 3.1416:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 3.1416")
-        if not 0 <= self.reach <= 10:
-            raise ValueError(f"reach is {self.reach}, not 0 to 10")
-        for name in (
-            "planar_points",
-            "full_points",
-            "planar_candidates",
-            "full_candidates",
-            "settle_points",
-            "photo_candidates",
-        ):
-            if not 1 <= getattr(self, name) <= 1_000_000:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-        for name in ("convincing", "distinct_m", "distinct_rad"):
-            if not 0 <= getattr(self, name) <= 1e3:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, not {self.mode!r}")
 
-    def differ(self, a: Float64, b: Float64) -> bool:
-        """Whether two poses (4, 4) are distinct hypotheses."""
-        between = se3.inverse(a) @ b
-        return bool(
-            np.linalg.norm(between[:3, 3]) > self.distinct_m
-            or se3.angle(between) > self.distinct_rad
-        )
+
+def differ(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
+    """Whether two poses (4, 4) are distinct hypotheses."""
+    between = se3.inverse(a) @ b
+    return bool(np.linalg.norm(between[:3, 3]) > distinct_m or se3.angle(between) > DISTINCT_RAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,37 +227,50 @@ class Search:
         Views, with rough planes where there are no others.
     compared
         Comparison that evaluates poses.
+    distinct_m
+        Poses that differ by more are distinct candidates, m.
     """
 
     source: PreparedView
     target: PreparedView
     compared: Comparison
     options: SearchOptions
+    distinct_m: float
     s: _View
     t: _View
 
     @classmethod
     def of(
-        cls, source: PreparedView, target: PreparedView, options: SearchOptions | None = None
+        cls,
+        source: PreparedView,
+        target: PreparedView,
+        options: SearchOptions | None = None,
+        *,
+        agreement: AgreementOptions | None = None,
+        distinct_m: float = DISTINCT_M,
     ) -> Search | None:
-        """Prepare two views; None if one has too few planes."""
+        """Prepare two views; None if one has too few planes.
+
+        `agreement` evaluates poses; the tolerances are those of views some metres deep unless
+        given.
+        """
         options = SearchOptions() if options is None else options
         source, target = with_rough_planes(source), with_rough_planes(target)
         s, t = _prepare(source), _prepare(target)
         if min(len(s.points), len(t.points)) < _MIN_POINTS:
             return None
-        compared = Comparison.of(source, target, options.agreement)
-        return cls(source, target, compared, options, s, t)
+        compared = Comparison.of(source, target, agreement)
+        return cls(source, target, compared, options, distinct_m, s, t)
 
     def everywhere(self, gravity: tuple[Float64, Float64] | None = None) -> Match | None:
         """Search the whole grid; see `search`."""
         s, t, options = self.s, self.t, self.options
         found: list[Candidate] = []
         if options.mode != "full":
-            floors = find_floors((self.source, self.target), options.floor, gravity)
+            floors = find_floors((self.source, self.target), gravity)
             if floors is not None:
                 found = self._refined(_planar(s, t, floors[0], floors[1], options))
-            convinced = bool(found) and max(c.score for c in found) >= options.convincing
+            convinced = bool(found) and max(c.score for c in found) >= _CONVINCING
             if options.mode == "planar" or (options.mode == "auto" and convinced):
                 return Match(self._ordered(found), "planar") if found else None
         found += self._refined(_full(s, t, options))
@@ -310,17 +284,17 @@ class Search:
 
     def _refined(self, poses: Float64) -> list[Candidate]:
         """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
-        s, t, options = self.s, self.t, self.options
+        s, t, options = self.s, self.t, self.compared.options
         poses = poses.copy()
         floor = _noise_floor(s, t, options)
         depth = 0.5 * (s.depth + t.depth)
         reaches = np.maximum(0.25 * depth * _NARROWER, 3 * floor)
-        _refine(s, t, poses, reaches, options.settle_points, options)
+        _refine(s, t, poses, reaches, _ICP_POINTS, options.max_angle)
         judged = self._evaluated(poses)
         best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
         finer = np.stack([candidate.T_target_source for candidate in best])
         reaches = np.maximum(8 * floor * _NARROWER, 1.3 * floor)
-        _refine(s, t, finer, reaches, _POLISH_POINTS, options)
+        _refine(s, t, finer, reaches, _POLISH_POINTS, options.max_angle)
         return judged + self._evaluated(finer)
 
     def _evaluated(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:
@@ -329,11 +303,12 @@ class Search:
 
     def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
         """Rank candidates after photometric alignment of the best ones."""
-        source, target, options = self.source, self.target, self.options
-        distinct = _distinct(found, options)
+        source, target = self.source, self.target
+        distinct = _distinct(found, self.distinct_m)
         if not (source.has_albedo and target.has_albedo):
             return distinct
-        best, rest = distinct[: options.photo_candidates], distinct[options.photo_candidates :]
+        count = self.options.photometric_candidates
+        best, rest = distinct[:count], distinct[count:]
         targets = [Target(target, np.eye(4))]
         moved = run_all(
             [
@@ -348,7 +323,7 @@ class Search:
             new if new.score > old.score - _GIVEN_UP else old
             for old, new in zip(best, placed, strict=True)
         ]
-        return _distinct([*kept, *rest], options)
+        return _distinct([*kept, *rest], self.distinct_m)
 
 
 def _prepare(view: PreparedView) -> _View:
@@ -409,22 +384,22 @@ def _planar(s: _View, t: _View, floor_s: Floor, floor_t: Floor, options: SearchO
     """Return the best poses (N, 4, 4) of the planar grid."""
     depth = 0.5 * (s.depth + t.depth)
     to_s, to_t = _upright(floor_s.normal), _upright(floor_t.normal)
-    n = round(options.yaw / options.planar_yaw_step)
+    n = round(options.yaw / _PLANAR_ANGLE)
     yaws = np.zeros((2 * n + 1, 3))
-    yaws[:, 1] = np.linspace(-n, n, 2 * n + 1) * options.planar_yaw_step
+    yaws[:, 1] = np.linspace(-n, n, 2 * n + 1) * _PLANAR_ANGLE
     rotations = to_t.T @ se3.so3_exp(yaws) @ to_s
-    moves = _ball(options.planar_step * depth, options.reach * depth, (1.0, 0.0, 1.0))
+    moves = _ball(_PLANAR_STEP * depth, options.reach * depth, (1.0, 0.0, 1.0))
     moves[:, 1] = floor_t.height - floor_s.height
     less = [
         np.abs(v.points @ f.normal - f.height) < 0.02 + 0.02 * v.points[:, 2]
         for v, f in ((s, floor_s), (t, floor_t))
     ]
-    step = depth * max(options.planar_step, options.planar_yaw_step)
+    step = depth * max(_PLANAR_STEP, _PLANAR_ANGLE)
     return _best(
         _Scorer(s, t, less, step),
         rotations,
         moves @ to_t,
-        options.planar_points,
+        _PLANAR_POINTS,
         options.planar_candidates,
     )
 
@@ -433,19 +408,19 @@ def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
     """Return the best poses (N, 4, 4) of the grid of six dimensions."""
     depth = 0.5 * (s.depth + t.depth)
     flat = options.roll / options.turn if options.turn else 1.0
-    rotations = se3.so3_exp(_ball(options.full_angle_step, options.turn, (1.0, 1.0, flat)))
-    moves = _ball(options.full_step * depth, options.reach * depth, (1.0, 1.0, 1.0))
-    step = depth * max(options.full_step, options.full_angle_step)
+    rotations = se3.so3_exp(_ball(_FULL_ANGLE, options.turn, (1.0, 1.0, flat)))
+    moves = _ball(_FULL_STEP * depth, options.reach * depth, (1.0, 1.0, 1.0))
+    step = depth * max(_FULL_STEP, _FULL_ANGLE)
     scorer = _Scorer(s, t, [None, None], step)
-    turns, shifts = _promising(scorer, rotations, moves, options.full_step * depth, options)
-    few = max(1, options.full_points // _COARSE_SHARE)
+    turns, shifts = _promising(scorer, rotations, moves, _FULL_STEP * depth, options)
+    few = max(1, _FULL_POINTS // _COARSE_SHARE)
     scores = scorer(rotations[turns], moves[shifts][:, None], few)[:, 0]
     top = _highest(scores, _KEPT * options.full_candidates)
     return _thinned(
         scorer,
         rotations[turns[top]],
         moves[shifts[top]],
-        options.full_points,
+        _FULL_POINTS,
         options.full_candidates,
     )
 
@@ -459,7 +434,7 @@ def _promising(
     count = np.bincount(cell)
     middles = np.stack([np.bincount(cell, axis) for axis in moves.T], 1) / count[:, None]
     wider = replace(scorer, reach=_WIDER * scorer.reach)
-    few = max(1, options.full_points // _COARSE_SHARE)
+    few = max(1, _FULL_POINTS // _COARSE_SHARE)
     scores = wider(rotations, middles[None], few).ravel()
     best = _highest(scores, max(options.full_candidates, round(_PROMISING * len(scores))))
     turns, at = np.divmod(best, len(cells))
@@ -536,18 +511,17 @@ def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -
     return poses
 
 
-def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
+def _noise_floor(s: _View, t: _View, options: AgreementOptions) -> float:
     """Sensor error tolerance at the depth of the views, m."""
-    a = options.agreement
-    return a.floor_m + a.floor_share * 0.5 * (s.depth + t.depth)
+    return options.floor_m + options.floor_share * 0.5 * (s.depth + t.depth)
 
 
 def _refine(
-    s: _View, t: _View, poses: Float64, reaches: Float64, points: int, options: SearchOptions
+    s: _View, t: _View, poses: Float64, reaches: Float64, points: int, max_angle: float
 ) -> None:
-    """Refine poses (N, 4, 4) in place by two-way ICP."""
+    """Refine poses (N, 4, 4) in place by two-way ICP, with normals within `max_angle`, rad."""
     some = (*s.some(points)[:2], *t.some(points)[:2])
-    cosine = float(np.cos(options.agreement.max_angle))
+    cosine = float(np.cos(max_angle))
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
         lambda i, j: kernels.refine_poses(
@@ -558,16 +532,16 @@ def _refine(
     )
 
 
-def _distinct(found: Sequence[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
+def _distinct(found: Sequence[Candidate], distinct_m: float) -> tuple[Candidate, ...]:
     """Return the distinct candidates, the best first."""
     found = sorted(found, key=lambda candidate: -candidate.score)
     poses = np.array([candidate.T_target_source for candidate in found]).reshape(-1, 4, 4)
     # The trace of a rotation decreases with its angle.
-    least = 1 + 2 * np.cos(min(options.distinct_rad, np.pi))
+    least = 1 + 2 * np.cos(DISTINCT_RAD)
     kept: list[int] = []
     for k, T in enumerate(poses):
         better = poses[kept]
-        far = np.linalg.norm(better[:, :3, 3] - T[:3, 3], axis=1) > options.distinct_m
+        far = np.linalg.norm(better[:, :3, 3] - T[:3, 3], axis=1) > distinct_m
         turned = (better[:, :3, :3] * T[:3, :3]).sum((1, 2)) < least
         if (far | turned).all():
             kept.append(k)

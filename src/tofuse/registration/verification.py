@@ -174,9 +174,9 @@ def both_ways_agree(
     return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
 
 
-def self_scaled(usual: UsualFit, plain: AgreementOptions | None = None) -> AgreementOptions:
-    """Return options that tolerate the usual errors of this camera, based on `plain` ones."""
-    plain = plain or AgreementOptions()
+def self_scaled(usual: UsualFit) -> AgreementOptions:
+    """Return options that tolerate the usual errors of this camera."""
+    plain = AgreementOptions()
     return replace(
         plain,
         floor_share=max(plain.floor_share, _NO_CONFLICT * usual.rms_share),

@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.registration.agreement import Agreement, agreement
+from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import CERTAIN, CONTRADICTION, Evidence
 from tofuse.registration.prepared_view import PreparedView
@@ -26,7 +26,14 @@ from tofuse.registration.projective import (
     align,
     registration_of,
 )
-from tofuse.registration.search import Candidate, Match, Search, SearchOptions
+from tofuse.registration.search import (
+    DISTINCT_M,
+    Candidate,
+    Match,
+    Search,
+    SearchOptions,
+    differ,
+)
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 from tofuse.registration.verification import (
     COARSE,
@@ -100,7 +107,7 @@ def register_pair(
     usual
         Fit statistics of this camera, if known.
     options
-        Range and resolution of the search, at a depth of some metres.
+        Range and effort of the search.
     always_search
         Whether to search even if the pose aligned from the guess is practically certain.
     proposals
@@ -116,11 +123,13 @@ def register_pair(
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, options, uncertainty)
+    pair = _Pair.of(source, target, usual, uncertainty)
     near = pair.followed(np.eye(4) if guess is None else guess)
     if near is not None and near.is_certain and not always_search:
         return pair.registration(near, near.evidence, None)
-    prepared = Search.of(source, target, pair.options)
+    prepared = Search.of(
+        source, target, options, agreement=pair.compared, distinct_m=pair.distinct_m
+    )
     match = None if prepared is None else prepared.everywhere()
     if prepared is None or match is None:
         return None
@@ -144,19 +153,28 @@ def follow(
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, None, uncertainty)
+    pair = _Pair.of(source, target, usual, uncertainty)
     near = pair.followed(guess)
     return None if near is None else pair.registration(near, near.evidence, None)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two views and the options of their comparison."""
+    """Two views and the tolerances of their comparison.
+
+    Attributes
+    ----------
+    compared
+        Options of the agreement of the two images.
+    distinct_m
+        Poses that differ by more are distinct hypotheses, m.
+    """
 
     source: PreparedView
     target: PreparedView
     usual: UsualFit
-    options: SearchOptions
+    compared: AgreementOptions
+    distinct_m: float
     uncertainty: UncertaintyOptions | None
 
     @classmethod
@@ -165,19 +183,15 @@ class _Pair:
         source: PreparedView,
         target: PreparedView,
         usual: UsualFit | None,
-        options: SearchOptions | None,
         uncertainty: UncertaintyOptions | None,
     ) -> _Pair:
-        """Adapt the options to the depth of the views and the usual errors of the camera."""
+        """Adapt the tolerances to the depth of the views and the usual errors of the camera."""
         usual = usual or UsualFit()
-        # Both searches, so that the margin counts all rivals.
-        options = options or SearchOptions(mode="both")
         depth = 0.5 * (source.depth + target.depth)
-        compared = self_scaled(usual, options.agreement)
+        compared = self_scaled(usual)
         compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))
-        distinct = min(options.distinct_m, _DISTINCT * depth)
-        options = replace(options, distinct_m=distinct, agreement=compared)
-        return cls(source, target, usual, options, uncertainty)
+        distinct_m = min(DISTINCT_M, _DISTINCT * depth)
+        return cls(source, target, usual, compared, distinct_m, uncertainty)
 
     def followed(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
@@ -202,7 +216,7 @@ class _Pair:
         same = both_ways_agree(T, back.T_world_source, far_m, _BOTH_WAYS)
         if not same or not self.usual.assess(back).usual:
             return None
-        said = agreement(self.source, self.target, T, self.options.agreement)
+        said = agreement(self.source, self.target, T, self.compared)
         return _Pose(T, there, options, said) if said.score > 0 else None
 
     def chosen(
@@ -244,17 +258,17 @@ class _Pair:
         gap = se3.log(se3.inverse(near.T_target_source) @ best.T_target_source) / UNITS
         weak = near.aligned.unobservable
         across = se3.exp((gap - weak.T @ (weak @ gap)) * UNITS)
-        same = not self.options.differ(np.eye(4), across)
+        same = not differ(np.eye(4), across, self.distinct_m)
         return near if near.degenerate and best.degenerate and same else best
 
     def same(self, a: _Pose, b: _Pose) -> bool:
         """Whether two poses are the same hypothesis."""
-        return not self.options.differ(a.T_target_source, b.T_target_source)
+        return not differ(a.T_target_source, b.T_target_source, self.distinct_m)
 
     def rival(self, pose: _Pose, match: Match) -> Candidate | None:
         """Return the best candidate of a search that is distinct from `pose`."""
-        T, differ = pose.T_target_source, self.options.differ
-        others = (c for c in match.candidates if differ(T, c.T_target_source))
+        T, least = pose.T_target_source, self.distinct_m
+        others = (c for c in match.candidates if differ(T, c.T_target_source, least))
         return next(others, None)
 
     def registration(

@@ -22,11 +22,11 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
 from tofuse.posegraph.view_store import KeptView
-from tofuse.registration.agreement import Comparison
+from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.confidence import BELIEVED, Evidence
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.search import Search, SearchOptions
+from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, differ
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
 from tofuse.rigs.joint import JointOptions, View, refine_together
@@ -106,11 +106,9 @@ class _Placer:
             if any(v is not None for v in views)
         }
         typical = min(1.0, float(np.median(list(self._depth.values()))) if self._depth else 1.0)
-        self._options = replace(
-            _AROUND,
-            distinct_m=min(_AROUND.distinct_m, _DISTINCT * typical),
-            agreement=replace(_AROUND.agreement, floor_m=_AROUND.agreement.floor_m * typical),
-        )
+        self._distinct_m = min(DISTINCT_M, _DISTINCT * typical)
+        usual = AgreementOptions()
+        self._agreement = replace(usual, floor_m=usual.floor_m * typical)
         self._compared: dict[tuple[int, int], list[Comparison]] = {}
         self._proposals: dict[tuple[int, int], Float64] = {}
         self._kept = self._views_to_refine()
@@ -136,14 +134,14 @@ class _Placer:
             if first is not None and second is not None and comparable(first.depth, second.depth)
         ]
         self._compared[a, b] = [
-            Comparison.of(s, t, self._options.agreement) for t, s in _evenly(both, _SCORED)
+            Comparison.of(s, t, self._agreement) for t, s in _evenly(both, _SCORED)
         ]
         found = [self._found(t, s) for t, s in _evenly(both, _SEARCHED)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *found])
         scores = np.array([self._at(a, b, T).score for T in poses])
         kept: list[Float64] = []
         for k in np.argsort(-scores, kind="stable"):
-            if scores[k] > 0 and all(self._options.differ(poses[k], other) for other in kept):
+            if scores[k] > 0 and self._is_distinct(poses[k], kept):
                 kept.append(poses[k])
         self._proposals[a, b] = np.array(kept[:_PROPOSALS]).reshape(-1, 4, 4)
 
@@ -151,8 +149,10 @@ class _Placer:
         """Return the poses T_target_source (N, 4, 4) that a pair of views proposes."""
         near = register_pair(source, target)
         poses = [] if near is None else [near.T_target_source]
-        for options in (self._options, _SIDE_BY_SIDE):
-            search = Search.of(source, target, options)
+        around = Search.of(
+            source, target, _AROUND, agreement=self._agreement, distinct_m=self._distinct_m
+        )
+        for search in (around, Search.of(source, target, _SIDE_BY_SIDE)):
             match = None if search is None else search.everywhere()
             if match is not None:
                 poses += [candidate.T_target_source for candidate in match.candidates]
@@ -213,7 +213,11 @@ class _Placer:
         return kept
 
     def _differ(self, a: Mapping[int, Float64], b: Mapping[int, Float64]) -> bool:
-        return a.keys() != b.keys() or any(self._options.differ(a[c], b[c]) for c in a)
+        return a.keys() != b.keys() or any(differ(a[c], b[c], self._distinct_m) for c in a)
+
+    def _is_distinct(self, T: Float64, others: Sequence[Float64]) -> bool:
+        """Whether a pose (4, 4) differs from all others."""
+        return all(differ(T, other, self._distinct_m) for other in others)
 
     def _refined(self, one: _Set) -> _Set:
         """Refine all cameras of a set jointly, if that improves its score."""
@@ -271,11 +275,11 @@ class _Placer:
         for gain, T in sorted(found, key=lambda pair: -pair[0]):
             if len(scores) > _RIVALS or gain <= 0:
                 break
-            if not all(self._options.differ(T, other) for other in apart):
+            if not self._is_distinct(T, apart):
                 continue
             apart.append(T)
             moved = self._aligned({**poses, camera: T})
-            if self._options.differ(at, moved[camera]):
+            if differ(at, moved[camera], self._distinct_m):
                 scores.append(gain)
         return scores
 

@@ -20,6 +20,7 @@ from tofuse.registration.base import Registration
 from tofuse.registration.interfaces import Alignment, Matches, Points
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.search import SearchOptions
 
 # Relative to the range: voxel size of the map, initial sigma of the threshold and the smallest
 # motion that updates it (the paper: 1 m, 2 m and 0.1 m of 100 m).
@@ -99,7 +100,7 @@ class Kiss(Odometry):
         if self.minimum_points < 3:
             raise ValueError(f"minimum_points is {self.minimum_points}, not 3 or more")
 
-    def start(self, seed: int) -> Tracker:
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`; deterministic."""
         return _KissTracker(self)
 
