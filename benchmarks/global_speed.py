@@ -80,7 +80,7 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     store: ViewStore[PreparedView] = ViewStore(closer.spacing)
     loops = closer.start(0, (), store)
     poses = result.diagnostics.sequential
-    options = Keyframes().surface
+    options = Keyframes().views.surface
     for k, frame in enumerate(there_and_back(frames, len(frames))):
         if result.has_pose[k]:
             surface = prepare_view(frame, options).subsampled(200)
@@ -143,7 +143,7 @@ def main(arguments: list[str] | None = None) -> int:
             f"{'pairs':>6} {'refinement':>13} {'ms a pair':>10} {'all':>13}"
         )
         mapped(frames, 30)
-        ends = [prepare_view(frames[k], Keyframes().surface) for k in (0, -1)]
+        ends = [prepare_view(frames[k], Keyframes().views.surface) for k in (0, -1)]
         search(ends[0], ends[1], SearchOptions())
         for count in options.frames:
             result, watch = mapped(frames, count)

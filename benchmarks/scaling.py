@@ -124,7 +124,7 @@ def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
 def tracker(columns: int) -> Any:
     """Return the default tracker, working on so many columns."""
     options = Keyframes()
-    return replace(options, surface=replace(options.surface, columns=columns)).start(0)
+    return replace(options, views=replace(options.views, columns=columns)).start(0)
 
 
 def forth_and_back(frames: Sequence[RangeFrame], count: int) -> Iterator[RangeFrame]:
@@ -147,7 +147,7 @@ def timed(tracker: Any, frames: Iterator[RangeFrame]) -> tuple[Float64, int]:
 
 def over_resolution(frames: Sequence[RangeFrame], columns: Sequence[int]) -> Iterator[str]:
     yield f"{'columns':>8}{'rows':>6}{'worked on':>11}{'ms: median':>12}{'95 %':>8}{'posed':>7}"
-    default = Keyframes().surface.columns
+    default = Keyframes().views.columns
     for wanted in columns:
         images = reduced(frames, wanted)
         width, height = images[0].camera.width, images[0].camera.height
@@ -162,7 +162,7 @@ def over_resolution(frames: Sequence[RangeFrame], columns: Sequence[int]) -> Ite
 
 
 def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
-    columns = Keyframes().surface.columns
+    columns = Keyframes().views.columns
     at_work = tracker(columns)
     source = forth_and_back(frames, max(counts))
     yield f"{'frames':>8}{'ms: median':>12}{'95 %':>8}{'posed':>7}{'memory, MB':>12}"
@@ -312,7 +312,7 @@ def bandwidth(count: int) -> float:
 def over_kernels(frames: Sequence[RangeFrame]) -> Iterator[str]:
     speed = bandwidth(1)
     yield f"copying moves {speed / 1e9:.1f} GB/s on one thread, {bandwidth(2) / 1e9:.1f} on two"
-    columns = Keyframes().surface.columns
+    columns = Keyframes().views.columns
     with using_threads(1):
         timed(tracker(columns), iter(frames[:3]))
         at_work = tracker(columns)

@@ -61,7 +61,7 @@ class Tofuse:
 
     def resolution(self, frame: RangeFrame) -> str:
         columns = frame.camera.width
-        while columns > keyframes().surface.columns:
+        while columns > keyframes().views.columns:
             columns //= 2
         return f"{columns} columns of {peers.grid(frame)}"
 
@@ -79,8 +79,8 @@ def keyframes() -> Keyframes:
 class TofuseSession:
     def __init__(self, photometric: bool) -> None:
         options = keyframes()
-        alignment = replace(options.alignment, photometric=photometric)
-        self._tracker = replace(options, alignment=alignment).start(0)
+        views = replace(options.views, photometric=photometric)
+        self._tracker = replace(options, views=views).start(0)
         self.statuses: list[str] = []
         self.unheld: list[int] = []
         self.reasons: list[str] = []

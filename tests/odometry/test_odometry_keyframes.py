@@ -179,9 +179,7 @@ def test_the_last_motion_goes_on(room, monkeypatch):
         return align(view, targets, predicted, options, start=start, **more)
 
     monkeypatch.setattr(hypotheses, "align", watched)
-    coarse = replace(Keyframes().alignment, levels=Keyframes().alignment.levels[:1])
-    frames = in_order(room.frames[:4])
-    T = [step.T_component_camera for step in run(frames, Keyframes(alignment=coarse))]
+    T = [step.T_component_camera for step in run(in_order(room.frames[:4]))]
     start, predicted = next(poses for index, *poses in asked if index == 3)
     np.testing.assert_allclose(start, T[2] @ se3.inverse(T[1]) @ T[2], atol=1e-9)
     motions = [se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(T[:3])]
@@ -412,20 +410,10 @@ def test_clouds_are_refused():
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("surface.columns", -1),
-        ("surface.columns", "wide"),
-        ("surface.radii", []),
-        ("surface.radii", [2, 1000000]),
-        ("surface.fill", float("nan")),
-        ("alignment.levels", []),
-        (
-            "alignment.levels",
-            [{"stride": 0, "iterations": 1, "inflation_m": 0, "photometric_inflation": 0}],
-        ),
-        ("alignment.robust", 0),
-        ("alignment.prior_m", -1),
-        ("unusual", 0),
-        ("unusual", float("nan")),
+        ("views.columns", -1),
+        ("views.columns", "wide"),
+        ("views.falloff", float("nan")),
+        ("views.photometric", 2),
         ("searches", "often"),
         ("minimum_points", -5),
         ("keyframe_angle", float("nan")),

@@ -10,18 +10,21 @@ import pytest
 from made_rooms import CAMERA, at, seen
 from tofuse.geometry import se3
 from tofuse.odometry.keyframes import Keyframes
-from tofuse.registration.prepared_view import SurfaceOptions
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
-OPTIONS = Keyframes(surface=SurfaceOptions(radii=(2,)))
+SHARP = SurfaceOptions(radii=(2,))
 # A camera that walks along and turns slowly.
 WALK = [at(-0.4 + 0.03 * k, 0.0, 0.015 * k) for k in range(24)]
 FIRST = 10  # frame with something before the camera
 
 
-def run(frames, odometry=None, options=OPTIONS):
-    tracker = options.start(0)
+def run(frames, odometry=None, options=None):
+    tracker = (options or Keyframes()).start(0)
     given = odometry or [None] * len(frames)
-    return [tracker.push(frame, T) for frame, T in zip(frames, given, strict=True)]
+    return [
+        tracker.push(frame, T, prepare_view(frame, SHARP))
+        for frame, T in zip(frames, given, strict=True)
+    ]
 
 
 def with_plate(frame, left, right, z=0.7):
@@ -87,7 +90,7 @@ def test_a_quick_turn_that_odometry_has_seen_needs_no_search() -> None:
     path = [T @ se3.exp([0, 0, 0, *rng.normal(0, 0.01, 3)]) for T in WALK[:12]]
     path += [at(-0.07 + 0.03 * k, 0.0, 0.615 + 0.015 * k) for k in range(6)]
     frames = [seen(T, k) for k, T in enumerate(path)]
-    never = replace(OPTIONS, searches=False)
+    never = Keyframes(searches=False)
     assert max(step.component for step in run(frames, options=never)) > 0
     steps = run(frames, path, never)
     assert [step.component for step in steps] == [0] * len(path)

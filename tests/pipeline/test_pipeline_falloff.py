@@ -60,11 +60,11 @@ def test_it_is_found_whatever_it_is(frames, exponent):
 
 def test_it_becomes_part_of_the_configuration_once(frames):
     config = adapted(from_method("default"), recording(frames, 5.0), threads=1)
-    assert config.odometry.surface.falloff == pytest.approx(5.0, abs=0.6)
+    assert config.odometry.views.falloff == pytest.approx(5.0, abs=0.6)
     # What is given is taken.
-    surface = replace(config.odometry.surface, falloff=1.0)
-    given = replace(config, odometry=replace(config.odometry, surface=surface))
-    assert adapted(given, recording(frames, 5.0), threads=1).odometry.surface.falloff == 1.0
+    views = replace(config.odometry.views, falloff=1.0)
+    given = replace(config, odometry=replace(config.odometry, views=views))
+    assert adapted(given, recording(frames, 5.0), threads=1).odometry.views.falloff == 1.0
 
 
 def test_a_recording_without_amplitude_or_motion_shows_none(frames):
@@ -73,7 +73,7 @@ def test_a_recording_without_amplitude_or_motion_shows_none(frames):
     dark = [replace(frame, amplitude_image=None) for frame in frames]
     source = ArraySource(tuple(dark))
     config = adapted(from_method("default"), Recording.of(source, "made", "arrays"), threads=1)
-    assert config.odometry.surface.falloff == 0.0
+    assert config.odometry.views.falloff == 0.0
 
 
 @pytest.mark.parametrize("exponent", [0.0, 4.0])

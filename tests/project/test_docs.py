@@ -28,6 +28,9 @@ from tofuse.geometry import se3
 from tofuse.pipeline.config import ROOMS, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
+from tofuse.registration.prepared_view import SurfaceOptions
+from tofuse.registration.projective import ProjectiveOptions
+from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.results.output import run_json
 from tofuse.results.pair import FILES as PAIR_FILES
 from tofuse.results.pair import pair_json
@@ -370,10 +373,9 @@ def test_stated_defaults_are_those_of_the_parts() -> None:
 
 
 def test_stated_defaults_are_those_of_keyframes() -> None:
-    tracker = registered_parts()["odometry"]["keyframes"]()
     numbers: dict[str, float] = {}
-    for field in ("uncertainty", "search", "alignment", "surface"):
-        numbers |= numbers_of(getattr(tracker, field))
+    for constants in (UncertaintyOptions, ProjectiveOptions, SurfaceOptions):
+        numbers |= numbers_of(constants)
     stated = dict(stated_defaults(sections("docs/methods.md")["How `keyframes` works"]))
     checked = numbers.keys() & stated.keys()
     assert {option: stated[option] for option in checked} == pytest.approx(
@@ -383,7 +385,7 @@ def test_stated_defaults_are_those_of_keyframes() -> None:
 
 
 def test_constants_of_the_covariance_are_those_of_the_tracker() -> None:
-    numbers = numbers_of(registered_parts()["odometry"]["keyframes"]().uncertainty)
+    numbers = numbers_of(UncertaintyOptions)
     table = [row for row in rows(text_of("docs/uncertainty.md")) if codes(row[0]) & set(numbers)]
     stated = {option: float(row[1]) for row in table for option in codes(row[0])}
     assert stated == pytest.approx({option: numbers[option] for option in stated})

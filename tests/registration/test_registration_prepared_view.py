@@ -222,28 +222,6 @@ def test_threads_change_nothing():
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"columns": -1},
-        {"columns": 0},
-        {"radii": ()},
-        {"radii": (5, 2)},
-        {"radii": (0,)},
-        {"radii": (2, 10**9)},
-        {"edge_margin": -1},
-        {"albedo_radius": -1},
-        {"edge_jump": float("nan")},
-        {"fill": 0.0},
-        {"offset": -1.0},
-        {"misfit": float("inf")},
-    ],
-)
-def test_options_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SurfaceOptions(**wrong)
-
-
 @pytest.mark.parametrize("columns", [320, 50])
 def test_stated_noise_of_the_range_is_that_of_z_at_any_resolution(columns):
     """Whatever the view shows: it has no noise at all."""

@@ -13,7 +13,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
-from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align, points_of
+from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, points_of
 from tofuse.sensor.models import camera_model
 
 OPTIONS = ProjectiveOptions()
@@ -234,41 +234,3 @@ def test_points_lie_on_the_fitted_surface(room):
     assert len(some) == pytest.approx(len(every) / 16, rel=0.1)
     z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
     np.testing.assert_allclose(every[:, 2], z, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"levels": ()},
-        {"robust": 0.0},
-        {"robust": float("nan")},
-        {"max_angle": -0.1},
-        {"prior_m": 0.0},
-        {"prior_rad": -1.0},
-        {"held": 0.0},
-        {"common_tilt": -1.0},
-        {"common_slope": float("inf")},
-        {"max_sigma_m": 0.0},
-        {"tolerance": -1.0},
-        {"convergence": float("nan")},
-    ],
-)
-def test_options_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        ProjectiveOptions(**wrong)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"stride": 0},
-        {"iterations": 0},
-        {"iterations": 10**9},
-        {"inflation_m": -1.0},
-        {"photometric_inflation": float("nan")},
-    ],
-)
-def test_levels_that_make_no_sense_are_refused(wrong):
-    good = {"stride": 2, "iterations": 4, "inflation_m": 0.0, "photometric_inflation": 0.0}
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Level(**(good | wrong))

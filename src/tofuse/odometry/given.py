@@ -14,13 +14,14 @@ from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.motion_segmentation import MIN_MOVING_FRACTION
 from tofuse.odometry.moving_objects import MovingObjects, at_size
+from tofuse.odometry.view_options import ViewOptions
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
-from tofuse.registration.projective import ProjectiveOptions, Target, align, registration_of
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.projective import Target, align, registration_of
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.uncertainty import UncertaintyOptions, covariance
+from tofuse.registration.uncertainty import covariance
 
 
 @part("odometry", "given")
@@ -34,15 +35,13 @@ class GivenPoses(Bounded, Odometry):
 
     Attributes
     ----------
-    surface, alignment, uncertainty
-        As in `Keyframes`.
+    views
+        How images are prepared and aligned.
     keyframe_angle, keyframe_distance
         Motion after which a frame becomes a keyframe: rad, and as a fraction of the median depth.
     """
 
-    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
-    alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
-    uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
+    views: ViewOptions = ViewOptions()  # noqa: RUF009 - immutable
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
     keyframe_distance: Annotated[float, Bounds(0, exclusive=True)] = 0.1
 
@@ -62,7 +61,11 @@ class _GivenTracker(Tracker):
 
     def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
-        return prepare_view(frame, self._options.surface) if isinstance(frame, RangeFrame) else None
+        return (
+            prepare_view(frame, self._options.views.surface)
+            if isinstance(frame, RangeFrame)
+            else None
+        )
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
@@ -72,7 +75,7 @@ class _GivenTracker(Tracker):
             raise InputError("is a cloud; poses are given for images", where=f"frame {frame.index}")
         if T_odometry is None:
             return Step("lost", "no pose was given", None)
-        view = prepare_view(frame, self._options.surface) if surface is None else surface
+        view = prepare_view(frame, self._options.views.surface) if surface is None else surface
         if self._T_component_world is None:
             self._T_component_world = se3.inverse(T_odometry)
         T = self._T_component_world @ T_odometry
@@ -97,9 +100,9 @@ class _GivenTracker(Tracker):
     def _registration(
         self, view: PreparedView, keyframe: Keyframe, target: Target, T: Float64
     ) -> Registration:
-        options = self._options
-        aligned = align(view, [target], T, options.alignment)
-        C = covariance(view, [target], aligned, options.alignment, options.uncertainty)
+        alignment = self._options.views.alignment
+        aligned = align(view, [target], T, alignment)
+        C = covariance(view, [target], aligned, alignment)
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ aligned.T_world_source
         return registration_of(aligned, T_keyframe_camera, C)
 
@@ -158,7 +161,7 @@ class _StatedTracker(Tracker):
         """See `Tracker.prepare`."""
         if self._stated(frame).T_component_camera is None or not isinstance(frame, RangeFrame):
             return None
-        return prepare_view(frame, self._odometry.options.surface)
+        return prepare_view(frame, self._odometry.options.views.surface)
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None

@@ -30,7 +30,7 @@ class KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
-        self._usual = UsualFit(options.unusual)
+        self._usual = UsualFit()
         self._relocalizer = Relocalizer(search if options.searches else None, self._usual)
         self._motion = MotionModel()
         self._segmentation = MotionSegmentation(self._relocalizer)
@@ -46,7 +46,7 @@ class KeyframeTracker(Tracker):
         """See `Tracker.prepare`."""
         if not isinstance(frame, RangeFrame) or self._problem_of(frame):
             return None
-        return prepare_view(frame, self._options.surface)
+        return prepare_view(frame, self._options.views.surface)
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
@@ -58,7 +58,7 @@ class KeyframeTracker(Tracker):
         problem = self._problem_of(frame) if surface is None else ""
         if problem:
             return self._lose(problem)
-        view = prepare_view(frame, self._options.surface) if surface is None else surface
+        view = prepare_view(frame, self._options.views.surface) if surface is None else surface
         if np.count_nonzero(view.planes[..., 3] > 0) < self._options.minimum_points:
             return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
@@ -136,7 +136,7 @@ class KeyframeTracker(Tracker):
             T_predicted,
             T_smoothed,
             T_last,
-            self._options.alignment,
+            self._options.views.alignment,
             self._usual,
         )
 
@@ -208,9 +208,8 @@ class KeyframeTracker(Tracker):
         return links
 
     def _registration(self, accepted: Hypothesis) -> Registration:
-        a, options = accepted.aligned, self._options
-        targets = [accepted.reference.target]
-        C = covariance(accepted.view, targets, a, options.alignment, options.uncertainty)
+        a, targets = accepted.aligned, [accepted.reference.target]
+        C = covariance(accepted.view, targets, a, self._options.views.alignment)
         # Odds that are twice as high as usual double the standard deviation.
         C = C * np.exp(2 * min(accepted.assessment.excess, 5.0))
         return registration_of(a, accepted.T_keyframe_camera, C)

@@ -7,11 +7,9 @@ from typing import Annotated, ClassVar, Literal
 
 from tofuse.bounds import Bounded, Bounds
 from tofuse.odometry.base import Odometry, Tracker
+from tofuse.odometry.view_options import ViewOptions
 from tofuse.parts import part
-from tofuse.registration.prepared_view import SurfaceOptions
-from tofuse.registration.projective import ProjectiveOptions
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.uncertainty import UncertaintyOptions
 
 Guess = Literal["identity", "previous", "odometry"]
 
@@ -29,15 +27,8 @@ class Keyframes(Bounded, Odometry):
 
     Attributes
     ----------
-    surface
-        How views are prepared.
-    alignment
-        How they are aligned.
-    uncertainty
-        How the covariance of an alignment is estimated.
-    unusual
-        Number of standard deviations above its median at which a statistic of an alignment is
-        unusual.
+    views
+        How images are prepared and aligned.
     searches
         Whether lost frames are relocalized by exhaustive search while frames arrive.
     guess
@@ -49,10 +40,7 @@ class Keyframes(Bounded, Odometry):
         Valid points that a frame must have.
     """
 
-    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
-    alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
-    uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
-    unusual: Annotated[float, Bounds(0.5, 100)] = 3.0
+    views: ViewOptions = ViewOptions()  # noqa: RUF009 - immutable
     searches: bool = True
     guess: Guess = "previous"
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2

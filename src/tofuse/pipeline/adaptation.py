@@ -75,12 +75,12 @@ def adapted(
             config = replace(config, filters=filters, model_filters=model_filters)
             config = _learned(config, recording)
         odometry = config.odometry
-        if isinstance(odometry, Keyframes | GivenPoses) and odometry.surface.falloff is None:
+        if isinstance(odometry, Keyframes | GivenPoses) and odometry.views.falloff is None:
             falloff = 0.0
             if _has_amplitude(recording):
-                falloff = estimate_falloff(recording, _preparation(config), odometry.surface)
-            surface = replace(odometry.surface, falloff=falloff)
-            config = replace(config, odometry=replace(odometry, surface=surface))
+                falloff = estimate_falloff(recording, _preparation(config), odometry.views.surface)
+            views = replace(odometry.views, falloff=falloff)
+            config = replace(config, odometry=replace(odometry, views=views))
     return config
 
 

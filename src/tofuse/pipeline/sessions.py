@@ -195,13 +195,7 @@ def _config(
     given = GivenPoses()
     if isinstance(config.odometry, Keyframes | GivenPoses):
         odometry = config.odometry
-        given = GivenPoses(
-            odometry.surface,
-            odometry.alignment,
-            odometry.uncertainty,
-            odometry.keyframe_angle,
-            odometry.keyframe_distance,
-        )
+        given = GivenPoses(odometry.views, odometry.keyframe_angle, odometry.keyframe_distance)
     config = replace(config, odometry=given)
     return adapted(config, recording, threads, progress)
 

@@ -51,7 +51,7 @@ _POINTS = 600
 _NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
 # Nearly without a prior.
 _WEAK_PRIOR = ProjectiveOptions(
-    levels=_NEAR, prior_m=3.0, prior_rad=3.0, held=1e6, common_tilt=0.0, common_slope=0.0
+    levels=_NEAR, prior_m=3.0, prior_rad=3.0, constrained=1e6, common_tilt=0.0, common_slope=0.0
 )
 _REJECTED = "does not fit as views of this camera usually do, or not the same from both ends"
 _TOO_FAR = "looks alike, but the trajectory can't have drifted that far"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -49,29 +48,6 @@ _MAX_PLANE_SIGMAS = 3.0
 _MEDIAN_OF_NORMAL = 0.6745
 
 
-class _Windows(Protocol):
-    """Options of the windows of plane fits."""
-
-    @property
-    def radii(self) -> tuple[int, ...]: ...
-    @property
-    def edge_margin(self) -> int: ...
-    @property
-    def fill(self) -> float: ...
-
-
-def _check_windows(options: _Windows) -> None:
-    radii = options.radii
-    if not radii or list(radii) != sorted(set(radii)):
-        raise ValueError(f"radii is {radii}; give ascending half widths")
-    if not 1 <= radii[0] <= radii[-1] <= 50:
-        raise ValueError(f"radii is {radii}, not 1 to 50 pixels")
-    if not 0 <= options.edge_margin <= 20:
-        raise ValueError(f"edge_margin is {options.edge_margin}, not 0 to 20 pixels")
-    if not 0 < options.fill <= 1:
-        raise ValueError(f"fill is {options.fill}, not above 0 and up to 1")
-
-
 @dataclass(frozen=True)
 class Smoothed:
     """Preparation of views that the camera has smoothed, at a finer scale.
@@ -91,11 +67,6 @@ class Smoothed:
     radii: tuple[int, ...] = (1, 2)
     edge_margin: int = 0
     fill: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.noise <= 1:
-            raise ValueError(f"noise is {self.noise}, not 0 to 1")
-        _check_windows(self)
 
 
 @dataclass(frozen=True)
@@ -142,24 +113,6 @@ class SurfaceOptions:
     albedo_radius: int = 1
     falloff: float | None = None
     smoothed: Smoothed = Smoothed()
-
-    def __post_init__(self) -> None:
-        if not 16 <= self.columns <= 4096:
-            raise ValueError(f"columns is {self.columns}, not 16 to 4096")
-        _check_windows(self)
-        if not 0 <= self.albedo_radius <= 20:
-            raise ValueError(f"albedo_radius is {self.albedo_radius}, not 0 to 20 pixels")
-        for name in ("edge_jump", "offset"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
-        if self.falloff is not None and not -20 <= self.falloff <= 20:
-            raise ValueError(f"falloff is {self.falloff}, not -20 to 20")
-        if not 0 <= self.edge_sigmas < 1e3:
-            raise ValueError(f"edge_sigmas is {self.edge_sigmas}, not 0 or more")
-        if not 0 <= self.flatness <= 1:
-            raise ValueError(f"flatness is {self.flatness}, not 0 to 1")
-        if not 0 < self.misfit < 1e6:
-            raise ValueError(f"misfit is {self.misfit}, not above 0")
 
     def for_noise(self, noise: float) -> SurfaceOptions:
         """Return the options for a view with this noise between neighbours, relative to depth."""

@@ -78,16 +78,6 @@ class UncertaintyOptions:
     loosest: float = 1.8
     steepness: float = 0.3
 
-    def __post_init__(self) -> None:
-        if len(self.tiles) != 2 or not all(2 <= n <= 64 for n in self.tiles):
-            raise ValueError(f"tiles is {self.tiles}; give two numbers from 2 to 64")
-        for name in ("noise_pixels", "photo_noise_pixels", "reach", "loosest"):
-            if not 0 < getattr(self, name) < 1e3:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("hidden", "offset", "floor", "steepness"):
-            if not 0 <= getattr(self, name) < 1e3:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
-
 
 @dataclass(frozen=True, eq=False)
 class Patches:

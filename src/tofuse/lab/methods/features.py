@@ -53,8 +53,6 @@ class Features(Registrar):
     verify
         Whether the image agreement (`agreement`) counts as much as the matches in the choice among
         several motions; contradicted ones are rejected.
-    surface
-        Preparation of the depth and its noise.
     consensus
         Options of the sample consensus.
     """
@@ -66,7 +64,6 @@ class Features(Registrar):
     mutual: bool = True
     blur_px: float = 0.7
     verify: bool = True
-    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
     consensus: ConsensusOptions = ConsensusOptions()  # noqa: RUF009 - immutable
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
@@ -111,7 +108,7 @@ class Features(Registrar):
     def _found(self, view: Frame) -> tuple[Keypoints, PreparedView]:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is no image", where=f"frame {view.index}")
-        surface = prepare_view(view, self.surface)
+        surface = prepare_view(view, SurfaceOptions())
         points = keypoints(
             view,
             surface,

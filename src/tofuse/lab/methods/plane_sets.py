@@ -48,8 +48,6 @@ class PlaneSets(Registrar):
         Inlier distance of a plane: standard deviations, plus a fraction of the depth.
     angle, offset
         Tolerances of matching planes: rad, and a fraction of the views' depth.
-    surface
-        Preparation of the depth and its noise.
     """
 
     planes: int = 8
@@ -58,7 +56,6 @@ class PlaneSets(Registrar):
     thickness: float = 0.005
     angle: float = 0.1
     offset: float = 0.03
-    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def __post_init__(self) -> None:
@@ -103,7 +100,7 @@ class PlaneSets(Registrar):
     def _prepared(self, view: Frame) -> PreparedView:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is no image", where=f"frame {view.index}")
-        return prepare_view(view, self.surface)
+        return prepare_view(view, SurfaceOptions())
 
     def _planes(self, view: PreparedView, rng: np.random.Generator) -> list[Plane]:
         return detect_planes(

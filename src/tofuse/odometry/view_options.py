@@ -1,0 +1,40 @@
+"""Options of the views that keyframe odometry aligns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tofuse.bounds import Bounded, Bounds
+from tofuse.registration.prepared_view import SurfaceOptions
+from tofuse.registration.projective import ProjectiveOptions
+
+
+@dataclass(frozen=True)
+class ViewOptions(Bounded):
+    """How images are prepared and aligned, as far as it depends on the camera and the scene.
+
+    Attributes
+    ----------
+    columns
+        Images are halved until they have at most this many columns.
+    photometric
+        Whether the albedo takes part in the alignment.
+    falloff
+        Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
+        None to estimate it from the recording.
+    """
+
+    columns: Annotated[int, Bounds(16, 4096)] = 320
+    photometric: bool = True
+    falloff: Annotated[float | None, Bounds(-20, 20)] = None
+
+    @property
+    def surface(self) -> SurfaceOptions:
+        """Options of `prepare_view`."""
+        return SurfaceOptions(columns=self.columns, falloff=self.falloff)
+
+    @property
+    def alignment(self) -> ProjectiveOptions:
+        """Options of `align`."""
+        return ProjectiveOptions(photometric=self.photometric)
