@@ -76,9 +76,9 @@ def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTi
 
 def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     """Align and verify pairs of views that overlap by a half, as if they were loops."""
-    closer = Revisits(spacing=Spacing(0.03, 0.015, 200))
-    store: ViewStore[PreparedView] = ViewStore(closer.spacing)
-    loops = closer.start(0, (), store)
+    closer = Spacing(0.03, 0.015, 200)
+    store: ViewStore[PreparedView] = ViewStore(closer)
+    loops = Revisits().start(0, (), store, spacing=closer)
     poses = result.diagnostics.sequential
     options = Keyframes().views.surface
     for k, frame in enumerate(there_and_back(frames, len(frames))):

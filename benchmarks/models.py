@@ -51,7 +51,6 @@ def main() -> None:
     parser.add_argument("--no-thesis", action="store_true", help="only the default method")
     parser.add_argument("--no-correction", action="store_true", help="no factory correction")
     parser.add_argument("--calibrate", nargs="*", default=[], help="offset, scale, focal")
-    parser.add_argument("--shared", type=float, help="of the refinement; 0: pixels are independent")
     args = parser.parse_args()
     print(f"simulated SR4000, {args.threads} threads; ATE in mm and degrees, rms")
     print(
@@ -91,13 +90,10 @@ def _config(scene: str, method: str, args: argparse.Namespace) -> Config:
     turned = scene in OBJECTS
     depth = plan(scene).scene.max_depth_m if turned and method == "thesis" else None
     config = None
-    if method == "default" and (args.calibrate or args.shared is not None):
+    if method == "default" and args.calibrate:
         config = Path(__file__).with_name("out") / "models.toml"
         config.parent.mkdir(exist_ok=True)
-        text = f"[refinement]\ncalibrate = {args.calibrate!r}\n"
-        if args.shared is not None:
-            text += f"[refinement.refine]\nshared = {args.shared}\n"
-        config.write_text(text)
+        config.write_text(f"[refinement]\ncalibrate = {args.calibrate!r}\n")
     return resolve(
         Options(Path("unused"), method=method, object=turned, max_depth=depth, config=config)
     )

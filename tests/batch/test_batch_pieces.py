@@ -102,7 +102,7 @@ def test_submaps_on_a_cluster_are_refined_to_the_same_bits(cluster: str) -> None
 
 def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> None:  # noqa: F811
     frames, _, start = turn
-    options = Revisits(spacing=ALL, overlap=0.15)
+    options = Revisits(overlap=0.15)
     here = pushed(options, frames, start)
     there = DaskExecutor(cluster, lambda text: None)
     with using_executor(there):

@@ -13,7 +13,6 @@ from tofuse.arrays import Float64
 from tofuse.fusion.options import Fusion
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.appearance import Appearance
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
@@ -38,7 +37,7 @@ def quick(config: Config | None = None) -> Config:
         corrections=(),
         model_filters=(),
         fusion=Fusion(voxel_m=0.05),
-        loops=replace(config.loops, searches=0, appearance=Appearance(most=0)),
+        loops=replace(config.loops, searches=0, similar_pairs=0),
         search=QUICK,
         self_calibration=False,
     )

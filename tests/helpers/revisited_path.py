@@ -44,7 +44,7 @@ def turn():
 
 def pushed(options, frames, poses, given=()):
     store = ViewStore(ALL)
-    loops = options.start(0, given, store)
+    loops = options.start(0, given, store, spacing=ALL)
     for frame, T in zip(frames, poses, strict=True):
         store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
         loops.push(frame, T)

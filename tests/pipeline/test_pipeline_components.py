@@ -15,7 +15,6 @@ from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.states import decode, encode
-from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.joining import Joining
 from tofuse.registration.search import SearchOptions
 
@@ -27,7 +26,7 @@ CONFIG = replace(
     corrections=(),
     model_filters=(),
     fusion=Fusion(voxel_m=0.05),
-    loops=replace(DEFAULT.loops, searches=0, appearance=Appearance(most=0)),
+    loops=replace(DEFAULT.loops, searches=0, similar_pairs=0),
     search=QUICK,
     joining=Joining(searches=2, searches_per_frame=0.0),
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from corner_views import corner
-from revisited_path import ALL, DRIFT, away_and_back
+from revisited_path import DRIFT, away_and_back
 from tofuse.geometry import se3
 from tofuse.odometry.base import Step, Tracker
 from tofuse.pipeline.config import from_method
@@ -69,7 +69,7 @@ def frames():
 
 
 def live(frames, threads):
-    loops = Revisits(spacing=ALL, searches=0)
+    loops = Revisits(searches=0)
     config = replace(
         from_method("default"),
         corrections=(),

@@ -14,7 +14,7 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph
-from tofuse.posegraph.joint_alignment import Bodies, RefineOptions, refine, spread_evenly
+from tofuse.posegraph.joint_alignment import Bodies, refine, spread_evenly
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
 from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, overlaps
 from tofuse.registration.prepared_view import prepare_view
@@ -201,12 +201,8 @@ def test_the_store_never_holds_more_than_it_may():
 @pytest.mark.parametrize(
     ("cls", "options"),
     [
-        (Spacing, {"most": 1}),
-        (Spacing, {"angle": -1}),
-        (RefineOptions, {"overlap": 0}),
-        (RefineOptions, {"rounds": ()}),
-        (RefineOptions, {"neighbours": 0}),
-        (Joint, {"loss": 2}),
+        (Joint, {"neighbours": 0}),
+        (Joint, {"submap": 2}),
     ],
 )
 def test_options_are_checked(cls, options):
@@ -220,7 +216,7 @@ def test_pairs_of_a_view_do_not_add_up_to_more_than_it_knows():
     views = surfaces(truth, noise=0.005)
     known = {}
     for neighbours in (2, 10):
-        part = Joint(refine=replace(OPTIONS, neighbours=neighbours))
+        part = Joint(neighbours=neighbours)
         found = refiner(part, views, drifted(truth))
         graph = build_graph(range(12), found.poses, found.edges)
         known[neighbours] = len(found.edges), accuracy_of(graph, Shown(), 1.0).position_m

@@ -12,7 +12,6 @@ from corner_views import corner
 from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
 from tofuse.posegraph import revisits
-from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import ViewStore
@@ -26,7 +25,7 @@ turn = revisited_path.turn  # the fixture
 
 def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
     frames, truth, start = turn
-    found = pushed(Revisits(spacing=ALL, searches=0), frames, start)
+    found = pushed(Revisits(searches=0), frames, start)
     closed = [c for c in found if c.record.accepted]
     assert closed
     assert any(c.record.i == 0 and c.record.j >= 11 for c in closed)
@@ -44,10 +43,10 @@ def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
 def test_views_that_never_left_each_other_are_no_loop(turn):
     frames, _truth, start = turn
     half = 6
-    assert pushed(Revisits(spacing=ALL), frames[:half], start[:half]) == []
+    assert pushed(Revisits(), frames[:half], start[:half]) == []
     # Standing still sees the same all the time, and never left it.
     still = [replace(frames[0], index=k) for k in range(5)]
-    assert pushed(Revisits(spacing=ALL), still, np.stack([np.eye(4)] * 5)) == []
+    assert pushed(Revisits(), still, np.stack([np.eye(4)] * 5)) == []
 
 
 def test_a_view_of_something_else_is_refused_with_a_reason(turn):
@@ -60,7 +59,7 @@ def test_a_view_of_something_else_is_refused_with_a_reason(turn):
             for k in (11, 12)
         ),
     ]
-    options = Revisits(spacing=ALL, overlap=0.15, searches=0)
+    options = Revisits(overlap=0.15, searches=0)
     found = pushed(options, strange, start)
     late = [c for c in found if c.record.j >= 11]
     assert late
@@ -74,7 +73,7 @@ def test_what_a_person_gives_counts(turn):
     frames, truth, start = turn
     T = se3.inverse(truth[0]) @ truth[12]
     given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
-    found = pushed(Revisits(spacing=ALL, per_view=0), frames, start, given)
+    found = pushed(Revisits(per_view=0), frames, start, given)
     by_pair = {(c.record.i, c.record.j): c for c in found}
     assert list(by_pair) == [(1, 11), (0, 12), (0, 99)]
     np.testing.assert_array_equal(by_pair[0, 12].T_i_j, T)
@@ -106,7 +105,7 @@ def registered(T, probability):
 )
 def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong, accepted):
     frames, truth, start = turn
-    options = Revisits(spacing=ALL, per_view=3)
+    options = Revisits(per_view=3)
     asked = []
 
     def scripted(source, target, **_):
@@ -134,7 +133,7 @@ def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong
             assert np.linalg.norm(gap[:3, 3]) < 0.05
 
 
-@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"max_degenerate": 6}])
+@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"max_drift": 2}])
 def test_options_are_checked(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Revisits(**options)
@@ -148,7 +147,7 @@ def test_loops_are_looked_for_again_where_views_have_moved(turn):
     for k in range(1, len(truth)):
         far.append(far[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ bend)
     store = ViewStore(ALL)
-    loops = Revisits(spacing=ALL, searches=0, appearance=Appearance(most=0)).start(0, (), store)
+    loops = Revisits(searches=0, similar_pairs=0).start(0, (), store, spacing=ALL)
     for frame, T in zip(frames, far, strict=True):
         store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
         loops.push(frame, T)

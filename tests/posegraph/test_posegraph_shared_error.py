@@ -167,8 +167,3 @@ def test_all_pixels_count_where_nothing_is_shared_or_nothing_else_tells():
     views, truth = bent_views(1, 0.01, lit=False)
     some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
     np.testing.assert_array_equal(some, none)
-
-
-def test_a_share_below_none_is_refused():
-    with pytest.raises(ValueError, match="shared is -1"):
-        RefineOptions(shared=-1.0)

@@ -34,9 +34,9 @@ class Appearance:
 
     Attributes
     ----------
-    most
+    pairs
         Maximum number of pairs of a recording, the most similar first; 0 disables appearance.
-    unlike, left
+    max_difference, min_difference
         Maximum difference of the two views of a pair, and minimum difference of a view in between
         from both: 0 for equal images, 1 for nothing in common.
     shift
@@ -46,20 +46,11 @@ class Appearance:
         are taken for different places that look the same (perceptual aliasing).
     """
 
-    most: int = 6
-    unlike: float = 0.3
-    left: float = 0.4
+    pairs: int = 6
+    max_difference: float = 0.3
+    min_difference: float = 0.4
     shift: float = 0.25
     drift: float = 0.2
-
-    def __post_init__(self) -> None:
-        if self.most < 0:
-            raise ValueError(f"most is {self.most}, not 0 or more")
-        for name in ("unlike", "left", "drift"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
-        if not 0 <= self.shift <= 0.5:
-            raise ValueError(f"shift is {self.shift}, not 0 to 0.5")
 
     def candidates(
         self,
@@ -80,16 +71,16 @@ class Appearance:
 
         Returns
         -------
-        Positions (i, j), i < j, of the possible pairs and of the others, at most `most` of each,
+        Positions (i, j), i < j, of the possible pairs and of the others, at most `pairs` of each,
         the most similar first.
         """
         chosen: list[tuple[int, int]] = []
         refused: list[tuple[int, int]] = []
-        if self.most == 0 or len(looks) < 3:
+        if self.pairs == 0 or len(looks) < 3:
             return chosen, refused
         for _, i, j in self._most_alike(looks):
             mine = chosen if possible(i, j) else refused
-            full = len(mine) >= self.most or _similar(i, j, mine) >= _MAX_SIMILAR
+            full = len(mine) >= self.pairs or _similar(i, j, mine) >= _MAX_SIMILAR
             if not full and not _similar(i, j, known):
                 mine.append((i, j))
         return chosen, refused
@@ -99,11 +90,11 @@ class Appearance:
         if len(looks) > _ALL:
             return self._most_alike_of_many(np.stack(looks))
         far = mutual_unlikeness(looks, self.shift)
-        away = far >= self.left
+        away = far >= self.min_difference
         found = [
             (float(far[i, j]), int(i), int(j))
             for j in range(2, len(looks))
-            for i in np.flatnonzero(far[: j - 1, j] <= self.unlike)
+            for i in np.flatnonzero(far[: j - 1, j] <= self.max_difference)
             if (away[i, i + 1 : j] & away[i + 1 : j, j]).any()
         ]
         return sorted(found)
@@ -114,13 +105,13 @@ class Appearance:
         far = unlikeness_of_pairs(looks, i, j, self.shift)
         found = []
         for k in np.lexsort((j, i, far)):
-            if far[k] > self.unlike:
+            if far[k] > self.max_difference:
                 break
             a, b = int(i[k]), int(j[k])
             between = np.unique(np.linspace(a + 1, b - 1, min(b - a - 1, _BETWEEN)).round())
             some = looks[between.astype(np.intp)]
-            left = unlikeness(looks[a], some, self.shift) >= self.left
-            if (left & (unlikeness(looks[b], some, self.shift) >= self.left)).any():
+            left = unlikeness(looks[a], some, self.shift) >= self.min_difference
+            if (left & (unlikeness(looks[b], some, self.shift) >= self.min_difference)).any():
                 found.append((float(far[k]), a, b))
         return found
 

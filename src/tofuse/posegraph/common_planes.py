@@ -82,20 +82,6 @@ class PlaneOptions:
     robust: float = 4.685
     convergence: float = 0.002
 
-    def __post_init__(self) -> None:
-        for name in ("coarsest", "shrink", "flatness"):
-            if not 0.01 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0.01 to below 1")
-        if not 1 <= self.iterations <= 1000:
-            raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
-        if not 1 <= self.divisions <= 100:
-            raise ValueError(f"divisions is {self.divisions}, not 1 to 100")
-        if self.min_points < 4:
-            raise ValueError(f"min_points is {self.min_points}, not 4 or more")
-        for name in ("robust", "convergence"):
-            if not 1e-6 <= getattr(self, name) <= 1e6:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-
 
 @dataclass(frozen=True, eq=False)
 class Aligned:

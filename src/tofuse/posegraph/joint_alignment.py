@@ -49,12 +49,6 @@ class Round:
     inflation_m: float
     photometric_inflation: float
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.iterations <= 1000:
-            raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
-        if not (0 <= self.inflation_m < 1e3 and 0 <= self.photometric_inflation < 1e3):
-            raise ValueError("inflation_m and photometric_inflation must be 0 or more")
-
 
 @dataclass(frozen=True)
 class RefineOptions:
@@ -91,20 +85,6 @@ class RefineOptions:
     max_sigma_m: float = 0.02
     convergence: float = 0.02
     shared: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.rounds) <= 20:
-            raise ValueError(f"there are {len(self.rounds)} rounds; give 1 to 20")
-        if not 0 < self.overlap <= 1:
-            raise ValueError(f"overlap is {self.overlap}, not above 0 and up to 1")
-        for name in ("neighbours", "points"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-        for name in ("robust", "max_angle", "max_sigma_m", "convergence"):
-            if not 1e-6 <= getattr(self, name) <= 1e6:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        if not 0 <= self.shared <= 100:
-            raise ValueError(f"shared is {self.shared}, not 0 to 100")
 
 
 @dataclass(frozen=True, eq=False)

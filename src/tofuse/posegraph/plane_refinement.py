@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.refinement import (
+    MAX_LOSS,
     Refinement,
     Refiner,
     Refining,
@@ -27,7 +30,7 @@ from tofuse.registration.prepared_view import PreparedView
 
 @part("refinement", "planes")
 @dataclass(frozen=True)
-class Planes(Refining):
+class Planes(Bounded, Refining):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
     See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
@@ -36,26 +39,14 @@ class Planes(Refining):
 
     Attributes
     ----------
-    spacing
-        Which views take part.
-    refine
-        How they are refined.
+    max_views
+        Maximum number of views that take part.
     points
-        Of each view, at most, taken at an even stride.
-    loss
-        A view has lost support if it fell by more.
+        Maximum number of points of each view, taken at an even stride.
     """
 
-    spacing: Spacing = Spacing(most=100, loosest=1e6)  # noqa: RUF009 - immutable
-    refine: PlaneOptions = PlaneOptions()  # noqa: RUF009 - immutable
-    points: int = 5000
-    loss: float = 0.03
-
-    def __post_init__(self) -> None:
-        if self.points < 100:
-            raise ValueError(f"points is {self.points}, not 100 or more")
-        if not 0 <= self.loss <= 1:
-            raise ValueError(f"loss is {self.loss}, not 0 to 1")
+    max_views: Annotated[int, Bounds(2, 100_000)] = 100
+    points: Annotated[int, Bounds(100)] = 5000
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
@@ -81,7 +72,7 @@ class KeptPoints:
 class _Planes(Refiner):
     def __init__(self, options: Planes) -> None:
         self._options = options
-        self._store: ViewStore[KeptPoints] = ViewStore(options.spacing)
+        self._store: ViewStore[KeptPoints] = ViewStore(Spacing(most=options.max_views, loosest=1e6))
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
@@ -97,12 +88,12 @@ class _Planes(Refiner):
             return Refinement(poses, views=len(views))
         at = np.array([row[view.index] for view in views], np.intp)
         before = poses[at]
-        found = refine_clouds([view.points for view in views], before, self._options.refine)
+        found = refine_clouds([view.points for view in views], before, PlaneOptions())
         mean = float(found.before.mean()), float(found.after.mean())
         unchanged = Refinement(poses, False, len(views), len(found.pairs), support=mean)
         if not len(found.pairs) or mean[1] < mean[0] - CHANCE:
             return unchanged
-        lost = found.after < found.before - self._options.loss
+        lost = found.after < found.before - MAX_LOSS
         after = without_losers(before, found.poses, lost)
         edges = tuple(_edges(found, [view.index for view in views], lost))
         return replace(moved_to(unchanged, at, after), edges=edges)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.files.spill import Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
@@ -32,6 +33,8 @@ CameraError = Literal["offset", "scale", "focal"]
 
 # Neighbouring pixels have correlated noise: this many count as one.
 _SHARED_NOISE = 5.0
+# Maximum decrease of the support of a view that keeps its refined pose: about that by chance.
+MAX_LOSS = 0.03
 _ERRORS: dict[CameraError, int] = {
     "offset": kernels.OFFSET,
     "scale": kernels.SCALE,
@@ -183,7 +186,7 @@ class _Known(_Idle):
 
 @part("refinement", "joint")
 @dataclass(frozen=True)
-class Joint(Refining):
+class Joint(Bounded, Refining):
     """Joint alignment of all overlapping views (eq 2.8), see `refine`.
 
     Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The
@@ -192,26 +195,22 @@ class Joint(Refining):
 
     Attributes
     ----------
-    refine
-        Options of the joint alignment.
     calibrate
         Errors of the camera to estimate as well: "offset", "scale", "focal".
-    loss
-        Largest tolerated decrease of a view's support.
+    neighbours
+        Maximum number of earlier views that each one is compared with.
     submap
         Largest number of views that are refined together; more are divided, see `submaps`.
     """
 
-    refine: RefineOptions = RefineOptions()  # noqa: RUF009 - immutable
     calibrate: tuple[CameraError, ...] = ()
-    loss: float = 0.03
-    submap: int = 300
+    neighbours: Annotated[int, Bounds(1)] = 10
+    submap: Annotated[int, Bounds(10, 100_000)] = 300
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.loss <= 1:
-            raise ValueError(f"loss is {self.loss}, not 0 to 1")
-        if not 10 <= self.submap <= 100_000:
-            raise ValueError(f"submap is {self.submap}, not 10 to 100000")
+    @property
+    def alignment(self) -> RefineOptions:
+        """Options of the joint alignment."""
+        return RefineOptions(neighbours=self.neighbours)
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
@@ -247,7 +246,7 @@ class _Joint(Refiner):
         gained = support[1] - support[0]
         if not len(refined.pairs) or fell(gained):
             return unchanged
-        after = without_losers(before, refined.poses, gained < -options.loss)
+        after = without_losers(before, refined.poses, gained < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were at the optimum already; the measurements give their covariances.
             after = before
@@ -270,7 +269,7 @@ def _together(
     views = [_kept(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     numbers = [_ERRORS[name] for name in options.calibrate]
-    refined = refine(views, poses, options.refine, calibrate=numbers, priors=priors)
+    refined = refine(views, poses, options.alignment, calibrate=numbers, priors=priors)
     return refined, lambda: _calibration_check(
         RefinedSubmap(views, np.arange(len(views)), refined, priors), options
     )
@@ -288,7 +287,7 @@ def _in_submaps(
     refined, checks = refine_submaps(
         [_Seen.of(_kept(p, options), store.outlines) for p in posed],
         poses,
-        options.refine,
+        options.alignment,
         options.submap,
         lambda some: [_kept(posed[k], options) for k in some],
         lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
@@ -316,15 +315,15 @@ class _Seen:
 
 
 def _kept(posed: PosedView[PreparedView], options: Joint) -> KeptView:
-    return KeptView.of(posed.view.with_pixel_variance().without_caches(), options.refine.points)
+    return KeptView.of(posed.view.with_pixel_variance().without_caches(), options.alignment.points)
 
 
 def _calibration_check(one: RefinedSubmap, options: Joint) -> CalibrationCheck:
     """Check the calibration by refined views; with estimated errors only the loop's gap."""
     refined = one.refined
     if not options.calibrate:
-        return check_calibration(one.views, refined, options.refine, one.priors)
-    gap = loop_gap(one.views, refined, refined.poses, refined.errors, options.refine)
+        return check_calibration(one.views, refined, options.alignment, one.priors)
+    gap = loop_gap(one.views, refined, refined.poses, refined.errors, options.alignment)
     return CalibrationCheck(gap=gap)
 
 

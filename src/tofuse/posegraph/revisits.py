@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.kernels.executors import executor
 from tofuse.parts import part
@@ -55,6 +56,14 @@ _WEAK_PRIOR = ProjectiveOptions(
 )
 _REJECTED = "does not fit as views of this camera usually do, or not the same from both ends"
 _TOO_FAR = "looks alike, but the trajectory can't have drifted that far"
+# Selection of the views that are tried: neighbours overlap by most of an image.
+_SPACING = Spacing(angle=0.15, distance=0.08, most=200)
+# A candidate revisits a place if some view in between overlaps either view by less than this.
+_MAX_APART = 0.1
+# Maximum difference of the poses of two consistent loops: the drift between them, m and rad.
+_SAME_M, _SAME_RAD = 0.15, 0.1
+# Maximum number of degenerate directions of a loop; its covariance is wide there.
+_MAX_DEGENERATE = 2
 # Smallest overlap of an alignment, above what occurs by chance.
 _MIN_OVERLAP = 0.3
 # Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
@@ -81,7 +90,7 @@ class _Entry:
 
 @part("loops", "revisits")
 @dataclass(frozen=True)
-class Revisits(LoopDetector):
+class Revisits(Bounded, LoopDetector):
     """Registers views that overlap again, according to the trajectory, after they did not.
 
     A loop is registered from the relative pose of the trajectory (`registration.view_pair.follow`),
@@ -92,49 +101,26 @@ class Revisits(LoopDetector):
 
     Attributes
     ----------
-    spacing
-        Selection of the views that are tried.
-    overlap, apart
-        Smallest overlap of a candidate, and the overlap below which some view in between must have
-        seen either.
+    overlap
+        Minimum overlap of a candidate, as a fraction of its pixels.
     per_view
-        Largest number of candidates of each view, those with the largest overlap.
-    unusual
-        A loop must fit as neighbouring views of this camera do: no statistic of the alignment may
-        be this many standard deviations above its median (`registration.verification`).
-    max_degenerate
-        Largest number of degenerate directions of a loop; its covariance is wide there.
+        Maximum number of candidates of each view, those with the largest overlap.
     searches
-        Largest number of rejected candidates that are searched, those with the largest overlap,
+        Maximum number of rejected candidates that are searched, those with the largest overlap,
         for each 200 views.
-    same_m, same_rad
-        Largest difference of the poses of two consistent loops.
-    appearance
-        Views with similar descriptors are candidates too, wherever they are on the trajectory; they
-        are searched.
+    similar_pairs
+        Maximum number of pairs with similar descriptors, wherever they are on the trajectory, that
+        are searched for each 200 views; 0 disables place recognition by appearance.
+    max_drift
+        Maximum drift of the trajectory, as a fraction of the path and of the rotation along it.
+        Similar views that imply more are taken for different places (perceptual aliasing).
     """
 
-    spacing: Spacing = Spacing(angle=0.15, distance=0.08, most=200)  # noqa: RUF009 - immutable
-    overlap: float = 0.4
-    apart: float = 0.1
-    per_view: int = 2
-    unusual: float = 3.0
-    max_degenerate: int = 2
-    searches: int = 6
-    same_m: float = 0.15
-    same_rad: float = 0.1
-    appearance: Appearance = Appearance()  # noqa: RUF009 - immutable
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.apart < self.overlap <= 1:
-            raise ValueError("apart must be below overlap, both 0 to 1")
-        for name in ("per_view", "searches"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
-        if not 0 <= self.max_degenerate <= 5:
-            raise ValueError(f"max_degenerate is {self.max_degenerate}, not 0 to 5")
-        if not 0.5 <= self.unusual <= 100:
-            raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
+    overlap: Annotated[float, Bounds(_MAX_APART, 1)] = 0.4
+    per_view: Annotated[int, Bounds(0)] = 2
+    searches: Annotated[int, Bounds(0)] = 6
+    similar_pairs: Annotated[int, Bounds(0)] = 6
+    max_drift: Annotated[float, Bounds(0.001, 1)] = 0.2
 
     def start(
         self,
@@ -142,9 +128,16 @@ class Revisits(LoopDetector):
         given: Sequence[GivenLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions | None = None,
+        *,
+        spacing: Spacing = _SPACING,
+        appearance: Appearance | None = None,
     ) -> Loops:
-        """See `LoopDetector.start`; draws nothing."""
-        return _RevisitLoops(self, given, views, search or SearchOptions())
+        """See `LoopDetector.start`; deterministic.
+
+        `spacing` selects the views that are tried, and `appearance` those that look alike.
+        """
+        appearance = appearance or Appearance(self.similar_pairs, drift=self.max_drift)
+        return _RevisitLoops(self, given, views, search or SearchOptions(), spacing, appearance)
 
     def candidates(
         self, views: Sequence[Outlined], poses: Float64, *, first: int = 0
@@ -160,7 +153,7 @@ class Revisits(LoopDetector):
         first
             Smallest j.
         """
-        pairs, shares = overlaps(views, poses, self.apart, first=first)
+        pairs, shares = overlaps(views, poses, _MAX_APART, first=first)
         found: list[tuple[int, int]] = []
         ends = np.searchsorted(pairs[:, 1], np.arange(len(views) + 1))
         for j in range(first, len(views)):
@@ -185,15 +178,18 @@ class _RevisitLoops(Loops):
         given: Sequence[GivenLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions,
+        spacing: Spacing,
+        appearance: Appearance,
     ) -> None:
         self._options, self._search = options, search
+        self._spacing, self._appearance = spacing, appearance
         self._store = views
-        self._chosen: ViewStore[PreparedView] = ViewStore(options.spacing)
+        self._chosen: ViewStore[PreparedView] = ViewStore(spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
         self._seen: dict[int, _Entry] = {}
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
-        self._usual = UsualFit(options.unusual)
+        self._usual = UsualFit()
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
         self._path_length: dict[int, Float64] = {}
@@ -210,7 +206,7 @@ class _RevisitLoops(Loops):
     @property
     def many(self) -> bool:
         """See `Loops.many`."""
-        return len(self._chosen.views) > self._options.spacing.most
+        return len(self._chosen.views) > self._spacing.most
 
     def look_again(self, poses: Mapping[int, Float64]) -> bool:
         """See `Loops.look_again`."""
@@ -354,7 +350,7 @@ class _RevisitLoops(Loops):
         """Frames (i, j) that look alike and aren't candidates yet: plausible and implausible."""
         place = {p.index: k for k, p in enumerate(posed)}
         known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
-        appearance = replace(self._options.appearance, most=self._options.appearance.most * times)
+        appearance = replace(self._appearance, pairs=self._appearance.pairs * times)
         both = appearance.candidates(
             [s.look for s in seen],
             lambda i, j: self._plausible(posed[i], posed[j], np.eye(4), ALIKE),
@@ -440,7 +436,7 @@ class _RevisitLoops(Loops):
         )
         path = self._path_length[source.index] - self._path_length[target.index]
         length, turned = path.tolist()
-        return self._options.appearance.plausible(off, length, turned, depth, C, unsure)
+        return self._appearance.plausible(off, length, turned, depth, C, unsure)
 
     def _consistent(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
         """Whether the loop (k, m) implies the same pose of j in i as the loop (i, j)."""
@@ -450,15 +446,12 @@ class _RevisitLoops(Loops):
         T_i_k = se3.inverse(poses[i]) @ poses[k]
         T_m_j = se3.inverse(poses[m]) @ poses[j]
         away = se3.inverse(T) @ T_i_k @ other @ T_m_j
-        return bool(
-            np.linalg.norm(away[:3, 3]) < self._options.same_m
-            and se3.angle(away) < self._options.same_rad
-        )
+        return bool(np.linalg.norm(away[:3, 3]) < _SAME_M and se3.angle(away) < _SAME_RAD)
 
     def _objection(self, made: Registration) -> str:
         if made.overlap is not None and made.overlap < _MIN_OVERLAP:
             return f"only {made.overlap:.0%} of the points project into the other view"
-        if len(made.unobservable) > self._options.max_degenerate:
+        if len(made.unobservable) > _MAX_DEGENERATE:
             return f"{len(made.unobservable)} directions are degenerate"
         return "" if made.believed else made.reason
 

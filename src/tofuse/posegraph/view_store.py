@@ -133,14 +133,6 @@ class Spacing:
     most: int = 300
     loosest: float = 4.0
 
-    def __post_init__(self) -> None:
-        if not (self.angle >= 0 and self.distance >= 0):
-            raise ValueError("angle and distance must be 0 or more")
-        if not 2 <= self.most <= 100_000:
-            raise ValueError(f"most is {self.most}, not 2 to 100000")
-        if not self.loosest >= 1:
-            raise ValueError(f"loosest is {self.loosest}, not 1 or more")
-
 
 class Storable(Protocol):
     """What is kept of a view."""
