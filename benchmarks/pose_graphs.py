@@ -32,7 +32,8 @@ from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.charts import Quaternion
 from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import Optimiser, PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
+from tofuse.posegraph.robust import Settings
 
 SHARE = 0.3  # of all loops that are false
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad
@@ -212,8 +213,8 @@ def convergence(figure: Path | None) -> None:
     graph, _ = make_graph("walk", 0, 0.0, noise=8.0)
     curves: dict[str, list[float]] = {}
     for rotation in ("tangent", "quaternion", "cosines"):
-        optimiser = LevenbergMarquardt(robust="none", rotation=rotation, tolerance=1e-13)
-        curves[f"Levenberg-Marquardt, {rotation}"] = list(optimiser.optimise(graph).objective)
+        settings = Settings("none", rotation=rotation, tolerance=1e-13)
+        curves[f"Levenberg-Marquardt, {rotation}"] = list(minimise(graph, settings).objective)
     curves["Lu-Milios"] = list(LuMilios(tolerance=1e-13).optimise(graph).objective)
     curves["general solver (L-BFGS), quaternion"] = general_solver(graph)
     least = min(min(c) for c in curves.values())

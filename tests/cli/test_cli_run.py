@@ -127,7 +127,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "frames",
         "loops",
         "optimiser",
-        "outside",
+        "priors",
         "refinement",
         "filters",
         "findings",

@@ -216,8 +216,6 @@ def test_thinning_keeps_every_channel_together() -> None:
         {"voxel_m": float("nan")},
         {"voxel_m": 1e6},
         {"min_views": 0},
-        {"normal_neighbours": 2},
-        {"normal_neighbours": 10**9},
     ],
 )
 def test_options_that_make_no_sense(options) -> None:

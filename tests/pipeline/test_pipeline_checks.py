@@ -191,7 +191,7 @@ CASES = {
     "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),
     "single_frame": evidence(("tracked",)),
     "sensor_differs": replace(
-        evidence(), outside=(SensorRecord("odometry", 8, 0, None, "it was not used"),)
+        evidence(), priors=(SensorRecord("odometry", 8, 0, None, "it was not used"),)
     ),
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
     "disconnected": in_components(apart((7, 8))),

@@ -28,7 +28,7 @@ CONFIG = replace(
     fusion=Fusion(voxel_m=0.05),
     loops=replace(DEFAULT.loops, searches=0, similar_pairs=0),
     search=QUICK,
-    joining=Joining(searches=2, searches_per_frame=0.0),
+    joining=Joining(searches=2),
 )
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
 PATH = [at(0.2 * np.sin(0.2 * k), 0.2 * np.cos(0.2 * k), 0.06 * k) for k in range(40)]

@@ -49,7 +49,7 @@ def results(tmp_path_factory) -> dict[str, Path]:
 def merged(*folders, searches=6, **options):
     sessions = read_sessions(folders, 2, Silent())
     config = quick(merged_config(sessions))
-    joining = replace(config.joining, searches=searches, searches_per_frame=0, tries=searches)
+    joining = replace(config.joining, searches=searches, tries=searches)
     return merge_sessions(sessions, replace(config, joining=joining), threads=2, **options)
 
 
@@ -143,7 +143,7 @@ def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_pat
 def test_threads_change_nothing(both, results) -> None:
     sessions = read_sessions([results["here"], results["there"]], 1, Silent())
     config = quick(merged_config(sessions))
-    joining = replace(config.joining, searches=6, searches_per_frame=0, tries=6)
+    joining = replace(config.joining, searches=6, tries=6)
     with threads(1):
         again = merge_sessions(sessions, replace(config, joining=joining), threads=1)
     assert again.trajectory.tobytes() == both.trajectory.tobytes()

@@ -41,17 +41,17 @@ def beside(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-def made(folder: Path, *outside: object) -> Reconstruction:
-    config = replace(from_method("default"), outside=outside, refinement=Joint())
+def made(folder: Path, *priors: object) -> Reconstruction:
+    config = replace(from_method("default"), priors=priors, refinement=Joint())
     return reconstruct(open_recording(folder), config, threads=1)
 
 
 def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, room_recording):
     alone, both = made(beside), made(beside, *BOTH)
-    told = {record.sensor: record for record in both.diagnostics.outside}
+    told = {record.sensor: record for record in both.diagnostics.priors}
     assert (told["gravity"].measured, told["gravity"].used) == (8, 8)
     assert (told["odometry"].measured, told["odometry"].used) == (5, 5)
-    assert [s["sensor"] for s in run_json(both)["outside"]] == ["gravity", "odometry"]
+    assert [s["sensor"] for s in run_json(both)["priors"]] == ["gravity", "odometry"]
     assert len(both.graph.edges) == len(alone.graph.edges) + 5
     assert both.graph.gravity is not None
     np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
@@ -76,7 +76,7 @@ def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, roo
 
 def test_without_files_it_is_the_same_to_the_last_bit(room_recording):
     asked, not_asked = made(room_recording, *BOTH), made(room_recording)
-    assert asked.diagnostics.outside == ()
+    assert asked.diagnostics.priors == ()
     np.testing.assert_array_equal(asked.trajectory, not_asked.trajectory)
     np.testing.assert_array_equal(asked.graph.information, not_asked.graph.information)
     np.testing.assert_array_equal(asked.cloud.points, not_asked.cloud.points)
@@ -85,5 +85,5 @@ def test_without_files_it_is_the_same_to_the_last_bit(room_recording):
 def test_a_turned_object_knows_nothing_of_gravity(tmp_path):
     from tofuse.pipeline.run import Options, resolve
 
-    assert resolve(Options(tmp_path)).outside == (GravityEdges(),)
-    assert resolve(Options(tmp_path, object=True)).outside == ()
+    assert resolve(Options(tmp_path)).priors == (GravityEdges(),)
+    assert resolve(Options(tmp_path, object=True)).priors == ()

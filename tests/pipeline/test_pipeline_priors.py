@@ -37,7 +37,7 @@ def by_phone(recording: Recording, poses=None) -> Recording:
 
 
 def kinds(config) -> list[type]:
-    return [type(sensor) for sensor in config.outside]
+    return [type(sensor) for sensor in config.priors]
 
 
 def test_a_phone_knows_its_poses(recording) -> None:
@@ -77,7 +77,7 @@ def test_a_phone_knows_which_way_up_it_was(recording) -> None:
 def test_nothing_but_the_images(recording) -> None:
     same, config = with_prior(by_phone(recording), from_method("default"), "none")
     assert same.odometry is None
-    assert config.outside == ()
+    assert config.priors == ()
 
 
 def test_the_thesis_listens_to_nothing_unless_asked(recording) -> None:
@@ -94,7 +94,7 @@ def test_a_file_of_odometry_comes_before_the_poses_of_the_phone(recording) -> No
     np.testing.assert_array_equal(led.odometry, odometry)
     assert kinds(config) == [GravityEdges, OdometryEdges]
     # What a configuration says of odometry stays.
-    said = replace(from_method("default"), outside=(OdometryEdges(share=0.1),))
+    said = replace(from_method("default"), priors=(OdometryEdges(relative=0.1),))
     assert with_prior(phone, said, "device")[1] is said
 
 
@@ -113,7 +113,7 @@ def test_poses_of_another_place_do_not_count(recording) -> None:
     result = reconstruct(phone, config)
     gap = np.linalg.norm(result.trajectory[:, :3, 3] - alone.trajectory[:, :3, 3], axis=1)
     assert gap.max() < 0.01
-    [sensor] = result.diagnostics.outside
+    [sensor] = result.diagnostics.priors
     assert sensor.scale is not None
     assert sensor.scale > 2
 
@@ -128,4 +128,4 @@ def test_the_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
         assert "--prior" in capsys.readouterr().err
         return
     config = read_run_json(tmp_path / "out" / "run.json")["config"]
-    assert [sensor["part"] for sensor in config["outside"]] == sensors
+    assert [sensor["part"] for sensor in config["priors"]] == sensors

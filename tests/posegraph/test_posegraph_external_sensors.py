@@ -111,7 +111,7 @@ def test_an_accelerometer_in_motion_does_not_count_for_gravity():
     lying = seen_down(right)
     lying[20:40, :3] += 0.33 * right[20:40, 0, :3]
     lying[:, :3] /= np.linalg.norm(lying[:, :3], axis=1)[:, None]
-    believed = replace(GravityEdges(), gate=np.inf)
+    believed = replace(GravityEdges(), gate=1e9)
     robust = tilt(
         solved(graph, measure_all((GravityEdges(),), sensed(gravity=lying), graph)), right
     )
@@ -150,7 +150,9 @@ def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     before = ate(graph.poses, right)
-    good = measure_all((OdometryEdges(share=0.01, share_rad=0.01),), sensed(odometer(right)), graph)
+    good = measure_all(
+        (OdometryEdges(relative=0.01, relative_rad=0.01),), sensed(odometer(right)), graph
+    )
     assert len(good.steps) == N - 1
     assert ate(solved(graph, good), right) < 0.6 * before
     # Of another camera: in other axes, and half as long again.
@@ -167,7 +169,7 @@ def test_odometry_counts_with_the_errors_that_it_has():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     noisy = odometer(right, 0.1)
-    told = measure_all((OdometryEdges(share=0.03, share_rad=0.03),), sensed(noisy), graph)
+    told = measure_all((OdometryEdges(relative=0.03, relative_rad=0.03),), sensed(noisy), graph)
     record = told.records[0]
     assert record.scale is not None
     assert 1.5 < record.scale < 5

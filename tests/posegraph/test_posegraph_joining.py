@@ -18,7 +18,7 @@ from tofuse.registration.search import SearchOptions
 from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
-SPARSELY = Joining(searches=2, searches_per_frame=0, bridge=False)
+SPARSELY = Joining(searches=2, bridge=False)
 # A camera that walks round and turns.
 PATH = [at(0.3 * np.sin(0.2 * k), 0.3 * np.cos(0.2 * k), 0.08 * k) for k in range(40)]
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
@@ -401,15 +401,13 @@ def test_the_main_group_is_the_first_one_where_asked_for(elsewhere, three) -> No
 
 @pytest.mark.parametrize(
     "options",
-    [{"tries": -1}, {"min_probability": 1.0}, {"min_probability": np.nan}, {"main": "last"}],
-)
-def test_options_of_sessions_are_checked(options) -> None:
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Joining(**options)
-
-
-@pytest.mark.parametrize(
-    "options", [{"searches": -1}, {"searches_per_frame": -0.1}, {"searches_per_frame": np.nan}]
+    [
+        {"searches": -1},
+        {"tries": -1},
+        {"min_probability": 1.0},
+        {"min_probability": np.nan},
+        {"main": "last"},
+    ],
 )
 def test_options_are_checked(options) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):

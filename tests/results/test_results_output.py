@@ -182,7 +182,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "changes",
         "loops",
         "optimiser",
-        "outside",
+        "priors",
         "refinement",
         "filters",
     ]

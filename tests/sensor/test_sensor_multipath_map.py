@@ -157,7 +157,7 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
     second = replace(Seen(*world).frame(), index=1)
 
     def corrected(placed: bool, T_expected: np.ndarray | None) -> np.ndarray:
-        corrector = Multipath(gain=GAIN, columns=30, lamp=1.2).start()
+        corrector = Multipath(gain=GAIN).start(MultipathModel(columns=30))
         corrector.apply(first, None)
         if placed:
             # Of another frame: says nothing.
@@ -171,7 +171,7 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
     np.testing.assert_array_equal(corrected(True, None), guessed)
     assert np.abs(corrected(True, np.eye(4)) - guessed).max() > 2e-4
     # Nothing of the view was left by the filters.
-    corrector = Multipath(gain=GAIN, columns=30, lamp=1.2).start()
+    corrector = Multipath(gain=GAIN).start(MultipathModel(columns=30))
     corrector.apply(first, None)
     corrector.add_pose(first.keep(np.zeros(first.depth.shape, bool)), T)
     fixed = corrector.apply(second, np.eye(4))

@@ -40,10 +40,6 @@ class Multipath(Bounded, Correction):
         Ambiguity range; None: that of the frame.
     bounces
         "one": light reflected by one other surface; "all": by any number.
-    iterations
-        Number of fixed-point iterations of multipath and surfaces.
-    columns
-        Blocks of pixels along the image's width for which multipath is computed.
     lamp
         Illumination angle relative to that of the image's corner. Surfaces are extrapolated up to
         there.
@@ -63,8 +59,6 @@ class Multipath(Bounded, Correction):
     gain: Annotated[float | None, Bounds(0, exclusive=True)] = None
     period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     bounces: Bounces = "one"
-    iterations: Annotated[int, Bounds(1, 10)] = 3
-    columns: Annotated[int, Bounds(8, 200)] = 44
     lamp: Annotated[float, Bounds(1)] = 1.2
     relative_sigma: Annotated[float, Bounds(0, 10)] = 0.2
     trial: bool = True
@@ -105,9 +99,11 @@ class Multipath(Bounded, Correction):
         seen = (float(strength), float(error))
         return replace(self, trial=False, applied=helps, seen=seen, relative_sigma=relative_sigma)
 
-    def start(self) -> MultipathCorrector:
-        """See `Correction.start`."""
-        return MultipathCorrector(self)
+    def start(self, reflections: MultipathModel | None = None) -> MultipathCorrector:
+        """See `Correction.start`. `reflections` computes the multipath."""
+        return MultipathCorrector(
+            self, reflections or MultipathModel(lamp=self.lamp, bounces=self.bounces)
+        )
 
 
 class MultipathCorrector(Corrector):
@@ -121,12 +117,10 @@ class MultipathCorrector(Corrector):
         As given, or the current estimate; None before the first frame.
     """
 
-    def __init__(self, options: Multipath) -> None:
+    def __init__(self, options: Multipath, reflections: MultipathModel) -> None:
         self.gain = options.gain
         self._options = options
-        self._reflections = MultipathModel(
-            options.columns, options.iterations, options.lamp, options.bounces
-        )
+        self._reflections = reflections
         self._estimator = GainEstimator(self._reflections)
         self._map = ReflectorMap()
         self._last: tuple[int, MultipathEstimate] | None = None

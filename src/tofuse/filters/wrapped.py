@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -18,6 +18,10 @@ from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
 # Number of pixels of a view from which white is estimated, and dark pixels are counted.
 _ASKED = 10_000
+# Minimum fraction of the valid pixels that are darker than any material: single ones are noise.
+_MIN_DARK = 0.001
+# Information need not propagate across the image, as wrapped pixels are removed and not corrected.
+_OPTIONS = UnwrapOptions(iterations=20)
 
 
 @part("filter", "wrapped")
@@ -37,15 +41,9 @@ class Wrapped(Bounded, Filter):
     ----------
     min_albedo
         Lowest possible albedo.
-    fraction
-        Smallest fraction of the valid pixels that must be darker than that.
-    options
-        Of the unwrapping.
     """
 
     min_albedo: Annotated[float, Bounds(0, 1)] = 0.02
-    fraction: Annotated[float, Bounds(0, 1)] = 0.001
-    options: UnwrapOptions = field(default_factory=lambda: UnwrapOptions(iterations=20))
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -61,7 +59,7 @@ class Wrapped(Bounded, Filter):
         white = white_amplitude(lit, some, some > 0)
         seen = (some > 0) & (lit > 0)
         dark = seen & (lit * np.square(some) < self.min_albedo * white)
-        if dark.sum() <= self.fraction * seen.sum():
+        if dark.sum() <= _MIN_DARK * seen.sum():
             return keep
-        periods = count_periods(radial, light, period, white, pixel_pitch(frame), self.options)
+        periods = count_periods(radial, light, period, white, pixel_pitch(frame), _OPTIONS)
         return (periods == 0) & (light * np.square(radial) >= self.min_albedo * white)

@@ -18,6 +18,7 @@ from tofuse.kernels.threads import thread_count
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 
 _BUFFER_ROWS = 2_000_000
+_NORMAL_NEIGHBOURS = 12  # points in the plane fit of a normal
 _KEY_BITS = 21  # voxels per axis: 2^21, that is 21 km at 1 cm
 
 
@@ -147,7 +148,7 @@ class CloudBuilder:
         points = sums[:, 0:3] / views[:, None]
         return Cloud(
             points.astype(np.float32),
-            _normals(points, sums[:, 3:6], self.config.normal_neighbours) if normals else None,
+            _normals(points, sums[:, 3:6], _NORMAL_NEIGHBOURS) if normals else None,
             _colors(sums),
             np.round(views).astype(np.int32),
             np.zeros(3),

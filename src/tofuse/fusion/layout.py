@@ -28,7 +28,9 @@ _MAX_STRIDE, _VIEWS_PER_STRIDE = 4, 32
 _BLOCK_SPACING, CUBE_SPACING = 0.34, 0.6
 # A smaller truncation would cut off the noise on one side of a surface more than on the other.
 REACH_SIGMAS = 3.0
-_MAX_REACH = 8.0  # voxels: limits the memory for a very noisy sensor
+# Truncation distance in voxels: trilinear interpolation needs the first, and the second limits the
+# memory for a very noisy sensor.
+_MIN_REACH, _MAX_REACH = 3.0, 8.0
 # Bytes of a voxel besides its colour: distance, weight, views, and the number of its cell.
 _VOXEL_BYTES = 4 + 4 + 2 + 4
 _BLOCK_BYTES = 27 * 4 + 8 * 4 + 3 * 8  # of a block: its neighbours, its eighths, its keys
@@ -86,8 +88,8 @@ class Layout:
         reach = voxel_m * float(
             np.clip(
                 REACH_SIGMAS * sigma / voxel_m,
-                options.reach,
-                max(_MAX_REACH, options.reach),
+                _MIN_REACH,
+                _MAX_REACH,
             )
         )
         keys = _surface_blocks(views, poses, EDGE * voxel_m, reach, free_space_stride)

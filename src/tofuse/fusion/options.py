@@ -19,11 +19,6 @@ class Fusion(Bounded):
         depth, which keeps the resolution of the sensor, or 0.4 % of that depth if that is more.
     min_views
         Minimum number of frames that saw a point of the model.
-    normal_neighbours
-        Points in the plane fit of each normal, for clouds.
-    reach
-        Truncation distance of the signed distance field, voxels; larger where the noise requires
-        it.
     island
         Connected pieces of the surface with fewer vertices are removed.
     memory_mb
@@ -40,8 +35,6 @@ class Fusion(Bounded):
 
     voxel_m: Annotated[float | None, Bounds(1e-5, 100, exclusive=True)] = None
     min_views: Annotated[int, Bounds(1)] = 1
-    normal_neighbours: Annotated[int, Bounds(3, 1000)] = 12
-    reach: Annotated[float, Bounds(1.5, 100)] = 3.0
     island: Annotated[int, Bounds(0)] = 100
     memory_mb: Annotated[int, Bounds(1, 1_000_000)] = 600
     holes_m: Annotated[float, Bounds(0, 1e6)] = 0.0

@@ -194,7 +194,7 @@ class BackEnd:
         # Without loops: with and without external sensors.
         sequential = guided = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
-        told = measure_all(self._config.outside, sensed, tracked)
+        told = measure_all(self._config.priors, sensed, tracked)
         graph = with_sensors(graph, told)
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or told:

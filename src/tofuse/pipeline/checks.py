@@ -88,7 +88,7 @@ class Evidence:
         Indices of the frames that equal the one before in every pixel.
     interruptions
         Positions among the records at which another recording begins.
-    outside
+    priors
         Records of external sensors.
     components
         As in `Reconstruction`; empty if all frames are in one.
@@ -116,7 +116,7 @@ class Evidence:
     ambiguity_m: float | None = None
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
-    outside: tuple[SensorRecord, ...] = ()
+    priors: tuple[SensorRecord, ...] = ()
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
@@ -366,7 +366,7 @@ def _optimiser(e: Evidence) -> Iterator[Reason]:
 
 
 def _external_sensors(e: Evidence) -> Iterator[Reason]:
-    for sensor in e.outside:
+    for sensor in e.priors:
         if 2 * sensor.used < sensor.measured:
             text = f"{sensor.text[0].upper()}{sensor.text[1:]}."
             yield Reason("sensor_differs", e.posed, text)

@@ -53,7 +53,7 @@ class Config(Bounded):
     model_filters
         Applied after tracking, to the views of the model: the tracker weights each pixel by its
         noise and loses accuracy without noisy pixels, which a clean model must leave out.
-    outside
+    priors
         External sensors whose measurements are used.
     search
         Exhaustive searches for the pose of a view: of lost frames, loops and components.
@@ -79,7 +79,7 @@ class Config(Bounded):
     refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
-    outside: tuple[ExternalSensor, ...] = ()
+    priors: tuple[ExternalSensor, ...] = ()
     search: SearchOptions = SearchOptions()  # noqa: RUF009 - immutable
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True

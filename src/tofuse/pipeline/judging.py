@@ -158,7 +158,7 @@ def judge(
     kind = view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
     config = replace(
-        from_method("default", kind), tolerance_m=tolerance_m, outside=(), self_calibration=False
+        from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
     )
     given = replace(config, odometry=GivenPoses())
     check_views(given, kind)

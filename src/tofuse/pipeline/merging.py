@@ -113,7 +113,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     """Return the configuration of a merge: the default, with the model options of the first."""
     first = sessions[0].config
     default = from_method("default")
-    outside = default.outside if all(s.config.outside for s in sessions) else ()
+    priors = default.priors if all(s.config.priors for s in sessions) else ()
     searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
         default.joining,
@@ -130,7 +130,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
         odometry=first.odometry,
         fusion=first.fusion,
         tolerance_m=first.tolerance_m,
-        outside=outside,
+        priors=priors,
         joining=joining,
         self_calibration=False,  # done for each session
     )

@@ -87,5 +87,5 @@ def default(kind: ViewKind) -> Config:
         optimiser=LevenbergMarquardt(),
         refinement=Joint(),
         # Odometry only on request: a file next to the images may be of any quality.
-        outside=(GravityEdges(),),
+        priors=(GravityEdges(),),
     )

@@ -41,10 +41,10 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
     if prior not in get_args(Prior):
         raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
     if prior == "none":
-        return recording, replace(config, outside=())
-    if any(isinstance(sensor, OdometryEdges) for sensor in config.outside):
+        return recording, replace(config, priors=())
+    if any(isinstance(sensor, OdometryEdges) for sensor in config.priors):
         return recording, config
-    uses_gravity = any(isinstance(sensor, GravityEdges) for sensor in config.outside)
+    uses_gravity = any(isinstance(sensor, GravityEdges) for sensor in config.priors)
     poses = recording.reference if POSES_BY in recording.metadata else None
     if prior == "auto" and (not uses_gravity or poses is None):
         return recording, config
@@ -57,7 +57,7 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
             )
         recording = with_odometry(recording, poses)
     gravity = () if uses_gravity else (GravityEdges(),)
-    return recording, replace(config, outside=(*config.outside, *gravity, OdometryEdges()))
+    return recording, replace(config, priors=(*config.priors, *gravity, OdometryEdges()))
 
 
 @dataclass

@@ -142,7 +142,7 @@ def _track(
 def _with_facts(result: Reconstruction, recording: Recording, config: Config) -> Reconstruction:
     """Add the facts about the recording, and the device's vertical where no sensor gave it."""
     result = described(result, describe(recording))
-    if result.up is None and config.outside:
+    if result.up is None and config.priors:
         result = replace(result, up=device_up(recording, result))
     return result
 

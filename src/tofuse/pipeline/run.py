@@ -336,7 +336,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
         # Neither gravity nor the camera's odometry applies to the frame of a moving object.
-        config = changed(config, {"outside": []}, where="--object")
+        config = changed(config, {"priors": []}, where="--object")
     if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
         corrections.insert(0, {"part": "unwrap"})
     if front or corrections != chosen["corrections"]:

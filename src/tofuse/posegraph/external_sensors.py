@@ -10,17 +10,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity, PoseGraph
 
+# With fewer measured frames, a moving accelerometer can't be detected.
+_MIN_FRAMES = 3
 _MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
 
 
@@ -139,16 +142,16 @@ class SensorPriors:
 class ExternalSensor(Protocol):
     """A sensor next to the camera, and the weighting of its measurements."""
 
-    part_kind: ClassVar[str] = "outside"
+    part_kind: ClassVar[str] = "prior"
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """Return its weighted measurements, given the graph of odometry without loops."""
         ...
 
 
-@part("outside", "gravity")
+@part("prior", "gravity")
 @dataclass(frozen=True)
-class GravityEdges(ExternalSensor):
+class GravityEdges(Bounded, ExternalSensor):
     """Constrains roll and pitch by the direction of gravity.
 
     Attributes
@@ -158,21 +161,10 @@ class GravityEdges(ExternalSensor):
         bound on that of the vertical, however many frames there are.
     gate
         Squared error in units of sigma beyond which a direction hardly counts.
-    min_frames
-        With fewer measured frames, gravity is not used.
     """
 
-    shared_rad: float = 0.01
-    gate: float = 25.0
-    min_frames: int = 3
-
-    def __post_init__(self) -> None:
-        if not 1e-6 <= self.shared_rad <= 1:
-            raise ValueError(f"shared_rad is {self.shared_rad}, not 1e-6 to 1")
-        if not self.gate > 0:
-            raise ValueError(f"gate is {self.gate}, not above 0")
-        if self.min_frames < 1:
-            raise ValueError(f"min_frames is {self.min_frames}, not 1 or more")
+    shared_rad: Annotated[float, Bounds(1e-6, 1)] = 0.01
+    gate: Annotated[float, Bounds(0, exclusive=True)] = 25.0
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """See `ExternalSensor.measure`."""
@@ -180,8 +172,8 @@ class GravityEdges(ExternalSensor):
         count = len(known)
         if count == 0:
             return SensorPriors()
-        if count < self.min_frames:
-            text = f"only {count} frames measure gravity, {self.min_frames} are needed"
+        if count < _MIN_FRAMES:
+            text = f"only {count} frames measure gravity, {_MIN_FRAMES} are needed"
             return SensorPriors(records=(SensorRecord("gravity", count, 0, None, text),))
         measured = sensed.gravity[known].copy()
         measured[:, 3] = np.hypot(measured[:, 3], self.shared_rad)
@@ -200,9 +192,9 @@ class GravityEdges(ExternalSensor):
         return SensorPriors((), ids, measured, self.gate / less, (record,))
 
 
-@part("outside", "odometry")
+@part("prior", "odometry")
 @dataclass(frozen=True)
-class OdometryEdges(ExternalSensor):
+class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
     Its errors are compared with those of tracking. If the median misfit is larger than the errors
@@ -211,7 +203,7 @@ class OdometryEdges(ExternalSensor):
 
     Attributes
     ----------
-    share, share_rad
+    relative, relative_rad
         Standard deviation of a step, as a fraction of its length and of its angle.
     min_m, min_rad
         Constant part of it, m and rad.
@@ -221,22 +213,12 @@ class OdometryEdges(ExternalSensor):
         Squared error of a step, in units of the errors of both, beyond which it is rejected.
     """
 
-    share: float = 0.05
-    share_rad: float = 0.05
-    min_m: float = 0.002
-    min_rad: float = 0.002
-    limit: float = 5.0
-    gate: float = 40.0
-
-    def __post_init__(self) -> None:
-        for name in ("share", "share_rad"):
-            if not 0 <= getattr(self, name) <= 10:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 10")
-        for name in ("min_m", "min_rad"):
-            if not 1e-6 <= getattr(self, name) <= 10:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1e-6 to 10")
-        if not (self.limit >= 1 and self.gate > 0):
-            raise ValueError("limit must be 1 or more, and gate above 0")
+    relative: Annotated[float, Bounds(0, 10)] = 0.05
+    relative_rad: Annotated[float, Bounds(0, 10)] = 0.05
+    min_m: Annotated[float, Bounds(1e-6, 10)] = 0.002
+    min_rad: Annotated[float, Bounds(1e-6, 10)] = 0.002
+    limit: Annotated[float, Bounds(1)] = 5.0
+    gate: Annotated[float, Bounds(0, exclusive=True)] = 40.0
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """See `ExternalSensor.measure`."""
@@ -277,8 +259,8 @@ class OdometryEdges(ExternalSensor):
         """(K, 6, 6) of motions (K, 4, 4)."""
         sigma = np.empty((len(steps), 6))
         length, angle = np.linalg.norm(steps[:, :3, 3], axis=1), se3.angle(steps)
-        sigma[:, :3] = (self.min_m + self.share * length)[:, None]
-        sigma[:, 3:] = (self.min_rad + self.share_rad * angle)[:, None]
+        sigma[:, :3] = (self.min_m + self.relative * length)[:, None]
+        sigma[:, 3:] = (self.min_rad + self.relative_rad * angle)[:, None]
         return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
 
     def _scale(self, sensed: SensorData, graph: PoseGraph, C: Float64, first: Intp) -> float | None:

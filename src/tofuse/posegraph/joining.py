@@ -16,13 +16,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from tofuse.arrays import Float64, Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.kernels.motion import retract, twist_between
 from tofuse.odometry.motion import HANDHELD
@@ -49,6 +50,8 @@ View = PosedView[PreparedView]
 
 # Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
 _LEARN = 16
+# One search for so many frames, as long recordings have more places.
+_FRAMES_PER_SEARCH = 50
 # View pairs that verify a join, besides those of the links; and their smallest overlap.
 _VERIFY, _OVERLAP = 8, 0.2
 # Contradiction is unusual beyond this many standard deviations above the median of neighbours.
@@ -158,14 +161,13 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Joining:
+class Joining(Bounded):
     """Options of joining components.
 
     Attributes
     ----------
-    searches, searches_per_frame
-        Largest number of searches: a constant, plus one for each component, plus this for each
-        frame.
+    searches
+        Maximum number of searches, in addition to one for each component and for every 50 frames.
     bridge
         Whether short gaps may be bridged by motion alone.
     tries
@@ -178,24 +180,16 @@ class Joining:
         number ("first").
     """
 
-    searches: int = 12
-    searches_per_frame: float = 0.02
+    searches: Annotated[int, Bounds(0, 1_000_000)] = 12
     bridge: bool = True
-    tries: int = 4
-    min_probability: float = 0.0
+    tries: Annotated[int, Bounds(0, 1_000_000)] = 4
+    min_probability: Annotated[float, Bounds(0, 0.999999)] = 0.0
     main: Literal["largest", "first"] = "largest"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.searches <= 1_000_000:
-            raise ValueError(f"searches is {self.searches}, not 0 or more")
-        if not 0 <= self.searches_per_frame <= 100:
-            raise ValueError(f"searches_per_frame is {self.searches_per_frame}, not 0 or more")
-        if not 0 <= self.tries <= 1_000_000:
-            raise ValueError(f"tries is {self.tries}, not 0 or more")
-        if not 0 <= self.min_probability < 1:
-            raise ValueError(f"min_probability is {self.min_probability}, not from 0 to below 1")
+        super().__post_init__()
         if self.main not in ("largest", "first"):
-            raise ValueError(f"main is {self.main!r}, not largest or first")
+            raise ValueError(f"main must be largest or first, not {self.main!r}")
 
     def join(
         self,
@@ -257,7 +251,7 @@ class _Joiner:
         self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
         self._paths: dict[tuple[int, ...], dict[int, float]] = {}
         total = sum(len(s.frames) for s in stretches)
-        self._searches = options.searches + len(stretches) + int(options.searches_per_frame * total)
+        self._searches = options.searches + len(stretches) + total // _FRAMES_PER_SEARCH
         self._usual = UsualFit()
         self._contradiction = CONTRADICTION
         steps = [_speeds(s, end=True) for s in stretches]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.parts import part
-from tofuse.posegraph.charts import Rotation
 from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
@@ -23,7 +24,7 @@ _NEGATIVE = -1e-9  # of the largest eigenvalue: information with a smaller one i
 
 @part("optimiser", "levenberg-marquardt", label="validated")
 @dataclass(frozen=True)
-class LevenbergMarquardt(Optimiser):
+class LevenbergMarquardt(Bounded, Optimiser):
     """Weighted least squares on SE(3), robust against false loops.
 
     Edges of odometry, gravity and anchors have their full weight; loop edges that of the robust
@@ -39,29 +40,10 @@ class LevenbergMarquardt(Optimiser):
     gate
         Threshold on a loop edge's squared error, in units of its information: 100 is ten standard
         deviations.
-    max_inflation
-        Largest factor on the loops' standard deviations before "truncated" rejects them, as stated
-        information is often too large.
-    rotation
-        Parametrisation of rotations in a step: "tangent", "quaternion" or "cosines".
-    tolerance
-        Iterations stop when a step lowers the objective by a smaller fraction.
-    max_iterations
-        Largest number of steps.
     """
 
     robust: Robust = "truncated"
-    gate: float = 100.0
-    max_inflation: float = 3.0
-    rotation: Rotation = "tangent"
-    tolerance: float = 1e-6
-    max_iterations: int = 100
-
-    def __post_init__(self) -> None:
-        if not self.gate > 0:
-            raise ValueError(f"gate is {self.gate}, not above 0")
-        if not self.max_inflation >= 1:
-            raise ValueError(f"max_inflation is {self.max_inflation}, not 1 or more")
+    gate: Annotated[float, Bounds(0, exclusive=True)] = 100.0
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`.
@@ -71,61 +53,64 @@ class LevenbergMarquardt(Optimiser):
         InputError
             If a pose or a measurement is not finite, or information not positive semidefinite.
         """
-        check_graph(graph)
-        poses = graph.poses.copy()
-        weights = np.ones(len(graph.edges))
-        parts, histories = [], []
-        for vertices, edges in pieces(graph):
-            solution = self._solve(graph, vertices, edges)
-            before, after = solution.history[0], solution.history[-1]
-            history = solution.history if after < before else (before,)
-            if after < before:
-                poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
-                # Exactly as before, without rounding errors.
-                poses[vertices[0]] = graph.poses[vertices[0]]
-            weights[edges] = solution.weights[: len(edges)]
-            histories.append(history)
-            parts.append(
-                GraphPart(
-                    int(graph.ids[vertices[0]]), len(vertices), len(edges),
-                    before, history[-1], solution.converged,
-                )
-            )  # fmt: skip
-        return Optimisation(
-            graph.with_poses(poses),
-            added_up(histories),
-            all(p.converged for p in parts),
-            weights,
-            tuple(parts),
-        )
+        return minimise(graph, Settings(self.robust, self.gate))
 
-    def _solve(self, graph: PoseGraph, vertices: Intp, edges: Intp) -> Solution:
-        """Solve one part; anchors are edges to one additional vertex, the last."""
-        number = np.full(len(graph.ids), -1)
-        number[vertices] = np.arange(len(vertices))
-        poses, pairs = graph.poses[vertices], number[graph.edges[edges]]
-        measured, information = graph.measurements[edges], graph.information[edges]
-        loop = graph.loop[edges]
-        if graph.anchors is not None and (number[graph.anchors.vertices] >= 0).any():
-            here = number[graph.anchors.vertices] >= 0
-            ends, Z = number[graph.anchors.vertices[here]], graph.anchors.poses[here]
-            frame = poses[ends[0]] @ se3.inverse(Z[0])
-            poses = np.concatenate([poses, frame[None]])
-            more = np.stack([np.full(len(ends), len(vertices)), ends], axis=1)
-            pairs = np.concatenate([pairs, more])
-            measured = np.concatenate([measured, Z])
-            information = np.concatenate([information, graph.anchors.information[here]])
-            loop = np.append(loop, np.zeros(len(ends), bool))
-        fixed = np.zeros(len(poses), bool)
-        fixed[0] = True
-        return solve(
-            poses, pairs, measured, information,
-            loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
-            settings=Settings(
-                self.robust, self.gate, self.max_inflation, self.rotation, self.tolerance,
-                self.max_iterations,
-            ),
+
+def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
+    """Optimise a graph with given settings, see `LevenbergMarquardt`."""
+    check_graph(graph)
+    poses = graph.poses.copy()
+    weights = np.ones(len(graph.edges))
+    parts, histories = [], []
+    for vertices, edges in pieces(graph):
+        solution = _solve(graph, vertices, edges, settings)
+        before, after = solution.history[0], solution.history[-1]
+        history = solution.history if after < before else (before,)
+        if after < before:
+            poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
+            # Exactly as before, without rounding errors.
+            poses[vertices[0]] = graph.poses[vertices[0]]
+        weights[edges] = solution.weights[: len(edges)]
+        histories.append(history)
+        parts.append(
+            GraphPart(
+                int(graph.ids[vertices[0]]), len(vertices), len(edges),
+                before, history[-1], solution.converged,
+            )
         )  # fmt: skip
+    return Optimisation(
+        graph.with_poses(poses),
+        added_up(histories),
+        all(p.converged for p in parts),
+        weights,
+        tuple(parts),
+    )
+
+
+def _solve(graph: PoseGraph, vertices: Intp, edges: Intp, settings: Settings) -> Solution:
+    """Solve one part; anchors are edges to one additional vertex, the last."""
+    number = np.full(len(graph.ids), -1)
+    number[vertices] = np.arange(len(vertices))
+    poses, pairs = graph.poses[vertices], number[graph.edges[edges]]
+    measured, information = graph.measurements[edges], graph.information[edges]
+    loop = graph.loop[edges]
+    if graph.anchors is not None and (number[graph.anchors.vertices] >= 0).any():
+        here = number[graph.anchors.vertices] >= 0
+        ends, Z = number[graph.anchors.vertices[here]], graph.anchors.poses[here]
+        frame = poses[ends[0]] @ se3.inverse(Z[0])
+        poses = np.concatenate([poses, frame[None]])
+        more = np.stack([np.full(len(ends), len(vertices)), ends], axis=1)
+        pairs = np.concatenate([pairs, more])
+        measured = np.concatenate([measured, Z])
+        information = np.concatenate([information, graph.anchors.information[here]])
+        loop = np.append(loop, np.zeros(len(ends), bool))
+    fixed = np.zeros(len(poses), bool)
+    fixed[0] = True
+    return solve(
+        poses, pairs, measured, information,
+        loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
+        settings=settings,
+    )  # fmt: skip
 
 
 def _gravity_of(graph: PoseGraph, number: Intp) -> Gravity | None:

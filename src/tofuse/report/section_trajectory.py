@@ -206,7 +206,7 @@ def optimised(s: Subject) -> Values:
             refined += f"Consistency fell from {support}: it was discarded."
         else:
             refined = "No two views overlap enough for a global refinement."
-    out += [f"{sensor.text[0].upper()}{sensor.text[1:]}." for sensor in d.outside]
+    out += [f"{sensor.text[0].upper()}{sensor.text[1:]}." for sensor in d.priors]
     return {"optimised": " ".join(out), "refined": refined, "camera_check": _camera_check(r)}
 
 

@@ -76,7 +76,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         {name: each["removed"] for name, each in run["filters"].items()},
         run["seconds"],
         parts=tuple(_part(each) for each in run["optimiser"]),
-        outside=tuple(SensorRecord(**s) for s in run["outside"]),
+        priors=tuple(SensorRecord(**s) for s in run["priors"]),
         accuracy=_accuracy(run["accuracy"]),
         calibrated=_calibration(run.get("self_calibration")),
     )

@@ -284,7 +284,7 @@ def run_json(result: Reconstruction, tiled: tiles.TilingSummary | None = None) -
                 }
                 for p in d.parts
             ],
-            "outside": [
+            "priors": [
                 {
                     "sensor": s.sensor,
                     "measured": s.measured,
@@ -292,7 +292,7 @@ def run_json(result: Reconstruction, tiled: tiles.TilingSummary | None = None) -
                     "scale": s.scale,
                     "text": s.text,
                 }
-                for s in d.outside
+                for s in d.priors
             ],
             "refinement": _refinement(d.refinement),
             "filters": {name: {"removed": share} for name, share in d.removed.items()},

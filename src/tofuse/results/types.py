@@ -137,7 +137,7 @@ class Diagnostics:
         Outcome of the global refinement; None where there was none.
     parts
         The connected parts of the pose graph, where the optimiser treats them separately.
-    outside
+    priors
         Outcome of the external sensors.
     samples
         Small images of some frames; empty for clouds.
@@ -160,7 +160,7 @@ class Diagnostics:
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
-    outside: tuple[SensorRecord, ...] = ()
+    priors: tuple[SensorRecord, ...] = ()
     samples: tuple[FrameSample, ...] = ()
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
     calibrated: SelfCalibration | None = None

@@ -164,7 +164,7 @@ def reconstruct_rig(
         odometry=GivenPoses(),
         loops=_NO_LOOPS,
         refinement=NoRefinement(),
-        outside=(),
+        priors=(),
         self_calibration=False,
     )
     moved = bool(measured or tracked)
