@@ -392,6 +392,39 @@ def test_constants_of_the_covariance_are_those_of_the_tracker() -> None:
     assert len(stated) == 7
 
 
+def options_of(data: Any, path: str = "") -> dict[str, str]:
+    """Options of a configuration's data by path, parts of a list by their names, as JSON."""
+    found: dict[str, str] = {}
+    if isinstance(data, dict):
+        for key, value in data.items():
+            if key != "part":
+                found |= options_of(value, f"{path}.{key}" if path else key)
+    elif isinstance(data, list) and data and isinstance(data[0], dict):
+        for item in data:
+            found |= options_of(item, f"{path}.{item['part']}")
+    else:
+        found[path] = json.dumps(data)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["range", "cloud"])
+def test_the_default_configuration_has_few_options(kind: ViewKind) -> None:
+    """What no user has a reason to set should be a constant."""
+    assert len(options_of(from_method("default", kind).to_dict())) <= 60
+
+
+def test_options_of_the_default_configuration_are_listed_with_their_defaults() -> None:
+    tables = {
+        name: {row[0].strip("`"): row[1].strip("`") for row in rows(text)}
+        for name, text in sections("docs/options.md").items()
+        if rows(text)
+    }
+    images, clouds = tables["Range images"], tables["Clouds"]
+    assert images == options_of(from_method("default", "range").to_dict())
+    assert images | clouds == images | options_of(from_method("default", "cloud").to_dict())
+    assert not clouds.items() & images.items()
+
+
 def test_every_field_of_a_configuration_is_described() -> None:
     table = rows(sections("docs/methods.md")["Configurations"])
     described = {row[0].strip("`") for row in table} - set(methods())
