@@ -134,7 +134,9 @@ def comes_back(
     views: Sequence[PreparedView], T: Float64, direction: Float64, options: ProjectiveOptions
 ) -> bool:
     """Whether the images themselves hold a direction: see above."""
-    free = replace(options, levels=PATIENT, held=1e6, common_tilt=0.0, prior_m=3.0, prior_rad=3.0)
+    free = replace(
+        options, levels=PATIENT, constrained=1e6, common_tilt=0.0, prior_m=3.0, prior_rad=3.0
+    )
     targets = [Target(views[0], np.eye(4))]
     for start in (-AWAY, AWAY):
         guess = T @ se3.exp(start * direction * UNITS)

@@ -209,14 +209,13 @@ def test_without_files_nothing_changes():
     [
         (GravityEdges, {"shared_rad": 0}),
         (GravityEdges, {"gate": -1}),
-        (GravityEdges, {"min_frames": 0}),
-        (OdometryEdges, {"share": -1}),
+        (OdometryEdges, {"relative": -1}),
         (OdometryEdges, {"min_m": 0}),
         (OdometryEdges, {"limit": 0.5}),
     ],
 )
 def test_options_that_make_no_sense_are_refused(part, options):
-    with pytest.raises(ValueError, match=r"is|must"):
+    with pytest.raises(ValueError, match=next(iter(options))):
         part(**options)
 
 

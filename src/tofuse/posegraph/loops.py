@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.view_store import ViewStore
@@ -158,7 +159,7 @@ class LoopDetector(Protocol):
 
 
 @dataclass(frozen=True)
-class Confirmation:
+class Confirmation(Bounded):
     """Register two views, and accept them if the error is low and enough points correspond (3.4).
 
     E of Algorithm 1 is normalised by the number of all points, and so decreases when points lose
@@ -179,16 +180,13 @@ class Confirmation:
     registrations: tuple[Registrar, ...] = field(
         default_factory=lambda: (algorithm_1(0.2), algorithm_1(0.05))
     )
-    min_share: float = 0.3
-    max_error: float = 0.65
+    min_share: Annotated[float, Bounds(0, 1)] = 0.3
+    max_error: Annotated[float, Bounds(0, exclusive=True)] = 0.65
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.registrations:
             raise ValueError("registrations is empty")
-        if not 0 <= self.min_share <= 1:
-            raise ValueError(f"min_share is {self.min_share}, not 0 to 1")
-        if not self.max_error > 0:
-            raise ValueError(f"max_error is {self.max_error}, not above 0")
 
     def objection(self, registration: Registration) -> str:
         """Return why a registration is rejected; empty if it is accepted.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.loops import (
@@ -27,7 +29,7 @@ from tofuse.registration.search import SearchOptions
 
 @part("loops", "nearby", label="validated")
 @dataclass(frozen=True)
-class Nearby(LoopDetector):
+class Nearby(Bounded, LoopDetector):
     """Selects earlier frames as candidates if the camera was close and had about the same yaw.
 
     Attributes
@@ -45,20 +47,11 @@ class Nearby(LoopDetector):
         Accepts or rejects candidates.
     """
 
-    max_distance_m: float = 0.5
-    max_yaw_rad: float = 0.35
-    min_gap: int = 16
-    per_frame: int = 2
+    max_distance_m: Annotated[float, Bounds(0, exclusive=True)] = 0.5
+    max_yaw_rad: Annotated[float, Bounds(0, exclusive=True)] = 0.35
+    min_gap: Annotated[int, Bounds(1)] = 16
+    per_frame: Annotated[int, Bounds(0)] = 2
     confirmation: Confirmation = field(default_factory=Confirmation)
-
-    def __post_init__(self) -> None:
-        for name in ("max_distance_m", "max_yaw_rad"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        if self.min_gap < 1:
-            raise ValueError(f"min_gap is {self.min_gap}, not 1 or more")
-        if self.per_frame < 0:
-            raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
     def start(
         self,
