@@ -310,7 +310,7 @@ def test_what_can_not_be_meant_is_refused():
     information[3, 1, 1] *= -1
     with pytest.raises(InputError, match="edge 3 4: the information matrix is not positive"):
         LevenbergMarquardt().optimise(replace(graph, information=information))
-    with pytest.raises(ValueError, match="gate is 0"):
+    with pytest.raises(ValueError, match="gate must be above 0"):
         LevenbergMarquardt(gate=0.0)
     with pytest.raises(InputError, match="names no vertex"):
         replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
