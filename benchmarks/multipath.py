@@ -231,9 +231,13 @@ def decided(config: Config, recording: Recording) -> Multipath | None:
 
 def in_words(part: Multipath | None) -> tuple[str, str]:
     """Strength and decision."""
-    if part is None or (part.applied and part.seen is None):
+    if part is None or (part.applied and part.strength is None):
         return "", "nothing that it works on"
-    seen = "too little" if part.seen is None else f"{part.seen[0]:.2f} ± {part.seen[1]:.2f}"
+    seen = (
+        "too little"
+        if part.strength is None
+        else f"{part.strength[0]:.2f} ± {part.strength[1]:.2f}"
+    )
     return seen, "applied" if part.applied else "left out"
 
 

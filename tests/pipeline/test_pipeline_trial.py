@@ -46,8 +46,8 @@ def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Record
     part = multipath_of(config)
     assert part.disabled
     assert not part.trial
-    assert part.seen is not None
-    assert abs(part.seen[0]) < 0.15
+    assert part.strength is not None
+    assert abs(part.strength[0]) < 0.15
     assert [n for n in listener.notes if "multipath not applied" in n]
     # Views pass as they are.
     corrector, frame = part.start(), straight[0]
@@ -64,8 +64,8 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
     config = adapted(from_method("default"), recording, 1, listener)
     part = multipath_of(config)
     assert part.applied
-    assert part.seen is not None
-    strength, error = part.seen
+    assert part.strength is not None
+    strength, error = part.strength
     assert 0.2 < strength < 1
     # What is not known of the strength is in the error of each pixel.
     assert part.relative_sigma == pytest.approx(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from corner_views import SHARP, corner
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.build import Measured, build_graph
@@ -24,6 +25,7 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import Priors, RefineOptions, refine
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.view_store import KeptView
+from tofuse.registration.prepared_view import prepare_view
 
 N = 60
 SIGMA = np.array([0.004] * 3 + [0.004] * 3)
@@ -221,10 +223,6 @@ def test_options_that_make_no_sense_are_refused(part, options):
 
 def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
     """Views of a bare wall, which any turn about its normal and shift along it leaves as it is."""
-    from test_kernels_refinement import SHARP, corner
-
-    from tofuse.registration.prepared_view import prepare_view
-
     poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))
     views = []
     for k, T in enumerate(poses):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import pytest
 
@@ -141,6 +141,25 @@ def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> 
             {"filters": [{"part": "median"}, {"part": "neighbour_share", "k": "x"}]},
             where="c.toml",
         )
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"search": {"reach": -1}}, "reach"),
+        ({"search": {"mode": "thorough"}}, "mode"),
+        ({"joining": {"search": {}}}, "search"),
+        ({"joining": {"main": "last"}}, "main"),
+        ({"loops": {"max_drift": 2}}, "max_drift"),
+        ({"refinement": {"submap": 1}}, "submap"),
+        ({"priors": [{"part": "gravity", "gate": 0}]}, "gate"),
+        ({"outside": []}, "outside"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=field) as refused:
+        changed(from_method("default"), changes, where="c.toml")
+    assert str(refused.value).startswith("c.toml: ")
 
 
 @dataclass(frozen=True)

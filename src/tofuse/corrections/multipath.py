@@ -51,7 +51,7 @@ class Multipath(Bounded, Correction):
         it bends flat surfaces. Not needed with a given gain.
     applied
         Whether anything is corrected, as decided by the trial.
-    seen
+    strength
         Outcome of the trial: the fraction of the predicted disagreement that was observed, and its
         standard error; None without a trial, or if too little could be compared.
     """
@@ -63,14 +63,16 @@ class Multipath(Bounded, Correction):
     relative_sigma: Annotated[float, Bounds(0, 10)] = 0.2
     trial: bool = True
     applied: bool = True
-    seen: tuple[float, ...] | None = None
+    strength: tuple[float, ...] | None = None
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.seen is not None and not (len(self.seen) == 2 and np.isfinite(self.seen).all()):
-            raise ValueError(f"seen is {self.seen}, not a strength and its standard error")
+        if self.strength is not None and not (
+            len(self.strength) == 2 and np.isfinite(self.strength).all()
+        ):
+            raise ValueError(f"strength is {self.strength}, not a strength and its standard error")
 
     @property
     def needs_trial(self) -> bool:
@@ -96,8 +98,10 @@ class Multipath(Bounded, Correction):
         relative_sigma = (
             float(np.hypot(self.relative_sigma, error / strength)) if helps else self.relative_sigma
         )
-        seen = (float(strength), float(error))
-        return replace(self, trial=False, applied=helps, seen=seen, relative_sigma=relative_sigma)
+        outcome = (float(strength), float(error))
+        return replace(
+            self, trial=False, applied=helps, strength=outcome, relative_sigma=relative_sigma
+        )
 
     def start(self, reflections: MultipathModel | None = None) -> MultipathCorrector:
         """See `Correction.start`. `reflections` computes the multipath."""
