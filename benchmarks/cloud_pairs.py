@@ -1,8 +1,8 @@
 """Two bare clouds far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
 
 `table` gives, over kinds of pairs, how many poses are right (within 0.1 m, or 5 % of the extent
-where that is less, at the middle of the source, and 4 degrees), how many of those are believed, and
-how many are believed and wrong; beside it Open3D's RANSAC over FPFH with point-to-plane ICP, and
+where that is less, at the middle of the source, and 4 degrees), how many of those are accepted, and
+how many are accepted and wrong; beside it Open3D's RANSAC over FPFH with point-to-plane ICP, and
 KISS-Matcher, as far as they are installed, with voxels of 1/100 of the target's extent. Clouds have
 at most 20,000 points. "moved" clouds were taken to another frame, so that nothing is known of
 where they were seen from; of "sparse" pairs the source has a tenth of the target's points. `fit`
@@ -259,10 +259,10 @@ KINDS = {
 
 
 def off_and_belief(pair: Pair, found: Registration | Float64) -> tuple[bool, bool, float]:
-    """Whether a pose is right, whether it is believed, and its probability."""
+    """Whether a pose is right, whether it is accepted, and its probability."""
     if isinstance(found, Registration):
         T = found.T_target_source
-        return pair.is_right(T), bool(found.believed), found.probability or 0.0
+        return pair.is_right(T), bool(found.accepted), found.probability or 0.0
     return pair.is_right(found), False, 0.0
 
 
@@ -280,7 +280,7 @@ def timed(method: pairs.Method, pair: Pair) -> tuple[bool, bool, float, float]:
 def print_table(names: list[str], data: Path, most: int) -> None:
     """A row for each kind, and what the probability is worth over all of them."""
     print(
-        "| Clouds | right | of these believed | believed and wrong | s a pair"
+        "| Clouds | right | of these accepted | accepted and wrong | s a pair"
         " | Open3D | s | KISS-Matcher | s |\n|---|---|---|---|---|---|---|---|---|"
     )
     p, right = [], []
@@ -303,9 +303,9 @@ def print_table(names: list[str], data: Path, most: int) -> None:
                 if method is not None:
                     rows.append(timed(method, pair))
         print(_row(KINDS[name].title, ours, theirs), flush=True)
-    wrong = sum(x >= pairs.BELIEVED and not r for x, r in zip(p, right, strict=True))
+    wrong = sum(x >= pairs.ACCEPTED and not r for x, r in zip(p, right, strict=True))
     print(
-        f"\n{len(p)} pairs, believed {sum(x >= pairs.BELIEVED for x in p)}, of these wrong {wrong}"
+        f"\n{len(p)} pairs, accepted {sum(x >= pairs.ACCEPTED for x in p)}, of these wrong {wrong}"
     )
     print(f"area under the ROC curve {pairs.roc_area(np.array(p), np.array(right)):.3f}")
     pairs.print_calibration(np.array(p), np.array(right))
@@ -352,8 +352,8 @@ def _print_decoys(names: list[str], data: Path, most: int) -> None:
         for pair, _ in decoys(names, data, most, np.random.default_rng([1, 6]))
     ]
     if found:
-        believed = sum(f[1] for f in found)
-        print(f"\nof {len(found)} pairs of different places {believed} believed", end=", ")
+        accepted = sum(f[1] for f in found)
+        print(f"\nof {len(found)} pairs of different places {accepted} accepted", end=", ")
         print(f"highest probability {max(f[2] for f in found):.2f}")
 
 
@@ -370,10 +370,10 @@ def print_fit(data: Path, most: int) -> None:
         pairs.print_fit(title, pairs.stacked([row[:3] for row in rows]))
         p = np.array([row[3] for row in held_out])
         right = np.array([row[1] for row in held_out], bool)
-        believed = p >= pairs.BELIEVED
+        accepted = p >= pairs.ACCEPTED
         print(f"\nas in use, on {len(p)} poses of {', '.join(others)}:")
-        print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, believed", end=" ")
-        print(f"{believed.sum()}, of these wrong {(believed & ~right).sum()}")
+        print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, accepted", end=" ")
+        print(f"{accepted.sum()}, of these wrong {(accepted & ~right).sum()}")
 
 
 # Regressors, whether the pose is right, number of the family, and the probability in use.

@@ -6,7 +6,7 @@ on top of the scene's own, a fifth have uniform albedo. The covariance's eigen-d
 sorted from the tightest (1) to the loosest (6), in units of 1 cm and 1 degree; the error along
 each, over its sigma, should be within 0.674, 1.645 and 1.960 in 50, 90 and 95 of 100 cases.
 Directions that were reported as unobservable, and alignments that the tracker would not have
-believed, are counted and left out. "plain" is the inverse of the plain information matrix.
+accepted, are counted and left out. "plain" is the inverse of the plain information matrix.
 
     python benchmarks/covariance.py [--pairs 500] [--noise poisson other] [--seed 1000]
 

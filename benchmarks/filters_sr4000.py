@@ -22,7 +22,7 @@ from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.confidence import Confidence
 from tofuse.filters.distance import Distance
 from tofuse.filters.median import Median
-from tofuse.filters.neighbours import NeighbourDistance, NeighbourShare
+from tofuse.filters.neighbours import NeighbourDistance, NeighbourFraction
 from tofuse.filters.temporal import TemporalDeviation, z_deviation
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
@@ -37,10 +37,10 @@ CASES: dict[str, list[Filter]] = {
     "neighbourhood angle 170 deg": [NeighbourhoodAngle()],
     "median 5 x 5, 0.1 m": [Median()],
     "neighbour distance 0.05 m": [NeighbourDistance()],
-    "neighbour share 0.5": [NeighbourShare()],
+    "neighbour share 0.5": [NeighbourFraction()],
     "temporal 25 mm": [TemporalDeviation()],
-    "chapter 4: confidence 7, share 0.5": [Confidence(), NeighbourShare()],
-    "figure 3.2 d: temporal, share 0.5": [TemporalDeviation(), NeighbourShare()],
+    "chapter 4: confidence 7, share 0.5": [Confidence(), NeighbourFraction()],
+    "figure 3.2 d: temporal, share 0.5": [TemporalDeviation(), NeighbourFraction()],
 }
 
 

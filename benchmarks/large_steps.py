@@ -89,7 +89,7 @@ class Outcome:
 
     right: bool
     probability: float
-    believed: bool
+    accepted: bool
     seconds: float
 
 
@@ -132,7 +132,7 @@ def look(
     right = False
     if true is not None:
         right = is_right(found.T_target_source, true)
-    return Outcome(right, found.probability or 0.0, bool(found.believed), seconds)
+    return Outcome(right, found.probability or 0.0, bool(found.accepted), seconds)
 
 
 def neighbours(taken: Views, options: SearchOptions) -> list[Outcome]:
@@ -178,11 +178,11 @@ def roc_area(right: list[Outcome], wrong: list[Outcome]) -> float:
 
 
 def counted(outcomes: list[Outcome]) -> str:
-    """How many are right, how many of those are believed, and what is believed and wrong."""
+    """How many are right, how many of those are accepted, and what is accepted and wrong."""
     right = sum(o.right for o in outcomes)
-    believed = sum(o.right and o.believed for o in outcomes)
-    wrong = sum(o.believed and not o.right for o in outcomes)
-    return f"{right} of {len(outcomes)}, {believed} believed" + f", {wrong} wrong" * (wrong > 0)
+    accepted = sum(o.right and o.accepted for o in outcomes)
+    wrong = sum(o.accepted and not o.right for o in outcomes)
+    return f"{right} of {len(outcomes)}, {accepted} accepted" + f", {wrong} wrong" * (wrong > 0)
 
 
 def print_row(title: str, bare: list[Outcome], full: list[Outcome]) -> None:
@@ -197,11 +197,11 @@ Method = Callable[[RangeFrame, RangeFrame], Float64 | None]
 
 
 def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
-    """The pose that the exhaustive search finds, if it is believed."""
+    """The pose that the exhaustive search finds, if it is accepted."""
     options = SurfaceOptions()
     views = prepare_view(source, options), prepare_view(target, options)
     found = register_pair(*views, options=SearchOptions(mode="auto"), always_search=True)
-    return found.T_target_source if found is not None and found.believed else None
+    return found.T_target_source if found is not None and found.accepted else None
 
 
 def by_part(part: Features | Fpfh | PlaneSets) -> Method:

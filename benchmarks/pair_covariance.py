@@ -1,10 +1,10 @@
-"""Is the covariance of a believed pair right? Errors of `tofuse.register` beside what it states.
+"""Is the covariance of an accepted pair right? Errors of `tofuse.register` beside what it states.
 
 Simulated pairs without a guess, by family: views of three ToF cameras with all their effects (light
 by way of other surfaces, scattering, wiggling, motion) as range images, as bare clouds, moved to
 any other frame, and with fewer points in one of them; objects that turn before a camera; and
 spherical scans whose noise, error over range and density are drawn at random. Of the poses that are
-believed and right (within 5 % of the extent and 4 degrees) the table says
+accepted and right (within 5 % of the extent and 4 degrees) the table says
 
 - how many errors lie in the 95 % ellipsoid of the stated covariance, without the directions that
   are stated to be unobservable;
@@ -224,7 +224,7 @@ def _moved(
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Of a believed pose.
+    """Of an accepted pose.
 
     Attributes
     ----------
@@ -294,12 +294,12 @@ class Outcome:
 
 
 def outcome(case: Case) -> Outcome | None:
-    """Register; None where the pose is not believed."""
+    """Register; None where the pose is not accepted."""
     try:
         found: Registration = tofuse.register(case.source, case.target)
     except RegistrationError:
         return None
-    if not found.believed:
+    if not found.accepted:
         return None
     p = case.source.points.astype(np.float64)
     J = np.zeros((len(p), 3, 6))
@@ -336,7 +336,7 @@ def row(name: str, some: list[Outcome]) -> str:
 
 def report(found: list[Outcome], *, kinds: bool = False) -> None:
     print(
-        "| Pairs | believed and right | and wrong | % in the 95 % ellipsoid | radius / error"
+        "| Pairs | accepted and right | and wrong | % in the 95 % ellipsoid | radius / error"
         " | % within the bound | bound / error | error, mm | leaks |\n"
         "|---|---|---|---|---|---|---|---|---|"
     )
@@ -371,7 +371,7 @@ def main() -> None:
                     found.append(one)
     if given.keep:
         given.keep.write_bytes(pickle.dumps(found))
-    print(f"{len(found)} of {tried} pairs are believed\n")
+    print(f"{len(found)} of {tried} pairs are accepted\n")
     report(found, kinds=given.kinds)
 
 

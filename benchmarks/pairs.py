@@ -1,7 +1,7 @@
 """Two range images far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
 
 `table` gives, over the frames between the two, how many poses are right (within 0.1 m and 4
-degrees), how many of those are believed, and how many are believed and wrong; beside it Open3D's
+degrees), how many of those are accepted, and how many are accepted and wrong; beside it Open3D's
 RANSAC over FPFH with point-to-plane ICP, if it is installed. `fit` fits the logistic models of
 `tofuse.registration.confidence` to simulated pairs, some of which share nothing, and prints their
 coefficients, with area under the ROC curve and calibration on scenes that took no part in the fit.
@@ -48,7 +48,7 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
+from tofuse.registration.confidence import ACCEPTED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -160,7 +160,7 @@ class Outcome:
     metres: float
     degrees: float
     seconds: float
-    believed: bool = False
+    accepted: bool = False
     probability: float = 0.0
 
     @property
@@ -180,8 +180,8 @@ def outcome(method: Method, source: RangeFrame, target: RangeFrame, true: Float6
         return Outcome(np.inf, np.inf, time.perf_counter() - start)
     seconds = time.perf_counter() - start
     if isinstance(found, Registration):
-        believed, probability = bool(found.believed), found.probability or 0.0
-        return Outcome(*off(found.T_target_source, true), seconds, believed, probability)
+        accepted, probability = bool(found.accepted), found.probability or 0.0
+        return Outcome(*off(found.T_target_source, true), seconds, accepted, probability)
     return Outcome(*off(found, true), seconds)
 
 
@@ -190,7 +190,7 @@ def print_table(names: Sequence[str], data: Path, most: int) -> None:
     ours: list[Outcome] = []
     peer = o3d_global.method()
     print(
-        "| Views | frames apart | right | of these believed | believed and wrong | s a pair"
+        "| Views | frames apart | right | of these accepted | accepted and wrong | s a pair"
         " | Open3D right | s a pair |\n|---|---|---|---|---|---|---|---|"
     )
     for name in names:
@@ -280,7 +280,7 @@ def print_methods(names: Sequence[str], data: Path, most: int) -> None:
 
 
 def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
-    """How many pairs of views of different places are believed; `most` of each two scenes."""
+    """How many pairs of views of different places are accepted; `most` of each two scenes."""
     rng = np.random.default_rng([1, 4])
     there = [name for name in names if _is_there(name, data)]
     found: list[Registration] = []
@@ -298,10 +298,10 @@ def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
                 except RegistrationError:
                     refused += 1
     if found:
-        believed = sum(bool(f.believed) for f in found)
+        accepted = sum(bool(f.accepted) for f in found)
         highest = max(f.probability or 0.0 for f in found)
         print(
-            f"\nof {len(found) + refused} pairs of different places {believed} believed,", end=" "
+            f"\nof {len(found) + refused} pairs of different places {accepted} accepted,", end=" "
         )
         print(f"{refused} refused, highest probability {highest:.2f}")
 
@@ -316,8 +316,8 @@ def _is_there(name: str, data: Path) -> bool:
 
 def _row(scene: Scene, apart: int, mine: list[Outcome], theirs: list[Outcome]) -> str:
     right = sum(o.right for o in mine)
-    sure = sum(o.right and o.believed for o in mine)
-    wrong = sum(o.believed and not o.right for o in mine)
+    sure = sum(o.right and o.accepted for o in mine)
+    wrong = sum(o.accepted and not o.right for o in mine)
     cells = [
         scene.title,
         apart * scene.every,
@@ -334,11 +334,11 @@ def _row(scene: Scene, apart: int, mine: list[Outcome], theirs: list[Outcome]) -
 def _print_worth(found: list[Outcome]) -> None:
     p = np.array([o.probability for o in found])
     right = np.array([o.right for o in found])
-    believed = np.array([o.believed for o in found])
-    wrong = believed & ~right
+    accepted = np.array([o.accepted for o in found])
+    wrong = accepted & ~right
     print(f"\n{len(found)} pairs, area under the ROC curve {roc_area(p, right):.3f}")
-    print(f"believed {believed.sum()}, of these wrong by more than 0.1 m or 4 degrees", end=" ")
-    far = sum(o.believed and (o.metres > 3 * RIGHT_M or o.degrees > 3 * RIGHT_DEG) for o in found)
+    print(f"accepted {accepted.sum()}, of these wrong by more than 0.1 m or 4 degrees", end=" ")
+    far = sum(o.accepted and (o.metres > 3 * RIGHT_M or o.degrees > 3 * RIGHT_DEG) for o in found)
     print(f"{wrong.sum()}, by more than three times that {far}")
     print_calibration(p, right)
 
@@ -470,9 +470,9 @@ def print_fit(title: str, all_of: Samples) -> None:
         mine = all_of.scene == scene
         other = fitted(all_of.x[~mine], all_of.right[~mine])
         p[mine] = [logistic(float(v)) for v in all_of.x[mine] @ other]
-    believed = p >= BELIEVED
+    accepted = p >= ACCEPTED
     print(f"area under the ROC curve {roc_area(p, all_of.right):.3f}, left out by scene")
-    print(f"believed {believed.sum()}, of these wrong {(believed & ~all_of.right).sum()}")
+    print(f"accepted {accepted.sum()}, of these wrong {(accepted & ~all_of.right).sum()}")
     print_calibration(p, all_of.right)
 
 

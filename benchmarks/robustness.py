@@ -156,7 +156,7 @@ def agreement(recording: Recording, poses: Float64) -> tuple[float, float]:
         found = map_consistency(recording, poses)
     except InputError:
         return np.nan, 0.0
-    return found.rms_m, float(np.nan_to_num(found.inlier_share))
+    return found.rms_m, float(np.nan_to_num(found.inlier_ratio))
 
 
 # ---- Real recordings -----------------------------------------------------------------------------

@@ -214,7 +214,7 @@ def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
         "mean_deg": float(degrees.mean()),
         "coverage": error.coverage,
         "map_rms_m": agreement.rms_m,
-        "map_inliers": agreement.inlier_share,
+        "map_inliers": agreement.inlier_ratio,
         "per_frame": per_frame.tolist(),
     }
 

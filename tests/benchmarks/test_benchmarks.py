@@ -192,9 +192,9 @@ def test_poses_of_the_scanner_app_fit_its_images(scripts, shared_data):
     assert len(sequence.frames) == 70
     found = map_consistency(sequence.checked, sequence.reference, 12)
     assert found.pairs > 10
-    assert found.inlier_share > 0.7
+    assert found.inlier_ratio > 0.7
     flipped = sequence.reference @ np.diag([1.0, -1.0, -1.0, 1.0])
-    assert not map_consistency(sequence.checked, flipped, 12).inlier_share > 0.5
+    assert not map_consistency(sequence.checked, flipped, 12).inlier_ratio > 0.5
 
 
 def test_the_made_room_is_one_room(scripts):

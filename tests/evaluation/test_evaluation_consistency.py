@@ -174,7 +174,7 @@ def test_any_camera_gives_what_the_definition_says(camera: Camera) -> None:
     found = consistency_of_frames(frames, bent)
     assert found.pairs == pairs > 3
     assert found.rms_m == pytest.approx(rms, rel=1e-4)
-    assert found.inlier_share == pytest.approx(share, rel=1e-3)
+    assert found.inlier_ratio == pytest.approx(share, rel=1e-3)
 
 
 def test_radial_range_is_brought_to_z() -> None:
@@ -195,7 +195,7 @@ def test_exact_images_agree_exactly() -> None:
     ]
     found = consistency_of_frames(frames, poses)
     assert found.rms_m < 0.004  # corners, where a plane is none
-    assert found.inlier_share > 0.95
+    assert found.inlier_ratio > 0.95
 
 
 def test_worse_poses_agree_less() -> None:
@@ -205,7 +205,7 @@ def test_worse_poses_agree_less() -> None:
     twists = np.random.default_rng(2).standard_normal((8, 6))
     results = [consistency_of_frames(frames, poses @ se3.exp(s * twists)) for s in (0, 0.01, 0.03)]
     assert results[0].rms_m < results[1].rms_m < results[2].rms_m
-    assert results[0].inlier_share > results[1].inlier_share > results[2].inlier_share
+    assert results[0].inlier_ratio > results[1].inlier_ratio > results[2].inlier_ratio
 
 
 def test_it_does_not_depend_on_threads_or_world() -> None:
@@ -224,7 +224,7 @@ def test_nothing_overlaps() -> None:
     found = consistency_of_frames(look(PINHOLE, away), away)
     assert found.pairs == 0
     plain = found.to_dict()
-    assert plain == {"rms_m": None, "inlier_share": None, "pairs": 0, "frames": 2}
+    assert plain == {"rms_m": None, "inlier_ratio": None, "pairs": 0, "frames": 2}
     json.dumps(plain, allow_nan=False)
     empty = [RangeFrame(k, k, PINHOLE, np.zeros((60, 80), np.float32)) for k in range(2)]
     assert consistency_of_frames(empty, away).pairs == 0
@@ -241,7 +241,7 @@ def test_pairs_say_who_agrees() -> None:
     assert [(p.i, p.j) for p in found.agreements] == sorted((p.i, p.j) for p in found.agreements)
     assert sum(p.inliers for p in found.agreements) / sum(
         p.compared for p in found.agreements
-    ) == pytest.approx(found.inlier_share)
+    ) == pytest.approx(found.inlier_ratio)
 
 
 # Recordings ------------------------------------------------------------------------------------
@@ -352,7 +352,7 @@ def by_tool(shared_data: Path, recording: Path, trajectory: Path, frames: int) -
 
 
 def in_its_words(found: Consistency) -> str:
-    return f"rms {found.rms_m:.5f} m, inliers {found.inlier_share:.4f}, pairs {found.pairs}"
+    return f"rms {found.rms_m:.5f} m, inliers {found.inlier_ratio:.4f}, pairs {found.pairs}"
 
 
 def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:

@@ -15,7 +15,7 @@ from tofuse.filters.angle import NeighbourhoodAngle, neighbourhood_angle
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.distance import Box
 from tofuse.filters.median import Median, local_median
-from tofuse.filters.neighbours import NeighbourDistance, NeighbourShare, mean_neighbour_distance
+from tofuse.filters.neighbours import NeighbourDistance, NeighbourFraction, mean_neighbour_distance
 from tofuse.filters.temporal import TemporalDeviation, z_deviation
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
@@ -157,20 +157,20 @@ def test_neighbour_distance_removes_the_far_ones() -> None:
 def test_neighbour_share_removes_the_most_distant() -> None:
     points = cloud_of(0, 401)
     f = CloudFrame.of(points)
-    keep = NeighbourShare(0.5, 3).mask(f, ())
+    keep = NeighbourFraction(0.5, 3).mask(f, ())
     distance = distance_twin(points, 3)
     assert keep.sum() == 201
     assert distance[keep].max() <= distance[~keep].min()
-    assert NeighbourShare(0.0).mask(f, ()).all()
-    assert not NeighbourShare(1.0).mask(f, ()).any()
-    assert NeighbourShare(0.29).mask(CloudFrame.of(cloud_of(1, 100)), ()).sum() == 71
+    assert NeighbourFraction(0.0).mask(f, ()).all()
+    assert not NeighbourFraction(1.0).mask(f, ()).any()
+    assert NeighbourFraction(0.29).mask(CloudFrame.of(cloud_of(1, 100)), ()).sum() == 71
 
 
 def test_neighbour_share_decides_ties_by_order() -> None:
     # On a regular grid all inner points have the same distance.
     x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))
     points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    keep = NeighbourShare(0.5, 2).mask(CloudFrame.of(points), ())
+    keep = NeighbourFraction(0.5, 2).mask(CloudFrame.of(points), ())
     assert np.flatnonzero(keep).tolist() == list(range(32))
 
 
@@ -185,7 +185,7 @@ def test_neighbours_don_t_care_about_order_or_frame(seed: int, n: int, k: int) -
     T = se3.exp(rng.uniform(-2, 2, 6))
     moved = se3.transform(T, points).astype(np.float32)
     assert mean_neighbour_distance(moved, k) == pytest.approx(distance, abs=2e-6)
-    share = NeighbourShare(0.4, k)
+    share = NeighbourFraction(0.4, k)
     keep = share.mask(CloudFrame.of(points), ())
     if len(np.unique(distance)) == n:
         assert np.array_equal(share.mask(CloudFrame.of(points[order]), ()), keep[order])
@@ -322,9 +322,9 @@ def test_masks_do_not_depend_on_threads() -> None:
         (Median, {"threshold": float("inf")}),
         (NeighbourDistance, {"threshold": NAN}),
         (NeighbourDistance, {"k": 0}),
-        (NeighbourShare, {"fraction": 1.1}),
-        (NeighbourShare, {"fraction": NAN}),
-        (NeighbourShare, {"k": True}),
+        (NeighbourFraction, {"fraction": 1.1}),
+        (NeighbourFraction, {"fraction": NAN}),
+        (NeighbourFraction, {"k": True}),
         (TemporalDeviation, {"frames": 1}),
         (TemporalDeviation, {"threshold": -0.025}),
     ],

@@ -84,7 +84,7 @@ def test_one_seed_gives_one_result():
 def test_views_without_planes_are_refused():
     rough = seen(A, sigma=0.4, seed=1)
     with pytest.raises(RegistrationError, match=r"no plane|contradicts"):
-        tofuse.register(rough, rough, method=PlaneSets(least_share=0.3))
+        tofuse.register(rough, rough, method=PlaneSets(min_fraction=0.3))
     cloud = CloudFrame(0, 0.0, rough.points)
     with pytest.raises(RegistrationError, match="is no image"):
         tofuse.register(cloud, cloud, method=PlaneSets())
@@ -96,7 +96,7 @@ def test_what_has_no_light_has_planes():
         tofuse.register(*views, method=Features())
 
 
-@pytest.mark.parametrize("options", [{"planes": 0}, {"angle": 0.0}, {"least_share": -1}])
+@pytest.mark.parametrize("options", [{"planes": 0}, {"angle": 0.0}, {"min_fraction": -1}])
 def test_options_are_checked(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         PlaneSets(**options)

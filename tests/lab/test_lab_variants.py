@@ -53,9 +53,9 @@ def test_tricp_finds_the_overlap_and_the_motion_among_outliers(overlap):
         T = small(k)
         target = view(relief(3000, 1, -0.5, 0.5))
         source = view(relief(3000, 2, low, low + 1, outliers=150), T)
-        true_share = (se3.transform(T, source.points[:3000])[:, 0] < 0.5).sum() / 3150
+        true_fraction = (se3.transform(T, source.points[:3000])[:, 0] < 0.5).sum() / 3150
         found = Tricp(0.015, points=800).register(source, target, np.eye(4), rng())
-        assert found.share == pytest.approx(true_share, abs=0.06)
+        assert found.inlier_ratio == pytest.approx(true_fraction, abs=0.06)
         assert error(found, T)[0] < 0.015
         assert error(found, T)[1] < 1.5
         plain = vanilla(0.015, 800).register(source, target, np.eye(4), rng())
@@ -76,7 +76,7 @@ def test_tricp_prefers_all_of_two_views_that_overlap_fully():
     found = Tricp(0.015, points=600).register(
         view(stone(3000, 1, 0.002), T), view(stone(3000, 0, 0.002)), np.eye(4), rng()
     )
-    assert found.share > 0.9
+    assert found.inlier_ratio > 0.9
 
 
 def textured_wall(n, seed, T=None):
@@ -112,8 +112,8 @@ def test_iccp_finds_partners_that_a_rejector_loses():
     )
     compatible = first.register(source, target, np.eye(4), rng())
     rejected = rejecting.register(source, target, np.eye(4), rng())
-    assert compatible.share > 0.95
-    assert rejected.share < 0.5
+    assert compatible.inlier_ratio > 0.95
+    assert rejected.inlier_ratio < 0.5
 
 
 def test_iccp_without_amplitude_says_so():
@@ -163,7 +163,7 @@ def test_a_configuration_can_name_them():
             "source": {"part": "normal-space", "points": 300},
             "matcher": {"part": "normal-shooting"},
             "metric": {"part": "gicp"},
-            "rejectors": [{"part": "boundary"}, {"part": "trimmed", "share": 0.8}],
+            "rejectors": [{"part": "boundary"}, {"part": "trimmed", "overlap": 0.8}],
             "stopping": {"part": "small-step"},
         },
     }.items():

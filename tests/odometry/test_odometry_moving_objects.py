@@ -219,7 +219,7 @@ def test_leaving_out_what_moves_keeps_the_pose(room):
         np.linalg.norm((se3.inverse(poses[0] @ poses[n]) @ a.T_world_source)[:3, 3])
         for a in (whole, rest)
     ]
-    assert rest.inlier_share > 0.95 > whole.inlier_share
+    assert rest.inlier_ratio > 0.95 > whole.inlier_ratio
     assert errors[1] < 0.02
 
 

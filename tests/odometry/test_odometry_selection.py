@@ -1,4 +1,4 @@
-"""Which explanation of a view is believed: the camera, what moves by itself, or a quick motion."""
+"""Which explanation of a view is accepted: the camera, what moves by itself, or a quick motion."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def test_a_lost_frame_has_a_reason_and_the_next_is_registered_to_the_last_tracke
     registrar = Scripted(
         [MOTIONS[0], RegistrationError("no overlap"), found(MOTIONS[1], 0.019), MOTIONS[2]]
     )
-    tracker = Sequential(registrar, minimum_share=0.02).start(0)
+    tracker = Sequential(registrar, min_inlier_ratio=0.02).start(0)
     steps = [tracker.push(cloud(k)) for k in range(5)]
     assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
     assert steps[2].T_component_camera is None
@@ -227,13 +227,13 @@ def test_peaks_is_followed_at_low_noise_and_drifts_at_high():
 def test_the_configuration_survives_a_round_trip():
     parts.discover("tofuse.registration")
     parts.discover("tofuse.odometry")
-    odometry = Sequential(algorithm_1(0.02), "previous", minimum_share=0.1)
+    odometry = Sequential(algorithm_1(0.02), "previous", min_inlier_ratio=0.1)
     data = parts.to_dict(odometry)
     assert data["part"] == "sequential"
     assert data["guess"] == "previous"
     assert data["registration"]["part"] == "icp"
     assert parts.from_dict(Odometry, data, where="test") == odometry
     assert odometry.takes == {"range", "cloud"}
-    for option, value in (("guess", "next"), ("minimum_points", 0), ("minimum_share", 2.0)):
+    for option, value in (("guess", "next"), ("minimum_points", 0), ("min_inlier_ratio", 2.0)):
         with pytest.raises(InputError, match="test"):
             parts.from_dict(Odometry, {**data, option: value}, where="test")

@@ -64,7 +64,7 @@ def test_right_poses_are_good(of_truth) -> None:
     assert of_truth.deviation.consistent
     assert of_truth.deviation.at_most_m < 0.03
     assert of_truth.consistency is not None
-    assert of_truth.consistency.inlier_share > 0.9
+    assert of_truth.consistency.inlier_ratio > 0.9
 
 
 def test_wrong_poses_are_as_far_off_as_is_said(of_bent, truth) -> None:

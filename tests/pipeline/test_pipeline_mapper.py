@@ -81,7 +81,7 @@ def test_result_of_a_whole_run(whole, recording) -> None:
     assert whole.graph.ids.tolist() == list(range(8))
     assert len(whole.cloud) > 1000
     assert {"filters", "tracking", "loops", "fusion", "checking"} <= set(whole.diagnostics.seconds)
-    assert 0 < whole.diagnostics.removed["neighbour_share"] < 1
+    assert 0 < whole.diagnostics.removed["neighbour_fraction"] < 1
     # The camera of the simulation turned; the estimate must be near, not merely there.
     error = np.linalg.norm(whole.trajectory[:, :3, 3] - recording.reference[:, :3, 3], axis=1)
     assert error.max() < 0.1

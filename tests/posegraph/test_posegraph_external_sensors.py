@@ -113,11 +113,11 @@ def test_an_accelerometer_in_motion_does_not_count_for_gravity():
     lying = seen_down(right)
     lying[20:40, :3] += 0.33 * right[20:40, 0, :3]
     lying[:, :3] /= np.linalg.norm(lying[:, :3], axis=1)[:, None]
-    believed = replace(GravityEdges(), gate=1e9)
+    accepted = replace(GravityEdges(), gate=1e9)
     robust = tilt(
         solved(graph, measure_all((GravityEdges(),), sensed(gravity=lying), graph)), right
     )
-    plain = tilt(solved(graph, measure_all((believed,), sensed(gravity=lying), graph)), right)
+    plain = tilt(solved(graph, measure_all((accepted,), sensed(gravity=lying), graph)), right)
     assert robust < 0.5 * tilt(graph.poses, right)
     assert robust < 0.7 * plain
     record = measure_all((GravityEdges(),), sensed(gravity=lying), graph).records[0]

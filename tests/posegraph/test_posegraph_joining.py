@@ -238,7 +238,7 @@ def test_a_single_link_waits_for_links_elsewhere() -> None:
     wrong = link_of(a, b, np.eye(4))
     (group,) = Joining().join(parts, [wrong])
     assert_joined(group, parts, path)
-    # Had the camera no time to get away, it would be believed.
+    # Had the camera no time to get away, it would be accepted.
     soon = replace(parts[1], times=parts[1].times - 60.0)
     (group,) = Joining().join([parts[0], soon], [wrong])
     with pytest.raises(AssertionError):
@@ -332,7 +332,7 @@ def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
     ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
     made = [register_pair(*reversed(ends[0])), follow(*reversed(ends[1]), np.eye(4))]
     links = [
-        Link(target.index, source.index, found, bool(found.believed), found.how)
+        Link(target.index, source.index, found, bool(found.accepted), found.how)
         for (target, source), found in zip(ends, made, strict=True)
     ]
     (group,) = SPARSELY.join(three, links)

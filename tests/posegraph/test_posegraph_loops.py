@@ -197,7 +197,7 @@ def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
 def test_real_registrations_tell_a_loop_from_another_place():
     """Views 0 and 1 of the synthetic case overlap; views 0 and 10 see opposite sides."""
     views, truth = peaks_views(0.02, 0)
-    confirmation = Confirmation((algorithm_1(1.0), algorithm_1(0.25)), min_share=0.4)
+    confirmation = Confirmation((algorithm_1(1.0), algorithm_1(0.25)), min_fraction=0.4)
     near = confirmation.confirm(views[1], views[0], np.eye(4), seed=0)
     assert near.record.accepted
     away = se3.log(se3.inverse(truth[1]) @ near.T_i_j)
@@ -212,7 +212,7 @@ def test_the_detector_is_a_part():
     assert data["part"] == "nearby"
     parts.discover("tofuse.registration")
     assert parts.from_dict(LoopDetector, data, where="x") == Nearby(min_gap=30)
-    for bad in ({"min_gap": 0}, {"max_distance_m": 0.0}, {"confirmation": {"min_share": 2.0}}):
+    for bad in ({"min_gap": 0}, {"max_distance_m": 0.0}, {"confirmation": {"min_fraction": 2.0}}):
         with pytest.raises(InputError, match="x"):
             parts.from_dict(LoopDetector, {"part": "nearby", **bad}, where="x")
 

@@ -16,7 +16,7 @@ from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.registration.base import Registration
-from tofuse.registration.confidence import BELIEVED
+from tofuse.registration.confidence import ACCEPTED
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.verification import Assessment
 
@@ -85,25 +85,25 @@ def test_what_a_person_gives_counts(turn):
 
 
 def registered(T, probability):
-    believed = probability >= BELIEVED
-    reason = "" if believed else "another pose fits nearly as well"
+    accepted = probability >= ACCEPTED
+    reason = "" if accepted else "another pose fits nearly as well"
     return Registration(
         T, True, 9, 1800, 2000, 0.1, 0.003, 1e4 * np.eye(6), margin=0.1,
-        believed=believed, probability=probability, reason=reason,
+        accepted=accepted, probability=probability, reason=reason,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("probable", "wrong", "accepted"),
     [
-        ((0.99, 0.99), (), 2),  # each is believed
+        ((0.99, 0.99), (), 2),  # each is accepted
         ((0.7, 0.7), (), 2),  # both say the same
         ((0.7, 0.7), (1,), 0),  # each says something else
-        ((0.7, 0.99), (0,), 1),  # only the one that is believed counts
+        ((0.7, 0.99), (0,), 1),  # only the one that is accepted counts
         ((0.3, 0.3), (), 0),  # hardly probable at all
     ],
 )
-def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong, accepted):
+def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong, accepted):
     frames, truth, start = turn
     options = Revisits(per_view=3)
     asked = []

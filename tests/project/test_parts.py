@@ -138,7 +138,7 @@ def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> 
     with pytest.raises(InputError, match=r"^c\.toml: filters\[1\]\.k: is 'x'"):
         changed(
             from_method("thesis"),
-            {"filters": [{"part": "median"}, {"part": "neighbour_share", "k": "x"}]},
+            {"filters": [{"part": "median"}, {"part": "neighbour_fraction", "k": "x"}]},
             where="c.toml",
         )
 

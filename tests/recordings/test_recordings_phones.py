@@ -172,7 +172,7 @@ def test_real_recordings_agree_with_their_own_poses(
     mirrored = map_consistency(few, few.reference @ made.ARKIT)
     turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     turned = map_consistency(few, few.reference @ turn)
-    assert poses.inlier_share > others
+    assert poses.inlier_ratio > others
     for other in (still, mirrored, turned):
         # Under wrong poses the views overlap less, or disagree.
         assert 2 * other.pairs < poses.pairs or poses.rms_m < 0.85 * other.rms_m

@@ -282,7 +282,7 @@ def test_projection_ends_where_closest_points_end():
             stopping=SmallStep(1e-3, 40),
         )
         found = method.register(source, target, np.eye(4), rng())
-        assert found.share > 0.9
+        assert found.inlier_ratio > 0.9
         assert error(found, SMALL)[0] < 5e-4
         assert error(found, SMALL)[1] < 0.05
 

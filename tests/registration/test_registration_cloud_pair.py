@@ -256,7 +256,7 @@ def test_scans_with_any_heading(scans):
     found = tofuse.register(source, target)
     assert off(found.T_target_source, true, source)[0] < 0.02
     assert off(found.T_target_source, true, source)[1] < 0.5
-    assert found.believed
+    assert found.accepted
     assert found.probability > 0.9
     assert found.contradiction < 0.01
 
@@ -286,10 +286,10 @@ def test_lengths_do_not_matter(scans, scale):
     scaled[:3, 3] *= scale
     found = tofuse.register(source * scale, target * scale)
     assert off(found.T_target_source, scaled, source * scale)[0] < 0.02 * scale
-    assert found.believed
+    assert found.accepted
 
 
-def test_views_that_share_nothing_are_not_believed(scans, frames):
+def test_views_that_share_nothing_are_rejected(scans, frames):
     for source, target in (
         (bumpy_ball(5000, 1), scans[0]),
         (frames[0].points, bumpy_ball(5000, 1) * 4),
@@ -299,14 +299,14 @@ def test_views_that_share_nothing_are_not_believed(scans, frames):
             found = tofuse.register(source, target)
         except tofuse.RegistrationError:
             continue
-        assert found.believed is False
+        assert found.accepted is False
         assert found.reason
 
 
-def test_a_corridor_that_fits_in_several_ways_is_not_believed():
+def test_a_corridor_that_fits_in_several_ways_is_rejected():
     """Two parallel walls and a floor: along them nothing tells where."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
-    assert found.believed is False
+    assert found.accepted is False
     assert "degenerate" in found.reason
     assert len(found.unobservable) >= 1
 
@@ -315,14 +315,14 @@ def test_a_corridor_that_fits_in_several_ways_is_not_believed():
 def test_other_units_are_named(scans, scale):
     source, target, _ = scans
     found = tofuse.register(source * scale, target)
-    assert found.believed is False
+    assert found.accepted is False
     assert f"{1 / scale:g} times as large" in found.reason
     assert "unit" in found.reason
 
 
 @pytest.mark.parametrize("scale", [0.001, 100.0])
 def test_other_units_are_named_where_nothing_is_certain(scale):
-    """A square room fits in four ways, so that no scale is believed."""
+    """A square room fits in four ways, so that no scale is accepted."""
     walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
     try:
         said = tofuse.register(other * scale, walls).reason
@@ -363,14 +363,14 @@ def test_lines_planes_and_points_get_an_honest_answer():
             found = tofuse.register(points, points)
         except tofuse.TofuseError:
             continue
-        assert found.believed is False
+        assert found.accepted is False
 
 
 def test_an_image_and_a_cloud_and_a_wide_image(frames):
     target, source, true = frames
     found = tofuse.register(source, CloudFrame.of(target.points))
     assert off(found.T_target_source, true, source.points)[0] < 0.05
-    assert found.believed
+    assert found.accepted
 
 
 def test_registration_between_other_frames():
@@ -393,7 +393,7 @@ def test_registration_between_other_frames():
 # From view to view
 
 
-def test_views_are_chained_and_unbelieved_ones_begin_a_component(scans):
+def test_views_are_chained_and_rejected_ones_begin_a_component(scans):
     source, target, true = scans
     tracker = Pairwise().start(0)
     views = [target, source, bumpy_ball(5000, 1), source + np.float32(1e-4)]

@@ -103,7 +103,7 @@ def test_it_recovers_the_motion_exactly_where_both_views_hold_the_same_points():
     found = algorithm_1(0.02, None).register(source, target, np.eye(4), rng())
     assert found.converged
     assert found.correspondences == found.points == 400
-    assert found.share == 1
+    assert found.inlier_ratio == 1
     np.testing.assert_allclose(found.T_target_source, SMALL, atol=1e-6)
     assert found.rms_m < 1e-6
 
@@ -124,7 +124,7 @@ def test_it_comes_near_with_other_points_of_the_same_surfaces():
     assert np.linalg.norm(xi[:3]) < 0.012
     assert np.linalg.norm(xi[3:]) < 0.006
     assert found.errors[-1] < 0.6
-    assert 0.2 < found.share < 0.7
+    assert 0.2 < found.inlier_ratio < 0.7
 
 
 def test_the_guess_is_where_it_starts():

@@ -253,8 +253,8 @@ def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
     blind = prepare_view(frame, strict)
     told = prepare_view(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict)
     waves = np.s_[4:-4, 60:-4]
-    blind_share, told_share = ((v.planes[waves][..., 3] > 0).mean() for v in (blind, told))
-    assert blind_share < 0.75 < 0.95 < told_share
+    blind_fraction, told_fraction = ((v.planes[waves][..., 3] > 0).mean() for v in (blind, told))
+    assert blind_fraction < 0.75 < 0.95 < told_fraction
 
 
 def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():

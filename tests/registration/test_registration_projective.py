@@ -70,7 +70,7 @@ def test_a_known_motion_is_found(request, scene, options):
     assert_near(found, pair.poses[1])
     assert found.converged
     assert len(found.unobservable) == 0
-    assert found.inlier_share > 0.95
+    assert found.inlier_ratio > 0.95
     assert found.in_front < 0.02 * found.compared
     assert 0.8 < found.overlap <= 1
     assert found.rms_m < 0.002
@@ -141,7 +141,7 @@ def test_outliers_do_not_move_it(room):
     view = prepare_view(replace(frame, depth=depth, amplitude_image=light), SurfaceOptions())
     found = align(view, [room.target], np.eye(4), OPTIONS)
     assert_near(found, room.poses[1], 0.003, 0.05)
-    assert found.inlier_share < 0.95
+    assert found.inlier_ratio < 0.95
 
 
 def test_a_scene_under_a_magnifying_glass_is_as_robust(room):

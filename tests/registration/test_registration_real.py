@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tofuse.filters.neighbours import NeighbourShare
+from tofuse.filters.neighbours import NeighbourFraction
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.frames import RangeFrame
@@ -21,14 +21,14 @@ def test_neighbours_of_a_real_recording(shared_data):
     for k, file in enumerate(files):
         depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[::4, ::4]
         frame = RangeFrame(k, k / 7.5, camera, np.where(depth == 65535, 0, depth / 1000))
-        frames.append(frame.keep(NeighbourShare(0.5).mask(frame, ())))
+        frames.append(frame.keep(NeighbourFraction(0.5).mask(frame, ())))
         poses.append(np.loadtxt(file.with_name(file.name.replace("depth.png", "pose.txt"))))
     motions, errors = [], []
     for k in range(1, len(frames)):
         rng = np.random.default_rng([0, k])
         found = algorithm_1(0.02).register(frames[k], frames[k - 1], np.eye(4), rng)
         assert found.converged
-        assert found.share > 0.3
+        assert found.inlier_ratio > 0.3
         truth = se3.inverse(poses[k - 1]) @ poses[k]
         motions.append(np.linalg.norm(truth[:3, 3]))
         errors.append(np.linalg.norm((se3.inverse(truth) @ found.T_target_source)[:3, 3]))

@@ -42,7 +42,7 @@ def test_clouds_of_any_size_are_registered(scale, degrees):
     assert np.rad2deg(se3.angle(gap)) < 0.2
     assert np.linalg.norm(gap[:3, 3]) < 0.01 * scale
     assert found.converged
-    assert found.share > 0.9
+    assert found.inlier_ratio > 0.9
     assert found.rms_m < 0.05 * scale
     assert np.linalg.eigvalsh(found.information).min() > 0
     assert len(found.unobservable) == 0
@@ -55,7 +55,7 @@ def test_half_of_the_views_may_be_missing_in_the_other():
         found = tofuse.register(source, relief(4000, 2 * k, -0.5, 0.5))
         assert error(found, T)[0] < 0.005
         assert error(found, T)[1] < 0.5
-        assert 0.4 < found.share < 0.65
+        assert 0.4 < found.inlier_ratio < 0.65
 
 
 def test_images_of_a_camera_are_registered():
@@ -81,7 +81,7 @@ def test_a_real_pair_of_lidar_scans(shared_data):
         # The reference itself was registered: its median residual is larger than that found here.
         assert np.linalg.norm(gap[:3, 3]) < 0.03
         assert np.rad2deg(se3.angle(gap)) < 0.35
-        assert found.share > 0.8
+        assert found.inlier_ratio > 0.8
         assert len(found.unobservable) == 0
 
 

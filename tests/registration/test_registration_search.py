@@ -206,7 +206,7 @@ def agreed(source, target, T, o):
                 continue
             other = target.planes[v, u].astype(float)
             s = np.sqrt(source.plane_variance[i, j]) * p[2] ** 2
-            slack = o.floor_m + o.floor_share * q[2]
+            slack = o.floor_m + o.floor_fraction * q[2]
             if other[3] <= 0:
                 patch = target.z[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3]
                 here = target.z[v, u] > 0
@@ -293,7 +293,7 @@ def test_floor_is_found_in_a_camera_that_lies_on_its_side():
     for floor in floors:
         assert floor.height == pytest.approx(1.0, abs=0.02)
         assert np.degrees(np.arccos(floor.normal @ down)) < 1
-    # Who knows better what is down is believed.
+    # Who knows better what is down is accepted.
     wrong = np.array([0.0, 0.0, 1.0])
     assert find_floors(views, gravity=(wrong, wrong)) is None
 

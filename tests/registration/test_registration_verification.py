@@ -159,25 +159,25 @@ def test_the_stricter_the_fewer_are_usual():
 def test_the_noise_scale_is_known_after_some_alignments():
     known = UsualFit()
     assert known.noise_scale == 0
-    assert known.rms_share == 0
+    assert known.rms_fraction == 0
     known.learn(aligned(noise=8.0), 2.0)
     assert known.noise_scale == 0
     known = taught(150, noise=8.0, spread=0.1)
     assert known.noise_scale == pytest.approx(8.0, rel=0.1)
-    assert known.rms_share == pytest.approx(0.005)
+    assert known.rms_fraction == pytest.approx(0.005)
     # What can't be measured teaches nothing.
     for noise in (0.0, np.inf):
         known.learn(aligned(noise=noise, rms_m=np.inf), 2.0)
     assert known.noise_scale == pytest.approx(8.0, rel=0.1)
-    assert known.rms_share == pytest.approx(0.005)
+    assert known.rms_fraction == pytest.approx(0.005)
 
 
 def test_images_are_compared_as_coarsely_as_the_camera_errs():
     fine, coarse = self_scaled(UsualFit()), UsualFit()
     for _ in range(10):
         coarse.learn(aligned(rms_m=0.1), 2.0)
-    assert self_scaled(coarse).floor_share == pytest.approx(0.1)
-    assert self_scaled(coarse).floor_share > fine.floor_share
+    assert self_scaled(coarse).floor_fraction == pytest.approx(0.1)
+    assert self_scaled(coarse).floor_fraction > fine.floor_fraction
 
 
 def test_views_of_another_scale_are_not_compared():

@@ -144,7 +144,7 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
             prepare_view(frame, SurfaceOptions()),
             rng,
             max_planes=planes,
-            min_share=0.1,
+            min_fraction=0.1,
             thickness=0.01,
         ):
             plane = found.normal / found.offset

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
 _SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
-_BELIEF_COLORS = {True: "green", False: "red", None: "yellow"}
+_STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
@@ -228,7 +228,7 @@ def register(arguments: argparse.Namespace) -> int:
     """``tofuse register``."""
     from tofuse.cli import registering
     from tofuse.pipeline.pair import PairOptions, exit_status, register_files
-    from tofuse.report.pair_words import belief
+    from tofuse.report.pair_words import decision
     from tofuse.results.pair import pair_json
 
     _check_overwrite(arguments)
@@ -239,8 +239,8 @@ def register(arguments: argparse.Namespace) -> int:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
         return exit_status(result)
     console = make_console()
-    head, tail = belief(result)
-    color = _BELIEF_COLORS[result.found.believed]
+    head, tail = decision(result)
+    color = _STATUS_COLORS[result.found.accepted]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
     for line in registering.text(result):
         console.print(line, markup=False)
@@ -323,7 +323,7 @@ def judge(arguments: argparse.Namespace) -> int:
     console.print(sentence(found, arguments.trajectory.name), markup=False)
     pairs = (("given", found.consistency), ("refined", found.refined_consistency))
     texts = [
-        f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_share:.1%} inliers"
+        f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
         for name, c in pairs
         if c is not None
     ]
@@ -660,7 +660,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         m = data["map_consistency"]
         value = "no two images overlap enough"
         if m["rms_m"] is not None:
-            value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
+            value = f"{m['rms_m']:.5f} m rms, {m['inlier_ratio']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
     make_console().print(table)
     return 0

@@ -45,8 +45,8 @@ A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: f
 a recording, counting from 0.
 
 """ + _exit_status(
-    "the pose is believed",
-    "the pose is not believed, or cannot be verified; it is still printed and written",
+    "the pose is accepted",
+    "the pose is rejected, or cannot be verified; it is still printed and written",
 )
 _JUDGE = _exit_status(
     "the poses were assessed",

@@ -78,7 +78,7 @@ class PairAgreement:
         return float(np.sqrt(self.squares / self.inliers)) if self.inliers else np.nan
 
     @property
-    def inlier_share(self) -> float:
+    def inlier_ratio(self) -> float:
         """Fraction of inliers among the points compared, 0 to 1; NaN if there are none."""
         return self.inliers / self.compared if self.compared else np.nan
 
@@ -91,7 +91,7 @@ class Consistency:
     ----------
     rms_m
         Pooled rms of the inliers' distances from the plane, m; NaN if no pair counts.
-    inlier_share
+    inlier_ratio
         Pooled fraction of inliers, 0 to 1; NaN if no pair counts.
     pairs
         Number of pairs of views that count.
@@ -102,7 +102,7 @@ class Consistency:
     """
 
     rms_m: float
-    inlier_share: float
+    inlier_ratio: float
     pairs: int
     frames: int
     agreements: tuple[PairAgreement, ...] = ()
@@ -125,7 +125,7 @@ class Consistency:
         """Return the pooled figures as plain data; None instead of NaN."""
         return {
             "rms_m": _known(self.rms_m),
-            "inlier_share": _known(self.inlier_share),
+            "inlier_ratio": _known(self.inlier_ratio),
             "pairs": self.pairs,
             "frames": self.frames,
         }

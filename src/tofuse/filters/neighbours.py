@@ -42,9 +42,9 @@ class NeighbourDistance(Bounded, Filter):
         return _spread(frame, mean_neighbour_distance(frame.points, self.k) <= self.threshold)
 
 
-@part("filter", "neighbour_share")
+@part("filter", "neighbour_fraction")
 @dataclass(frozen=True)
-class NeighbourShare(Bounded, Filter):
+class NeighbourFraction(Bounded, Filter):
     """Remove a fraction of the points: those with the largest mean distance to their neighbours.
 
     Chapter 4 removes half of them, with 3 neighbours. Of equal distances later points are removed

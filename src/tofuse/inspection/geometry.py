@@ -39,7 +39,7 @@ def check_kind(sample: Sample) -> Iterator[Finding]:
     evidence = {
         "exponent": alpha,
         "sigma": sigma,
-        "rms_share": b.rms_before,
+        "rms_fraction": b.rms_before,
         "rms_share_if_corrected": b.rms_after,
     }
     surfaces = f"{b.surfaces} surfaces"
@@ -120,9 +120,9 @@ def check_intrinsics(sample: Sample) -> Iterator[Finding]:
     off_x = (lens.cx - (lens.width - 1) / 2) / lens.width
     off_y = (lens.cy - (lens.height - 1) / 2) / lens.height
     evidence = {
-        "cx_off_share": off_x,
-        "cy_off_share": off_y,
-        "fx_share": lens.fx / lens.width,
+        "cx_off_fraction": off_x,
+        "cy_off_fraction": off_y,
+        "fx_fraction": lens.fx / lens.width,
         "fx_over_fy": lens.fx / lens.fy,
     }
     where = "Use the intrinsics of the depth camera at this resolution."

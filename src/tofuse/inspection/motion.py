@@ -68,7 +68,7 @@ class Pair:
     @property
     def fits(self) -> bool:
         """Whether the two views are consistent where they overlap."""
-        return self.alignment.score > 0.5 and self.alignment.inlier_share > 0.7
+        return self.alignment.score > 0.5 and self.alignment.inlier_ratio > 0.7
 
     @cached_property
     def moved_fraction(self) -> float:

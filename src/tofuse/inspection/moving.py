@@ -84,7 +84,7 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
             f"The camera moves fast for the frame rate: from one frame to the next the image moves "
             f"by {shift:.0%} of its size ({angle:.1f} degrees).",
             "Move more slowly, record at a higher rate, or use a smaller --every.",
-            {"shift_share": shift, "angle_deg": angle},
+            {"shift_fraction": shift, "angle_deg": angle},
         )
 
 
@@ -109,7 +109,7 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
             f"{np.median(fractions):.1%} of the image is in the other's free space.",
             "Record while nothing moves, or crop it (--max-depth); if it is the object to be "
             "modelled, turning in front of a stationary camera, use --object.",
-            {"moved_share": float(np.median(fractions)), "pairs_share": frequency},
+            {"moved_fraction": float(np.median(fractions)), "pairs_fraction": frequency},
         )
 
 

@@ -45,7 +45,7 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
             "few_valid",
             "There is no valid point in the sampled frames: is the depth unit right?",
             "Check depth_unit_m, and that the depth images have 16 bits.",
-            {"valid_share": 0.0},
+            {"valid_fraction": 0.0},
         )
         return
     median = float(np.median(depths))
@@ -80,7 +80,7 @@ def check_valid(sample: Sample) -> Iterator[Finding]:
             "few_valid",
             f"Only {valid:.1%} of the pixels are valid.",
             "Move closer, use a longer exposure, or check the confidence threshold.",
-            {"valid_share": valid},
+            {"valid_fraction": valid},
         )
 
 
@@ -96,7 +96,7 @@ def check_saturation(sample: Sample) -> Iterator[Finding]:
             "saturated",
             f"{fraction:.0%} of the pixels are saturated and invalid.",
             "Use a shorter exposure, or keep farther from shiny and bright objects.",
-            {"saturated_share": fraction},
+            {"saturated_fraction": fraction},
         )
 
 
@@ -117,7 +117,7 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
             f"{fraction:.1%} of the pixels fly between near and far surfaces: edges "
             f"are {width:.1f} pixels wide.",
             "Keep the filters against flying pixels on; clean the lens, and check its focus.",
-            {"flying_share": fraction, "edge_width_px": width},
+            {"flying_fraction": fraction, "edge_width_px": width},
         )
 
 
@@ -185,17 +185,17 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
         typical = float(np.median(albedo[known]))
         near = known & surface & (r < _NEAR * period)
         dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
-    seam_share, dark_share = seams / max(valid, 1), dark / max(with_albedo, 1)
-    if seam_share > _SEAM_FRACTION or dark_share > _DARK_FRACTION:
+    seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
+    if seam_fraction > _SEAM_FRACTION or dark_fraction > _DARK_FRACTION:
         yield Finding(
             "phase_wrap",
             f"Surfaces beyond {period:.3g} m, after which the phase of this camera repeats, are "
-            f"measured as near ones: {seam_share:.2%} of the pixels are at seams from far to "
-            f"near, and {dark_share:.1%} are near and yet {1 / _DARK:.0f} times darker than the "
+            f"measured as near ones: {seam_fraction:.2%} of the pixels are at seams from far to "
+            f"near, and {dark_fraction:.1%} are near and yet {1 / _DARK:.0f} times darker than the "
             "rest.",
             "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
             "drop weak pixels by an amplitude filter.",
-            {"seam_share": seam_share, "dark_share": dark_share, "period_m": period},
+            {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},
         )
 
 

@@ -472,7 +472,7 @@ def measure_agreement(
     T: Float64,
     sigmas: float,
     floor_m: float,
-    floor_share: float,
+    floor_fraction: float,
     min_cosine: float,
     differences: Float32,
     start: int,
@@ -491,9 +491,9 @@ def measure_agreement(
         plane.
     T
         (4, 4) from the points' frame to the image's.
-    sigmas, floor_m, floor_share
+    sigmas, floor_m, floor_fraction
         A point supports the pose if its distance is below `sigmas` standard deviations plus
-        `floor_m` plus `floor_share` times its depth; it violates free space if it is nearer than
+        `floor_m` plus `floor_fraction` times its depth; it violates free space if it is nearer than
         the surface by twice that.
     min_cosine
         Smallest cosine between the normals of a supporting point and the plane.
@@ -527,7 +527,7 @@ def measure_agreement(
         i = int(v + 0.5)
         j = int(u + 0.5)
         if planes[i, j, 3] <= 0:
-            limit = sigmas * np.float64(sigma[k]) + floor_m + floor_share * z
+            limit = sigmas * np.float64(sigma[k]) + floor_m + floor_fraction * z
             if nearest[i, j] > 0 and z < nearest[i, j] - 2 * limit:
                 out[VIOLATION] += 1
             continue
@@ -543,7 +543,7 @@ def measure_agreement(
         along = (m0 * px + m1 * py + m2 * pz) / pz
         own = along * np.float64(sigma[k])
         variance = own * own + np.float64(plane_variance[i, j]) / (length * length)
-        limit = sigmas * np.sqrt(variance) + floor_m + floor_share * z
+        limit = sigmas * np.sqrt(variance) + floor_m + floor_fraction * z
         if r < -2 * limit:
             out[VIOLATION] += 1
         elif abs(r) < limit and (

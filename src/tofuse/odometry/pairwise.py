@@ -1,4 +1,4 @@
-"""Odometry of views far apart: each is registered to an earlier one, if the pose is believed."""
+"""Odometry of views far apart: each is registered to an earlier one, if the pose is accepted."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ _SAME_POSE = 0.03
 @part("odometry", "pairwise")
 @dataclass(frozen=True)
 class Pairwise(Bounded, Odometry):
-    """Registers each view to the one before; where that is not believed, to earlier ones.
+    """Registers each view to the one before; where that is not accepted, to earlier ones.
 
     Once the predicted motion has agreed with searches, it replaces them as long as the views agree
     there; degenerate directions follow the motion. For unordered views, or views far apart, each
     pair is searched.
 
-    A view whose best pose is not believed, but more probable than not, keeps it and is marked as
-    doubtful. Else it begins a component of its own; believed registrations to views of other
+    A view whose best pose is not accepted, but more probable than not, keeps it and is marked as
+    doubtful. Else it begins a component of its own; accepted registrations to views of other
     components become links.
 
     Attributes
     ----------
     registration
-        Registers one pair, and states whether the pose is believed.
+        Registers one pair, and states whether the pose is accepted.
     references
         Maximum number of earlier views that a view is registered to, the last one first.
     minimum_points
         Points that a view must have.
     probable
-        Minimum probability of a pose that is not believed, but kept.
+        Minimum probability of a pose that is not accepted, but kept.
     """
 
     registration: AnyPair = field(default_factory=AnyPair)
@@ -113,7 +113,7 @@ class _PairwiseTracker(Tracker):
         doubtful: list[_Registered] = []
         for earlier in own:
             registered = self._by_search(frame, earlier)
-            if registered is not None and registered.believed:
+            if registered is not None and registered.accepted:
                 if earlier is own[0]:
                     self._motion_confirmed.append(
                         local is not None and local.agrees(registered, frame.points)
@@ -167,13 +167,13 @@ class _PairwiseTracker(Tracker):
         self._placed.append(_Placed(frame, T, self._component))
         return Step(
             "tracked",
-            "" if registered.believed else registration.reason,
+            "" if registered.accepted else registration.reason,
             T,
             to.frame.index,
             registration,
             component=self._component,
             links=links,
-            doubtful=not registered.believed,
+            doubtful=not registered.accepted,
         )
 
     def _begin_component(
@@ -188,10 +188,10 @@ class _PairwiseTracker(Tracker):
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
     def _links(self, frame: Frame) -> tuple[Link, ...]:
-        """Return the registration to the last view of another component, if it is believed."""
+        """Return the registration to the last view of another component, if it is accepted."""
         others = [p for p in self._placed if p.component != self._component]
         registered = self._by_search(frame, others[-1]) if others else None
-        return (registered.link(frame),) if registered is not None and registered.believed else ()
+        return (registered.link(frame),) if registered is not None and registered.accepted else ()
 
 
 def _moment(frame: Frame) -> Moment:
@@ -206,14 +206,14 @@ class _Registered:
     registration: Registration
 
     @property
-    def believed(self) -> bool:
-        return bool(self.registration.believed)
+    def accepted(self) -> bool:
+        return bool(self.registration.accepted)
 
     @property
     def needs_no_search(self) -> bool:
-        """Whether a pose is believed and either certain or degenerate, so that no search helps."""
+        """Whether a pose is accepted and either certain or degenerate, so that no search helps."""
         certain = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
-        return self.believed and certain
+        return self.accepted and certain
 
     def agrees(self, other: _Registered, points: Float32) -> bool:
         """Whether both map points (n, 3) to the same place, relative to their extent."""
@@ -228,4 +228,4 @@ class _Registered:
 
     def link(self, frame: Frame) -> Link:
         r = self.registration
-        return Link(self.to.frame.index, frame.index, r, self.believed, r.how)
+        return Link(self.to.frame.index, frame.index, r, self.accepted, r.how)

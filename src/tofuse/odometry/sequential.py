@@ -47,7 +47,7 @@ class Sequential(Bounded, Odometry):
         the motion between the poses of an odometry file (identity where either is missing).
     minimum_points
         Valid points that a frame must have.
-    minimum_share
+    min_inlier_ratio
         Smallest inlier fraction, 0 to 1. The thesis has no such threshold for consecutive frames;
         this one is low and only refuses registrations with hardly any correspondences.
     """
@@ -55,7 +55,7 @@ class Sequential(Bounded, Odometry):
     registration: Registrar = field(default_factory=algorithm_1)
     guess: Guess = "identity"
     minimum_points: Annotated[int, Bounds(1)] = 10
-    minimum_share: Annotated[float, Bounds(0, 1)] = 0.02
+    min_inlier_ratio: Annotated[float, Bounds(0, 1)] = 0.02
 
     @property
     def takes(self) -> frozenset[str]:
@@ -104,10 +104,10 @@ class _SequentialTracker(Tracker):
             registration = options.registration.register(frame, last.frame, guess, rng)
         except RegistrationError as error:
             return _lost(f"not registered to frame {last.frame.index}: {error}", last)
-        if registration.share < options.minimum_share:
+        if registration.inlier_ratio < options.min_inlier_ratio:
             return _lost(
-                f"only {registration.share:.1%} of the points correspond to frame "
-                f"{last.frame.index}, {options.minimum_share:.1%} are needed",
+                f"only {registration.inlier_ratio:.1%} of the points correspond to frame "
+                f"{last.frame.index}, {options.min_inlier_ratio:.1%} are needed",
                 last,
             )
         self._motion = registration.T_target_source

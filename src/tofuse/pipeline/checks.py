@@ -311,7 +311,7 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
     ]
     if not pairs:
         return
-    weak = e.runs_of({index for index, r in pairs if r.share < WEAK_INLIER_FRACTION})
+    weak = e.runs_of({index for index, r in pairs if r.inlier_ratio < WEAK_INLIER_FRACTION})
     if weak:
         text = (
             f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of {in_words(weak)} have a "

@@ -8,7 +8,7 @@ from tofuse.corrections.multipath import Multipath
 from tofuse.corrections.noise import Noise
 from tofuse.filters.angle import NeighbourhoodAngle
 from tofuse.filters.confidence import Confidence
-from tofuse.filters.neighbours import NeighbourShare
+from tofuse.filters.neighbours import NeighbourFraction
 from tofuse.filters.wrapped import Wrapped
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.keyframes import Keyframes
@@ -36,7 +36,7 @@ def thesis(kind: ViewKind) -> Config:
     icp = algorithm_1(resolution=0.01, points=1000)
     return Config(
         method="thesis",
-        filters=(Confidence(minimum=7), NeighbourShare(fraction=0.5, k=3)),
+        filters=(Confidence(minimum=7), NeighbourFraction(fraction=0.5, k=3)),
         odometry=Sequential(registration=icp, guess="previous"),
         # A wide search, as the trajectory has drifted when a loop closes; a strict verification, as
         # a wrong loop does more harm than a missing one.
@@ -45,7 +45,7 @@ def thesis(kind: ViewKind) -> Config:
             max_yaw_rad=0.8,
             min_gap=30,
             per_frame=6,
-            confirmation=Confirmation(min_share=0.45),
+            confirmation=Confirmation(min_fraction=0.45),
         ),
         optimiser=Castellani(normalisation="thesis"),
         fusion=Fusion(),
@@ -58,7 +58,7 @@ def default(kind: ViewKind) -> Config:
     Range images get a noise model, multipath is compensated if views show it, and they are aligned
     with keyframes by planes and albedo; views of the model are filtered further. Revisited places
     close loops, and all views are refined jointly. Clouds are registered in pairs, as far as their
-    poses are believed, and refined by the planes that they share.
+    poses are accepted, and refined by the planes that they share.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":

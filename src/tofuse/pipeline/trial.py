@@ -217,7 +217,7 @@ class _AlignedViews:
             if target is not None and source is not None:
                 pair = source.surface, [Target(target.surface, np.eye(4))]
                 aligned = align(*pair, np.eye(4), _ALIGNMENT)
-                fits = aligned.inlier_share * aligned.overlap >= _MIN_INLIERS
+                fits = aligned.inlier_ratio * aligned.overlap >= _MIN_INLIERS
                 if not fits or len(aligned.unobservable) > 6 - _MIN_CONSTRAINED:
                     aligned = None
             self._steps[i, j] = aligned

@@ -170,7 +170,7 @@ class Confirmation(Bounded):
     registrations
         Applied sequentially, coarse to fine, each initialised by the one before, as a trajectory
         has drifted when a loop closes. The last one is judged.
-    min_share
+    min_fraction
         Minimum fraction of the source's points with a correspondence, 0 to 1.
     max_error
         Maximum mean distance of corresponding points in units of the resolution, that is, E over
@@ -180,7 +180,7 @@ class Confirmation(Bounded):
     registrations: tuple[Registrar, ...] = field(
         default_factory=lambda: (algorithm_1(0.2), algorithm_1(0.05))
     )
-    min_share: Annotated[float, Bounds(0, 1)] = 0.3
+    min_fraction: Annotated[float, Bounds(0, 1)] = 0.3
     max_error: Annotated[float, Bounds(0, exclusive=True)] = 0.65
 
     def __post_init__(self) -> None:
@@ -191,14 +191,14 @@ class Confirmation(Bounded):
     def objection(self, registration: Registration) -> str:
         """Return why a registration is rejected; empty if it is accepted.
 
-        A method that verifies its pose itself (`believed`) decides.
+        A method that verifies its pose itself (`accepted`) decides.
         """
-        if registration.believed is not None:
+        if registration.accepted is not None:
             return registration.reason
-        if registration.correspondences == 0 or registration.share < self.min_share:
+        if registration.correspondences == 0 or registration.inlier_ratio < self.min_fraction:
             return (
-                f"only {registration.share:.0%} of the points correspond, "
-                f"{self.min_share:.0%} are needed"
+                f"only {registration.inlier_ratio:.0%} of the points correspond, "
+                f"{self.min_fraction:.0%} are needed"
             )
         error = mean_error(registration)
         if not error <= self.max_error:
@@ -229,17 +229,17 @@ class Confirmation(Bounded):
                 found.append(self._register(source, target, start, seed))
             except RegistrationError as error:
                 failure = failure or str(error)
-            if found and found[-1].believed is not None:
+            if found and found[-1].accepted is not None:
                 break  # it searched for rival poses itself
         if not found:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
-        best = max(found, key=lambda r: (not self.objection(r), r.share, -r.error))
+        best = max(found, key=lambda r: (not self.objection(r), r.inlier_ratio, -r.error))
         objection = self.objection(best)
         reason = objection or (
-            f"{best.share:.0%} of the points correspond, with an error of "
+            f"{best.inlier_ratio:.0%} of the points correspond, with an error of "
             f"{mean_error(best):.2f} of the resolution"
         )
-        record = LoopRecord(i, j, not objection, reason, overlap=best.share, rms_m=best.rms_m)
+        record = LoopRecord(i, j, not objection, reason, overlap=best.inlier_ratio, rms_m=best.rms_m)
         if objection:
             return ClosedLoop(record)
         return ClosedLoop(record, best.T_target_source, best.information)
@@ -255,4 +255,4 @@ class Confirmation(Bounded):
 
 def mean_error(registration: Registration) -> float:
     """Return E over the corresponding points: their mean distance in units of the resolution."""
-    return registration.error / registration.share if registration.share else np.inf
+    return registration.error / registration.inlier_ratio if registration.inlier_ratio else np.inf

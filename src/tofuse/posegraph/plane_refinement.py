@@ -34,7 +34,7 @@ class Planes(Bounded, Refining):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
     See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
-    them. The outcome is believed only if the views support each other about as well as before, and
+    them. The outcome is accepted only if the views support each other about as well as before, and
     views that lose support stay where their neighbours had them.
 
     Attributes

@@ -27,7 +27,7 @@ class AgreementOptions:
     ----------
     points
         Approximate number of points of each image that are projected into the other.
-    sigmas, floor_m, floor_share
+    sigmas, floor_m, floor_fraction
         Distance tolerance of a supporting point: standard deviations of both images, plus metres,
         plus a fraction of its depth, for systematic errors of the sensor.
     max_angle
@@ -43,7 +43,7 @@ class AgreementOptions:
     points: int = 2500
     sigmas: float = 2.0
     floor_m: float = 0.01
-    floor_share: float = 0.01
+    floor_fraction: float = 0.01
     max_angle: float = 0.7
     albedo: float = 0.1
     violation_weight: float = 2.0
@@ -195,7 +195,7 @@ def _one_way(
             T,
             options.sigmas,
             options.floor_m,
-            options.floor_share,
+            options.floor_fraction,
             float(np.cos(options.max_angle)),
             differences,
             a,

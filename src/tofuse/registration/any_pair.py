@@ -37,7 +37,7 @@ class AnyPair(Registrar):
     """Registration of two views with a wide baseline, with verification of the pose.
 
     Images, and clouds seen from their origin, are registered as images (`registration.view_pair`).
-    Other clouds, clouds whose image registration is not believed, and images with too few planes
+    Other clouds, clouds whose image registration is rejected, and images with too few planes
     are registered as clouds (`registration.cloud_pair`).
 
     Attributes
@@ -67,7 +67,7 @@ class AnyPair(Registrar):
         seen = _registered_as_images(source, target, guess, proposals, search=searches)
         if seen is not None and are_images:
             return seen
-        if seen is not None and seen.believed:
+        if seen is not None and seen.accepted:
             return measured_as_clouds(source, target, seen, rng)
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)

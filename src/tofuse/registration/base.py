@@ -45,14 +45,14 @@ class Registration:
     margin
         Score of the pose minus that of its best rival, as a fraction of the points, for methods
         that search; None for those that follow a guess.
-    believed
+    accepted
         Whether the pose is verified; None for methods that don't verify. `converged` does not imply
         it: iterations converge at wrong poses too.
     probability
         That the pose is right, 0 to 1, see `registration.confidence`; None for methods that don't
         estimate it.
     reason
-        Why the pose is not believed, in words; empty otherwise.
+        Why the pose is rejected, in words; empty otherwise.
     runner_up
         (4, 4) T_target_source of the best rival; None if there is none, or none was searched for.
     overlap, support
@@ -78,7 +78,7 @@ class Registration:
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     errors: tuple[float, ...] = ()
     margin: float | None = None
-    believed: bool | None = None
+    accepted: bool | None = None
     probability: float | None = None
     reason: str = ""
     runner_up: Float64 | None = None
@@ -89,8 +89,8 @@ class Registration:
     confirmed: bool = False
 
     @property
-    def share(self) -> float:
-        """Inlier ratio: corresponding points as a fraction of the source's points, 0 to 1."""
+    def inlier_ratio(self) -> float:
+        """Corresponding points as a fraction of the source's points, 0 to 1."""
         return self.correspondences / self.points if self.points else 0.0
 
     @property
@@ -102,9 +102,9 @@ class Registration:
     def stands_alone(self) -> bool:
         """Whether it needs no confirmation by another measurement.
 
-        It is believed, or a search and an alignment agree on a probable pose.
+        It is accepted, or a search and an alignment agree on a probable pose.
         """
-        return bool(self.believed) or (self.is_probable and self.confirmed)
+        return bool(self.accepted) or (self.is_probable and self.confirmed)
 
     @property
     def how(self) -> str:

@@ -152,7 +152,7 @@ def register_clouds(
     Returns
     -------
     The registration. If the views fit only with the source scaled by a power of ten from 0.001 to
-    1000, the pose is that of the scaled source, not believed, and `reason` states the scale.
+    1000, the pose is that of the scaled source, not accepted, and `reason` states the scale.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def register_clouds(
         found = _registered_scaled(source, target, scale, rng)
         if found is not None:
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
-            return replace(found, believed=False, reason=reason)
+            return replace(found, accepted=False, reason=reason)
     try:
         return _registered(source, target, guess, rng, seen, always_search=always_search)
     except RegistrationError as error:
@@ -224,14 +224,14 @@ def _power_of_scale(source: Frame, target: Frame) -> int:
 def _registered_scaled(
     source: Frame, target: Frame, scale: float, rng: np.random.Generator
 ) -> Registration | None:
-    """Register the scaled source; None if the result is not believed."""
+    """Register the scaled source; None if the result is not accepted."""
     points = source.points * np.float32(scale)
     scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
     try:
         found = _registered(scaled, target, None, rng)
     except RegistrationError:
         return None
-    return found if found.believed else None
+    return found if found.accepted else None
 
 
 def measured_as_clouds(
@@ -349,7 +349,7 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     return replace(
         found,
         margin=lead,
-        believed=not reason,
+        accepted=not reason,
         probability=evidence.probability,
         reason=reason,
         runner_up=None if rival is None or rival is _NOWHERE else rival.T_target_source,

@@ -18,8 +18,8 @@ from tofuse.registration.agreement import Agreement
 
 # Tolerances of a right pose: fraction of the depth, and rad.
 RIGHT_SHARE, RIGHT_RAD = 0.05, float(np.radians(4.0))
-# Minimum probability of a believed pose; the mean probability of believed poses is much higher.
-BELIEVED = 0.9
+# Minimum probability of an accepted pose; the mean probability of accepted poses is much higher.
+ACCEPTED = 0.9
 # Minimum probability at which a pose aligned from a guess is accepted without a search, as it was
 # not compared with rivals.
 CERTAIN = 0.98
@@ -39,7 +39,7 @@ class Model:
 # under the ROC curve is 0.99 and 0.91.
 IMAGES = Model(searched=(0.34, 6.17, -6.40, -4.21), followed=(0.55, 7.01, -6.02))
 # Fitted to clouds: 146 searched poses. On 226 held-out pairs, some without overlap, the area is
-# 0.98; of 90 believed poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
+# 0.98; of 90 accepted poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
 # known viewpoint.
 CLOUDS = Model(searched=(-1.82, 6.08, -4.78, -0.69), followed=(-2.29, 9.96, -5.5))
 
@@ -105,8 +105,8 @@ class Evidence:
         return logistic(float(self.searched @ self.model.searched))
 
     def objection(self) -> str:
-        """Return the reason why the pose is not believed; empty if it is."""
-        if self.probability >= BELIEVED:
+        """Return the reason why the pose is rejected; empty if it is accepted."""
+        if self.probability >= ACCEPTED:
             return ""
         said = []
         if self.support < _LITTLE_SUPPORT:

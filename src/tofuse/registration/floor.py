@@ -18,7 +18,7 @@ class Floor:
 
     normal: Float64
     height: float
-    share: float
+    fraction: float
 
 
 # Number of sampled points, and of plane hypotheses.

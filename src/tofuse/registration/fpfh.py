@@ -119,8 +119,8 @@ class Fpfh(Registrar):
         """
         found = self.candidates(source, target, rng)
         best = found.poses[0]
-        rival = found.poses[1].share if len(found.poses) > 1 else 0.0
-        first = registration_of(found.pairs, best.agreed, best.share - rival)
+        rival = found.poses[1].inlier_ratio if len(found.poses) > 1 else 0.0
+        first = registration_of(found.pairs, best.agreed, best.inlier_ratio - rival)
         if not self.refine:
             return first
         fine = CoarseToFine(coarsest=found.size)
@@ -142,12 +142,12 @@ class Fpfh(Registrar):
         variance = np.full(len(i), 2 * (_SCATTER * size) ** 2)
         pairs = Pairs(there.points[i], here.points[j], variance)
         tree = KdTree(here.points)
-        settled = [
-            Candidate(*_settled(there, here, tree, c.T_target_source, size), c)
+        refined = [
+            Candidate(*_refined(there, here, tree, c.T_target_source, size), c)
             for c in consensus(pairs, self._consensus(size), rng)
         ]
         distinct: list[Candidate] = []
-        for one in sorted(settled, key=lambda c: -c.share):
+        for one in sorted(refined, key=lambda c: -c.inlier_ratio):
             # Discard poses that converge to a better one.
             if all(
                 are_distinct(
@@ -189,7 +189,7 @@ class Candidate:
     """A pose T_target_source (4, 4), the fraction of averaged points that fit, and its matches."""
 
     T_target_source: Float64
-    share: float
+    inlier_ratio: float
     agreed: Consensus
 
 
@@ -258,7 +258,7 @@ def _nearest(a: Float64, b: Float64) -> Int64:
     return nearest
 
 
-def _settled(
+def _refined(
     source: Described, target: Described, tree: KdTree, T: Float64, size: float
 ) -> tuple[Float64, float]:
     """Refine T (4, 4) by ICP over the averaged points; return it and the fraction that fits."""

@@ -43,7 +43,7 @@ def detect_planes(
     rng: np.random.Generator,
     *,
     max_planes: int = 8,
-    min_share: float = 0.03,
+    min_fraction: float = 0.03,
     sigmas: float = 2.5,
     thickness: float = 0.005,
 ) -> list[Plane]:
@@ -60,7 +60,7 @@ def detect_planes(
         Draws the hypotheses.
     max_planes
         Largest number of planes.
-    min_share
+    min_fraction
         Smallest fraction of the view's points on a plane.
     sigmas, thickness
         Largest distance of an inlier: standard deviations, plus a fraction of its depth.
@@ -71,7 +71,7 @@ def detect_planes(
     weight = 1 / within**2
     left = np.ones(len(p), bool)
     planes: list[Plane] = []
-    while len(planes) < max_planes and left.sum() >= max(3, min_share * len(p)):
+    while len(planes) < max_planes and left.sum() >= max(3, min_fraction * len(p)):
         tried = rng.choice(np.flatnonzero(left), min(_TRIED, int(left.sum())), replace=False)
         offsets = (p[tried] * n[tried]).sum(1)
         on = _on(p, n, within, n[tried], offsets) & left
@@ -81,7 +81,7 @@ def detect_planes(
             mine = _on(p, n, within, normal[None], np.array([offset]))[0] & left
             if mine.sum() < 3:
                 break
-        if mine.sum() < max(3, min_share * len(p)):
+        if mine.sum() < max(3, min_fraction * len(p)):
             break
         left &= ~mine
         rms = float(np.sqrt(((p[mine] @ normal - offset) ** 2).mean()))

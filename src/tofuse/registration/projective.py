@@ -166,7 +166,7 @@ class Aligned:
     noise_scale: float = 1.0
 
     @cached_property
-    def inlier_share(self) -> float:
+    def inlier_ratio(self) -> float:
         """Inliers as a fraction of the compared points."""
         return self.inliers / self.compared if self.compared else 0.0
 

@@ -513,7 +513,7 @@ def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -
 
 def _noise_floor(s: _View, t: _View, options: AgreementOptions) -> float:
     """Sensor error tolerance at the depth of the views, m."""
-    return options.floor_m + options.floor_share * 0.5 * (s.depth + t.depth)
+    return options.floor_m + options.floor_fraction * 0.5 * (s.depth + t.depth)
 
 
 def _refine(

@@ -105,7 +105,7 @@ class UsualFit:
         return float(np.exp(self._mean[3]))
 
     @property
-    def rms_share(self) -> float:
+    def rms_fraction(self) -> float:
         """Usual rms distance of inliers from the surface, as a fraction of the depth."""
         return float(np.median(self._rms)) if self._rms else 0.0
 
@@ -179,7 +179,7 @@ def self_scaled(usual: UsualFit) -> AgreementOptions:
     plain = AgreementOptions()
     return replace(
         plain,
-        floor_share=max(plain.floor_share, _NO_CONFLICT * usual.rms_share),
+        floor_fraction=max(plain.floor_fraction, _NO_CONFLICT * usual.rms_fraction),
         albedo=max(plain.albedo, _NO_CONFLICT * usual.albedo),
     )
 
@@ -192,7 +192,7 @@ def finely_scaled(usual: UsualFit) -> AgreementOptions:
     return replace(
         coarse,
         floor_m=0.0,
-        floor_share=_NO_CONFLICT * usual.rms_share,
+        floor_fraction=_NO_CONFLICT * usual.rms_fraction,
         # An albedo difference counts against a pose beyond twice the usual one.
         albedo=2 * _NO_CONFLICT * usual.albedo,
     )

@@ -112,7 +112,7 @@ def register_pair(
         Whether to search even if the pose aligned from the guess is practically certain.
     proposals
         Returns poses (N, 4, 4) beyond the reach of the search, evaluated if its result is not
-        believed.
+        accepted.
     uncertainty
         Constants of the covariance; those of views without multipath unless given.
 
@@ -134,7 +134,7 @@ def register_pair(
     if prepared is None or match is None:
         return None
     found = pair.chosen(near, match, prepared, guess is not None)
-    if found.believed or proposals is None:
+    if found.accepted or proposals is None:
         return found
     return pair.chosen(near, prepared.among(proposals(), match), prepared, guess is not None)
 
@@ -226,7 +226,7 @@ class _Pair:
 
         The latter is preferred if `guessed`, that is if the start was given by the caller.
         """
-        best = self.settled(match, prepared)
+        best = self.refined(match, prepared)
         confirmed = near is not None and not near.degenerate and self.same(near, best)
         if guessed and near is not None:
             best = self.nearer(near, best, prepared)
@@ -235,7 +235,7 @@ class _Pair:
         evidence = Evidence.of(best.agreement, lead, best.degenerate)
         return replace(self.registration(best, evidence, rival), confirmed=confirmed)
 
-    def settled(self, match: Match, prepared: Search) -> _Pose:
+    def refined(self, match: Match, prepared: Search) -> _Pose:
         """Align the best pose of a search, unless its agreement decreases significantly."""
         error_m = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
         options = replace(_PATIENT, prior_m=error_m, prior_rad=_AFTER_SEARCH)
@@ -280,7 +280,7 @@ class _Pair:
         return replace(
             found,
             margin=evidence.margin,
-            believed=not reason,
+            accepted=not reason,
             probability=evidence.probability,
             reason=reason,
             runner_up=None if rival is None else rival.T_target_source,

@@ -42,7 +42,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
 def render_pair(result: PairResult) -> str:
     """Return the page as HTML."""
     scene = pair_scene(result)
-    head, tail = pair_words.belief(result)
+    head, tail = pair_words.decision(result)
     drawn = render_modes(scene)
     pictures = {mode: images.data_uri(image) for mode, image in drawn.items()}
     return template("pair.html.j2").render(
@@ -50,7 +50,7 @@ def render_pair(result: PairResult) -> str:
         version=__version__,
         style=asset("style.css"),
         script=script(),
-        tone=_TONES[result.found.believed],
+        tone=_TONES[result.found.accepted],
         head=head,
         tail=tail,
         facts=_facts(result, scene),

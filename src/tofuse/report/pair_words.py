@@ -13,17 +13,17 @@ _ALONG = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
 
 
-def belief(result: PairResult) -> tuple[str, str]:
-    """Return whether the pose is believed, and the rest of the sentence."""
+def decision(result: PairResult) -> tuple[str, str]:
+    """Return whether the pose is accepted, and the rest of the sentence."""
     found = result.found
     chance = "" if found.probability is None else f"probability {_chance(found.probability)}"
-    if found.believed:
-        return "Believed", chance
-    if found.believed is None:
+    if found.accepted:
+        return "Accepted", chance
+    if found.accepted is None:
         return "Not verified", "; ".join(
             text for text in (chance, found.reason or "the method can't verify its result") if text
         )
-    return "Not believed", "; ".join(text for text in (chance, found.reason) if text)
+    return "Rejected", "; ".join(text for text in (chance, found.reason) if text)
 
 
 def translation(result: PairResult) -> str:
@@ -67,7 +67,7 @@ def overlap(result: PairResult) -> str:
     if found.contradiction is not None:
         parts.append(f"{percent(found.contradiction)} contradict it")
     if not parts:
-        return f"{percent(found.share)} of the source's points have a correspondence"
+        return f"{percent(found.inlier_ratio)} of the source's points have a correspondence"
     return ", ".join(parts)
 
 
@@ -91,7 +91,7 @@ def sigma(result: PairResult) -> str:
 def sigma_note(result: PairResult) -> str:
     """Return an explanation of `sigma`."""
     note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
-    if result.found.believed is None:
+    if result.found.accepted is None:
         note += "; from point noise only, usually too small"
     return note
 

@@ -24,7 +24,7 @@ from tofuse.kernels.threads import run_all
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
-from tofuse.registration.confidence import BELIEVED, Evidence
+from tofuse.registration.confidence import ACCEPTED, Evidence
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, differ
 from tofuse.registration.verification import comparable
@@ -317,7 +317,7 @@ class _Placer:
         usual = float(gaps.mean()) if len(gaps) else rival
         chance = float(np.exp(-max(score - rival, 0.0) / usual)) if usual > 0 else 0.0
         probability = min(evidence.probability, 1 - chance)
-        if evidence.probability >= BELIEVED:
+        if evidence.probability >= ACCEPTED:
             return evidence.probability, ""
         if evidence.probability < PROBABLE:
             return probability, evidence.objection()

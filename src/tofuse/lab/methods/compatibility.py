@@ -134,19 +134,19 @@ class Trimmed(Rejector):
 
     Attributes
     ----------
-    share
-        The overlap, as a fraction of the source's selected points.
+    overlap
+        Fraction of the selected points of the source that lie in the overlap.
     """
 
-    share: float = 0.8
+    overlap: float = 0.8
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share is {self.share}, not more than 0 and at most 1")
+        if not 0 < self.overlap <= 1:
+            raise ValueError(f"overlap is {self.overlap}, not more than 0 and at most 1")
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
-        count = int(self.share * len(alignment.source))
+        count = int(self.overlap * len(alignment.source))
         if count >= len(matches):
             return matches
         keep = np.zeros(len(matches), bool)

@@ -42,7 +42,7 @@ class PlaneSets(Registrar):
     ----------
     planes
         Maximum number per view.
-    least_share
+    min_fraction
         Minimum fraction of a view's points on a plane.
     sigmas, thickness
         Inlier distance of a plane: standard deviations, plus a fraction of the depth.
@@ -51,7 +51,7 @@ class PlaneSets(Registrar):
     """
 
     planes: int = 8
-    least_share: float = 0.03
+    min_fraction: float = 0.03
     sigmas: float = 2.5
     thickness: float = 0.005
     angle: float = 0.1
@@ -61,7 +61,7 @@ class PlaneSets(Registrar):
     def __post_init__(self) -> None:
         if not 1 <= self.planes <= 20:
             raise ValueError(f"planes is {self.planes}, not 1 to 20")
-        for name in ("least_share", "sigmas", "thickness", "angle", "offset"):
+        for name in ("min_fraction", "sigmas", "thickness", "angle", "offset"):
             if not 0 < getattr(self, name) <= 100:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
 
@@ -107,7 +107,7 @@ class PlaneSets(Registrar):
             view,
             rng,
             max_planes=self.planes,
-            min_share=self.least_share,
+            min_fraction=self.min_fraction,
             sigmas=self.sigmas,
             thickness=self.thickness,
         )

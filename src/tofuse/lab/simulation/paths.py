@@ -73,10 +73,10 @@ def smooth_step(u: float) -> float:
 
 
 def there_and_back(
-    T_room_camera: Float64, length_m: float, seconds: float, outward_share: float = 0.38
+    T_room_camera: Float64, length_m: float, seconds: float, outward_fraction: float = 0.38
 ) -> Path:
     """Translate along the camera's +x axis by `length_m` and back, faster on the way out."""
-    out = outward_share * seconds
+    out = outward_fraction * seconds
 
     def path(t: float) -> Float64:
         share = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
