@@ -37,10 +37,10 @@ CASES: dict[str, list[Filter]] = {
     "neighbourhood angle 170 deg": [NeighbourhoodAngle()],
     "median 5 x 5, 0.1 m": [Median()],
     "neighbour distance 0.05 m": [NeighbourDistance()],
-    "neighbour share 0.5": [NeighbourFraction()],
+    "neighbour fraction 0.5": [NeighbourFraction()],
     "temporal 25 mm": [TemporalDeviation()],
-    "chapter 4: confidence 7, share 0.5": [Confidence(), NeighbourFraction()],
-    "figure 3.2 d: temporal, share 0.5": [TemporalDeviation(), NeighbourFraction()],
+    "chapter 4: confidence 7, fraction 0.5": [Confidence(), NeighbourFraction()],
+    "figure 3.2 d: temporal, fraction 0.5": [TemporalDeviation(), NeighbourFraction()],
 }
 
 

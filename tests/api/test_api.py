@@ -10,8 +10,10 @@ import pytest
 
 import tofuse
 from tofuse.cli.progress import TerminalProgress
+from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.icp import Icp
 
 
 @pytest.fixture(scope="module")
@@ -293,3 +295,17 @@ def test_viewing_serves_the_page_until_it_is_stopped(result):
             assert page.status == 200
     finally:
         stop(server)
+
+
+def test_a_path_is_no_recording() -> None:
+    with pytest.raises(InputError, match=r"is a str, not a recording; pass tofuse\.open"):
+        tofuse.reconstruct("recording")  # type: ignore[arg-type]
+
+
+def test_a_registration_is_shown_in_one_line() -> None:
+    points = np.random.default_rng(0).random((300, 3))
+    shown = repr(tofuse.register(points, points, method=Icp()))
+    assert shown == (
+        "Registration: not verified, translation 0.0000 m, rotation 0.000 degrees, "
+        "100% inliers, rms 0.00 mm"
+    )

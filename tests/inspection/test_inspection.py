@@ -54,7 +54,7 @@ def test_facts_of_a_simulated_recording(room_recording) -> None:
     assert facts["recording"] == str(room_recording)
     assert (facts["format"], facts["frames"]) == ("native", "8")
     assert facts["images"].startswith("176 x 144, ")
-    assert "amplitude, confidence" in facts["with"]
+    assert "amplitude, confidence" in facts["other images"]
     assert facts["reference poses"] == "for 8 frames"
     assert facts["odometry"] == "none"
     assert facts["valid points"].endswith("%")
@@ -67,14 +67,14 @@ def test_facts_of_a_simulated_recording(room_recording) -> None:
 def test_numbers_of_a_made_recording() -> None:
     frames = [image(2.0, k, valid=600) for k in range(11)]
     facts = inspect_recording(of(frames)).facts
-    assert facts["time"] == "1.00 s, 10.0 frames per second"
+    assert facts["duration"] == "1.00 s, 10.0 frames per second"
     assert facts["depth"] == "2.00 to 2.00 m, median 2.00 m"
     assert facts["valid points"] == "50%"
     assert facts["images"].startswith("40 x 30, 52 x 40 degrees")
-    assert facts["depth is"] == "z"
-    assert facts["with"] == "depth only"
+    assert facts["kind of depth"] == "z"
+    assert facts["other images"] == "none"
     one = inspect_recording(of([image(2.0, depth_kind="range")])).facts
-    assert (one["time"], one["depth is"]) == ("a single moment", "radial range")
+    assert (one["duration"], one["kind of depth"]) == ("a single frame", "radial range")
 
 
 def test_poses_that_are_known() -> None:
@@ -176,7 +176,7 @@ def test_nothing_readable() -> None:
 def test_channels_are_listed() -> None:
     colour = np.zeros((30, 40, 3), np.uint8)
     frame = replace(image(2.0), color_image=colour, amplitude_image=np.ones((30, 40), np.float32))
-    assert inspect_recording(of([frame])).facts["with"] == "amplitude, colour"
+    assert inspect_recording(of([frame])).facts["other images"] == "amplitude, colour"
 
 
 # What follows: each check has a recording that triggers it, and one that must not.

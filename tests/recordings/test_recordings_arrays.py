@@ -58,7 +58,7 @@ def test_npz_of_metres_and_rays(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"depth_unit_m": None}, r"depth_unit_m: is missing; save the metres"),
+        ({"depth_unit_m": None}, r"depth_unit_m: is missing, but depth has whole numbers"),
         ({"K": None}, "K: is missing, and so is rays"),
         ({"K": np.eye(4)}, r"K: has shape \(4, 4\); save \(3, 3\)"),
         ({"depth": made.COUNTS[0, 0]}, r"depth: has shape \(16,\)"),

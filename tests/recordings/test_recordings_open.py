@@ -127,7 +127,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         ("empty", "empty folder"),
         ("loop", "leads back to itself"),
         ("inside", "not a recording of a known format"),
-        ("file.mkv", "suffix '.mkv'"),
+        ("file.mkv", "a '.mkv' file"),
         ("file", r"1 \.docx"),
         ("images", r"1 \.PNG; put .* into a folder depth/ .* camera\.json"),
         ("file.mkv/x", "not a folder"),

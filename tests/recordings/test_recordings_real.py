@@ -184,4 +184,4 @@ def test_every_folder_opens_unasked_and_is_described(
     median = float(facts["depth"].rsplit(" ", 2)[1])
     assert 0.2 < median < 30
     if format_ not in ("ply", "slam6d"):
-        assert facts["depth is"] == ("radial range" if format_ == "ifm-o3r" else "z")
+        assert facts["kind of depth"] == ("radial range" if format_ == "ifm-o3r" else "z")

@@ -264,9 +264,15 @@ def reconstruct(
     Raises
     ------
     InputError
-        If no frame can be read, or none has enough valid points for a pose; or if a filter can't
-        estimate its parameters from the recording.
+        If `recording` is not a recording; if no frame can be read, or none has enough valid points
+        for a pose; or if a filter can't estimate its parameters from the recording.
     """
+    if not isinstance(recording, Recording):
+        raise InputError(
+            f"is a {type(recording).__name__}, not a recording",
+            where="recording",
+            remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
+        )
     with _shown(progress) as seen:
         found = reconstruct_recording(
             recording, config, seed=seed, threads=threads, loops=loops, progress=seen

@@ -140,7 +140,7 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
     if count == 8:
         return _tum
     raise InputError(
-        f"has {count} columns, as no known trajectory format",
+        f"is not a trajectory of a known format: its first line has {count} columns",
         where=path,
         remedy=f"give {_KNOWN}",
     )

@@ -20,7 +20,7 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
         "recording": recording.path,
         "format": recording.format,
         "frames": str(len(recording)),
-        "time": _time(recording.timestamps),
+        "duration": _time(recording.timestamps),
         **_view_facts(recording, frames[0]),
         **_depth_facts(frames),
         "reference poses": _coverage(recording.reference),
@@ -29,14 +29,14 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     facts |= {
         name: str(value)
         for name, value in recording.metadata.items()
-        if isinstance(value, str | int | float)
+        if isinstance(value, str | int | float) and name != "depth_kind"
     }
     return facts
 
 
 def _time(times: Float64) -> str:
     if len(times) < 2:
-        return "a single moment"
+        return "a single frame"
     step = float(np.median(np.diff(times)))
     rate = f", {1 / step:.1f} frames per second" if step > 0 else ""
     return f"{times[-1] - times[0]:.2f} s{rate}"
@@ -67,13 +67,14 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     out = {
         "images": f"{frame.camera.width} x {frame.camera.height}, {wide:.0f} x {high:.0f} degrees, "
         f"{model} camera",
-        "noise as of": family if family != "unknown" else "unknown camera",
+        "noise model": family if family != "unknown" else "unknown camera",
     }
     if isinstance(lens, Pinhole):
-        out["lens"] = f"f {lens.fx:.1f}, {lens.fy:.1f} pixels, centre {lens.cx:.1f}, {lens.cy:.1f}"
+        focal, centre = f"{lens.fx:.1f}, {lens.fy:.1f}", f"{lens.cx:.1f}, {lens.cy:.1f}"
+        out["intrinsics"] = f"f {focal} pixels, centre {centre}"
     return out | {
-        "depth is": "z" if frame.depth_kind == "z" else "radial range",
-        "with": ", ".join(also) or "depth only",
+        "kind of depth": "z" if frame.depth_kind == "z" else "radial range",
+        "other images": ", ".join(also) or "none",
     }
 
 
@@ -86,7 +87,7 @@ def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
     extent = np.median([_extent(f) for f in frames if len(f)], axis=0)
     return {
         "depth": f"{low:.2f} to {high:.2f} m, median {median:.2f} m",
-        "a view spans": " x ".join(f"{size:.2f}" for size in extent) + " m",
+        "extent of a view": " x ".join(f"{size:.2f}" for size in extent) + " m",
         "valid points": f"{valid:.0%}",
     }
 

@@ -502,7 +502,10 @@ class BackEnd:
         """Return the reason if there is no surface."""
         if model.mesh is not None and len(model.mesh):
             return ()
-        text = "The views show no surface of any size: mesh.ply and mesh.glb are empty."
+        text = (
+            "No connected surface is left at this resolution (--voxel): mesh.ply and mesh.glb are "
+            "empty."
+        )
         if model.mesh is None:
             text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
         return (Reason("no_surface", self._whole_recording, text),)

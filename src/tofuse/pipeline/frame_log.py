@@ -108,8 +108,8 @@ class FrameLog:
             raise InputError(
                 f"none of the {len(entries)} frames has enough valid points for a pose"
                 + (f" (first: {entries[0].record.reason})" if entries else ""),
-                where="recording",
-                remedy="check it with `tofuse inspect`; the filters may be too strict for it",
+                where="the recording",
+                remedy="check it with `tofuse inspect`, and the limits of depth and the filters",
             )
 
     @property

@@ -158,7 +158,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
     children = list_folder(path) if path.is_dir() else []
     if path.is_dir() and not children:
-        raise InputError("is an empty folder", where=path, remedy="give a recording")
+        raise InputError("is an empty folder", where=path, remedy="pass a recording")
     if format is not None:
         return _resolve_as(path, format)
     sniffs = _sniff(path)
@@ -235,7 +235,7 @@ def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> Input
         saw = "; ".join(dict.fromkeys(sniff.saw for sniff in sniffs.values()))
         remedies = [sniff.remedy or f"give --format {name}" for name, sniff in sniffs.items()]
         return InputError(
-            f"may not be a recording: there is {saw}",
+            f"could not be identified: it has {saw}",
             where=path,
             remedy=", or ".join(dict.fromkeys(remedies)),
         )
@@ -243,11 +243,11 @@ def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> Input
     if path.is_dir():
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
         saw = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
-        problem = f"is not a recording of a known format: there are {saw}"
+        problem = f"is not a recording of a known format: it contains {saw}"
         if any(kind.lower() in _IMAGES for kind in kinds):
-            remedy = "put the depth images into a folder depth/ in it, next to a camera.json"
+            remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
     else:
-        problem = f"is not a recording of a known format: a file with the suffix {path.suffix!r}"
+        problem = f"is not a recording of a known format, but a {path.suffix!r} file"
     return InputError(
         problem, where=path, remedy=f"{remedy}, or give --format ({', '.join(readers())})"
     )

@@ -169,7 +169,7 @@ class Recording:
         chosen = self.indices[slice(start, end, every)]
         if len(chosen) == 0:
             raise InputError(
-                f"frames {start} to {end} of {len(self)} select nothing",
+                f"has {len(self)} frames, of which the selection leaves none",
                 where=self.path,
                 remedy="change --start, --end or --every",
             )

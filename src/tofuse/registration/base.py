@@ -15,7 +15,7 @@ from tofuse.recordings.frames import Frame
 PROBABLE = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """Result of a registration: the pose of one view in the frame of another.
 
@@ -87,6 +87,15 @@ class Registration:
     contradiction: float | None = None
     violation: float | None = None
     confirmed: bool = False
+
+    def __repr__(self) -> str:
+        decided = {True: "accepted", False: "rejected", None: "not verified"}[self.accepted]
+        t, w = self.T_target_source[:3, 3], se3.so3_log(self.T_target_source[:3, :3])
+        return (
+            f"Registration: {decided}, translation {np.linalg.norm(t):.4f} m, "
+            f"rotation {np.degrees(np.linalg.norm(w)):.3f} degrees, "
+            f"{self.inlier_ratio:.0%} inliers, rms {1000 * self.rms_m:.2f} mm"
+        )
 
     @property
     def inlier_ratio(self) -> float:

@@ -127,7 +127,7 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
         raise InputError(
             f"is an array of shape {array.shape} and type {array.dtype}",
             where=name,
-            remedy="give a frame, or (N, 3) numbers in metres",
+            remedy="pass a frame, or (N, 3) numbers in metres; for a file, tofuse.open(path)[0]",
         )
     good = array[np.isfinite(array).all(1)].astype(np.float64)
     if len(good) < FEWEST_POINTS:

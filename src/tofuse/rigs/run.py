@@ -111,7 +111,7 @@ def _selected(whole: Recording, source: RigSource, options: Options) -> Recordin
     chosen = np.arange(count)[slice(options.start, options.end, options.every)]
     if not len(chosen):
         raise InputError(
-            f"instants {options.start} to {options.end} of {count} select nothing",
+            f"has {count} instants, of which the selection leaves none",
             where="the rig",
             remedy="change --start, --end or --every",
         )

@@ -411,7 +411,7 @@ def build(
     kind = SCENES.get(name)
     if kind is None:
         raise InputError(
-            f"there is no scene called {name!r}", where="scene", remedy=f"use one of {list(SCENES)}"
+            f"there is no scene {name!r}", where="scene", remedy=f"use one of {', '.join(SCENES)}"
         )
     if frames is not None and frames < 1:
         raise InputError(f"is {frames}", where="frames", remedy="ask for at least 1")

@@ -39,7 +39,7 @@ class Native:
             return Sniff(
                 UNSURE,
                 "depth/ but no camera.json",
-                "give --format native --camera camera.json",
+                "write one (docs/formats.md), or give --format native --camera camera.json",
             )
         return Sniff(SURE, "cloud/") if images == "cloud" else None
 

@@ -135,7 +135,11 @@ class NpzSource(FileSource):
         unit = 1.0
         if self.depth.dtype.kind != "f" or "depth_unit_m" in arrays:
             if "depth_unit_m" not in arrays and options.camera is None:
-                raise self._error("depth_unit_m", "is missing", "save the metres per count")
+                raise self._error(
+                    "depth_unit_m",
+                    "is missing, but depth has whole numbers",
+                    "save the metres per count, such as 0.001",
+                )
             unit = self._number(arrays, "depth_unit_m") if "depth_unit_m" in arrays else 1.0
         height, width = self.depth.shape[1:]
         camera: Camera
