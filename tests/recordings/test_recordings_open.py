@@ -129,7 +129,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         ("inside", "not a recording of a known format"),
         ("file.mkv", "a '.mkv' file"),
         ("file", r"1 \.docx"),
-        ("images", r"1 \.PNG; put .* into a folder depth/ .* camera\.json"),
+        ("images", r"1 \.PNG; if .* move them to depth/ .* camera\.json"),
         ("file.mkv/x", "not a folder"),
         ("a\0b", "not a path"),
         ("n" * 300, "too long"),

@@ -239,7 +239,9 @@ class Confirmation(Bounded):
             f"{best.inlier_ratio:.0%} of the points correspond, with an error of "
             f"{mean_error(best):.2f} of the resolution"
         )
-        record = LoopRecord(i, j, not objection, reason, overlap=best.inlier_ratio, rms_m=best.rms_m)
+        record = LoopRecord(
+            i, j, not objection, reason, overlap=best.inlier_ratio, rms_m=best.rms_m
+        )
         if objection:
             return ClosedLoop(record)
         return ClosedLoop(record, best.T_target_source, best.information)
