@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.lab.methods.keypoints import Detector, Keypoints, Light, keypoints
 from tofuse.parts import part
@@ -27,7 +28,7 @@ from tofuse.registration.sample_consensus import (
 
 @part("registration", "features")
 @dataclass(frozen=True)
-class Features(Registrar):
+class Features(Bounded, Registrar):
     """SIFT, ORB or FAST keypoints of the albedo or the colour, matched, with 3D positions.
 
     Matches are mutual nearest neighbours that pass the ratio test (Lowe 2004). As all have depth,
@@ -59,24 +60,19 @@ class Features(Registrar):
 
     detector: Detector = "sift"
     light: Light = "auto"
-    count: int = 1000
-    ratio: float = 0.9
+    count: Annotated[int, Bounds(3, 100_000)] = 1000
+    ratio: Annotated[float, Bounds(0.01, 1)] = 0.9
     mutual: bool = True
-    blur_px: float = 0.7
+    blur_px: Annotated[float, Bounds(0.001, 100)] = 0.7
     verify: bool = True
     consensus: ConsensusOptions = ConsensusOptions()  # noqa: RUF009 - immutable
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, choices in (("detector", Detector), ("light", Light)):
             if getattr(self, name) not in get_args(choices):
                 raise ValueError(f"{name} is {getattr(self, name)!r}, not one of {choices}")
-        if not 3 <= self.count <= 100_000:
-            raise ValueError(f"count is {self.count}, not 3 to 100000")
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"ratio is {self.ratio}, not above 0 and up to 1")
-        if not 0 < self.blur_px <= 100:
-            raise ValueError(f"blur_px is {self.blur_px}, not above 0")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

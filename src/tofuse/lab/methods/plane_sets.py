@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, permutations
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.parts import part
@@ -30,7 +31,7 @@ _HELD = 0.005
 
 @part("registration", "planes")
 @dataclass(frozen=True)
-class PlaneSets(Registrar):
+class PlaneSets(Bounded, Registrar):
     """RANSAC planes of both images, matched by the angles between them.
 
     Two pairs of planes determine a rotation, by their normals; three a translation, by their
@@ -50,20 +51,13 @@ class PlaneSets(Registrar):
         Tolerances of matching planes: rad, and a fraction of the views' depth.
     """
 
-    planes: int = 8
-    min_fraction: float = 0.03
-    sigmas: float = 2.5
-    thickness: float = 0.005
-    angle: float = 0.1
-    offset: float = 0.03
+    planes: Annotated[int, Bounds(1, 20)] = 8
+    min_fraction: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.03
+    sigmas: Annotated[float, Bounds(0, 100, exclusive=True)] = 2.5
+    thickness: Annotated[float, Bounds(0, 100, exclusive=True)] = 0.005
+    angle: Annotated[float, Bounds(0, 100, exclusive=True)] = 0.1
+    offset: Annotated[float, Bounds(0, 100, exclusive=True)] = 0.03
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.planes <= 20:
-            raise ValueError(f"planes is {self.planes}, not 1 to 20")
-        for name in ("min_fraction", "sigmas", "thickness", "angle", "offset"):
-            if not 0 < getattr(self, name) <= 100:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
