@@ -16,7 +16,7 @@ import tomllib
 from pathlib import Path
 
 from tofuse import parts
-from tofuse.pipeline.config import ROOMS
+from tofuse.pipeline.config import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "thesis.md"
@@ -30,8 +30,8 @@ PLACES = {
 
 def tables() -> dict[str, str]:
     """Return the tables by the headings that they follow; ValueError for what is not there."""
-    for room in ROOMS:
-        parts.discover(room)
+    for package in PACKAGES:
+        parts.discover(package)
     rows = tomllib.loads(ROWS.read_text("utf-8"))
     out = {}
     for key, heading in PLACES.items():

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from tofuse import parts
-from tofuse.pipeline.config import ROOMS
+from tofuse.pipeline.config import PACKAGES
 
 Score = Mapping[str, float]
 
@@ -51,8 +51,8 @@ class Board(Protocol):
 
 @cache
 def _discover() -> None:
-    for room in ROOMS:
-        parts.discover(room)
+    for package in PACKAGES:
+        parts.discover(package)
 
 
 def default_made(kind: str) -> dict[str, Any]:

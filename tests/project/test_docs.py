@@ -25,7 +25,7 @@ from tofuse import parts
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
-from tofuse.pipeline.config import ROOMS, Config, ViewKind, changed, from_method, methods
+from tofuse.pipeline.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.registration.prepared_view import SurfaceOptions
@@ -53,7 +53,7 @@ CITED = (
     *("Fischler and Bolles 1981", "Lowe 1999, 2004", "Wheeler and Ikeuchi 1995"),
     *("Söderkvist and Wedin 1994", "Moore 1991", "Hartley and Zisserman 2003"),
 )
-PART_ROOMS = (*ROOMS, "tofuse.recordings.readers", "tofuse.live.devices")
+PART_PACKAGES = (*PACKAGES, "tofuse.recordings.readers", "tofuse.live.devices")
 
 
 @cache
@@ -282,8 +282,8 @@ def documented_parts() -> dict[str, dict[str, list[str]]]:
 
 
 def registered_parts() -> dict[str, dict[str, type]]:
-    for room in PART_ROOMS:
-        parts.discover(room)
+    for package in PART_PACKAGES:
+        parts.discover(package)
     found = {kind: parts.known(kind) for kind in parts._registry}
     # Parts that other tests have made up are not the package's.
     ours = {
@@ -458,7 +458,7 @@ def test_every_room_is_described_in_the_order_of_imports() -> None:
     project = tomllib.loads(text_of("pyproject.toml"))
     layers = project["tool"]["importlinter"]["contracts"][0]["layers"]
     ranks = {room.strip(): rank for rank, layer in enumerate(layers) for room in layer.split("|")}
-    table = rows(sections("ARCHITECTURE.md")["Rooms"])
+    table = rows(sections("ARCHITECTURE.md")["Packages"])
     described = [row[0].strip("`") for row in table if not row[0].strip("`").endswith(("/", "."))]
     assert set(described) == set(ranks) - {"_version"}
     order = [ranks[room] for room in described]

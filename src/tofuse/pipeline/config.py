@@ -96,7 +96,7 @@ class Config(Bounded):
         return dict(parts.to_dict(self))
 
 
-ROOMS = (
+PACKAGES = (
     "tofuse.corrections",
     "tofuse.filters",
     "tofuse.registration",
@@ -138,8 +138,8 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     InputError
         For an option or part that does not exist, or a value of the wrong type.
     """
-    for room in ROOMS:
-        parts.discover(room)
+    for package in PACKAGES:
+        parts.discover(package)
     merged = _merge(config.to_dict(), _divided(changes))
     result: Config = parts.from_dict(Config, merged, where=where)
     return result
