@@ -1,4 +1,4 @@
-# `make help` says what there is. Each target sets up its own .venv from the pinned versions in requirements/dev.txt.
+# `make help` lists the targets. Each target sets up its own .venv from the pinned versions in requirements/dev.txt.
 PYTHON ?= python3
 BIN := .venv/bin
 
@@ -67,6 +67,7 @@ sbom: build/release/.ready  ## what a user installs, in CycloneDX: build/sbom.js
 	$(PYTHON) -m venv --without-pip build/described
 	build/release/bin/python -m pip --python build/described/bin/python install --quiet --disable-pip-version-check -r requirements/runtime.txt
 	build/release/bin/cyclonedx-py environment --pyproject pyproject.toml --mc-type library --output-reproducible --of JSON -o build/sbom.json build/described/bin/python
+	build/release/bin/python requirements/sbom.py build/sbom.json
 
 clean:                      ## remove the environment and what was built
 	rm -rf .venv build dist

@@ -1,11 +1,11 @@
-"""Attacks on the boundary of the program: damaged files, cut-off writes, poor surroundings.
+"""Attacks on the boundary of the program: fuzzed files, power cuts, hostile environments.
 
-    python benchmarks/attack.py [--quick] [--files N] [--kills N] [--only files|kills|surroundings]
+    python benchmarks/attack.py [--quick] [--files N] [--cuts N] [--only files|cuts|environments]
                                 [--journal FILE] [--minutes M]
 
-Prints for each how many were tried and how many held; ends with 1 if any did not. What is promised,
-and so what it is to hold, is in docs/reliability.md. The whole takes hours. With a journal it goes
-on where it was stopped, or where `--minutes` ended it, and the table is of all that was done.
+Prints how many of each kind were tried and how many passed; exits with 1 if any failed. The
+guarantees that are tested are in docs/reliability.md. All of it takes hours. With a journal, a
+stopped run continues where it, or `--minutes`, ended; the table then covers all runs.
 """
 
 from __future__ import annotations
@@ -26,34 +26,36 @@ from attacks.environments import ENVIRONMENTS, Environment, attempt
 from attacks.journal import Journal
 from attacks.power import Power, PowerCut
 
-FILES, KILLS = 20_000, 500
-QUICK_FILES, QUICK_KILLS, QUICK_ENVIRONMENTS = 300, 60, 12
-FILES_IN_PIECE, KILLS_IN_PIECE = 200, 25
+FILES, CUTS = 20_000, 500
+QUICK_FILES, QUICK_CUTS, QUICK_ENVIRONMENTS = 300, 60, 12
+FILES_IN_PIECE, CUTS_IN_PIECE = 200, 25
 
 Work = Callable[[], tuple[int, list[str]]]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="some hundreds in all")
-    parser.add_argument("--files", type=int, help=f"damaged files in all; {FILES} unless given")
-    parser.add_argument("--kills", type=int, help=f"power cuts; {KILLS} unless given")
+    parser.add_argument("--quick", action="store_true", help="some hundreds of attacks")
+    parser.add_argument("--files", type=int, help=f"total of fuzzed files; default {FILES}")
+    parser.add_argument("--cuts", type=int, help=f"power cuts; default {CUTS}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("files", "kills", "surroundings"))
-    parser.add_argument("--journal", type=Path, help="keeps what is done, to go on from")
-    parser.add_argument("--minutes", type=float, default=np.inf, help="begin nothing after these")
+    parser.add_argument("--only", choices=("files", "cuts", "environments"))
+    parser.add_argument("--journal", type=Path, help="file of completed attacks, to continue from")
+    parser.add_argument(
+        "--minutes", type=float, default=np.inf, help="start no attack after that time"
+    )
     arguments = parser.parse_args()
     quick, only = arguments.quick, arguments.only
     files = arguments.files or (QUICK_FILES if quick else FILES)
-    kills = arguments.kills or (QUICK_KILLS if quick else KILLS)
+    cuts = arguments.cuts or (QUICK_CUTS if quick else CUTS)
     most = QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)
     begun = time.monotonic()
-    journal = Journal(arguments.journal, {"seed": arguments.seed, "files": files, "kills": kills})
+    journal = Journal(arguments.journal, {"seed": arguments.seed, "files": files, "cuts": cuts})
     with tempfile.TemporaryDirectory() as base:
         plan = {
-            "kills": lambda: cut_writes(kills, arguments.seed),
-            "surroundings": lambda: surroundings(most, Path(base)),
-            "files": lambda: damaged_files(files, arguments.seed),
+            "cuts": lambda: power_cuts(cuts, arguments.seed),
+            "environments": lambda: environments(most, Path(base)),
+            "files": lambda: fuzzed_files(files, arguments.seed),
         }
         work = [part() for name, part in plan.items() if only in (None, name)]
         left = False
@@ -63,40 +65,40 @@ def main() -> int:
                 break
             journal.do(name, number, attack)
     rows = journal.table()
-    print(f"\n{'attack':40} {'tried':>7} {'held':>7}")
-    for name, tried, held in rows:
-        print(f"{name:40} {tried:7} {held:7}")
-    tried, held = (sum(row[k] for row in rows) for k in (1, 2))
-    print(f"{'all':40} {tried:7} {held:7}{'  (not done yet)' if left else ''}")
-    return 0 if tried == held else 1
+    print(f"\n{'attack':40} {'tried':>7} {'passed':>7}")
+    for name, tried, passed in rows:
+        print(f"{name:40} {tried:7} {passed:7}")
+    tried, passed = (sum(row[k] for row in rows) for k in (1, 2))
+    print(f"{'all':40} {tried:7} {passed:7}{'  (incomplete)' if left else ''}")
+    return 0 if tried == passed else 1
 
 
 def pieces(total: int, size: int) -> Iterator[tuple[int, int, int]]:
-    """Number, first and count of the pieces of so many."""
+    """Split `total` attacks into pieces: number, first and count of each."""
     for number, first in enumerate(range(0, total, size)):
         yield number, first, min(size, total - first)
 
 
-def damaged_files(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
-    """Damaged files of each format, as many of each."""
+def fuzzed_files(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
+    """Fuzzed files, the same number of each format."""
     subjects = mutation.subjects()
     each = -(-total // len(subjects))
 
     def work(name: str, first: int, count: int) -> tuple[int, list[str]]:
         outcomes = mutation.run(name, count, 1_000_000 * seed + first)
-        return count, [f"seed {k}: {said}" for k, said in outcomes if said not in HELD]
+        return count, [f"seed {k}: {said}" for k, said in outcomes if said not in PASSED]
 
     for number, first, count in pieces(each, FILES_IN_PIECE):
         for name in reversed(subjects):  # the small ones first
-            yield f"damaged: {name}", number, lambda n=name, f=first, c=count: work(n, f, c)
+            yield f"fuzzed: {name}", number, lambda n=name, f=first, c=count: work(n, f, c)
 
 
-HELD = ("read", "refused")
+PASSED = ("read", "rejected")
 
 
-def cut_writes(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
-    """Power cuts at random calls to the system: writing, and then going on, again and again."""
-    for number, first, count in pieces(total, KILLS_IN_PIECE):
+def power_cuts(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
+    """Power cuts at random system calls, in writing a result and in up to three recoveries."""
+    for number, first, count in pieces(total, CUTS_IN_PIECE):
         yield (
             "power cuts while a result is written",
             number,
@@ -105,8 +107,8 @@ def cut_writes(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
 
 
 def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
-    """Some of the power cuts."""
-    mutation.subjects()  # which finds the tests
+    """Power cuts with the seeds from `first`."""
+    mutation.subjects()  # adds tests/helpers to the import path
     import made_results
     from tofuse.results.folder import OutputFolder, finish_interrupted, is_result
     from tofuse.results.output import write_result
@@ -149,8 +151,8 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
     return count, faults
 
 
-def surroundings(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
-    """Runs that lack something."""
+def environments(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
+    """Runs in hostile environments."""
     from tofuse.lab.simulation.record import simulate
 
     chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // most)][:most]
@@ -165,7 +167,7 @@ def surroundings(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
         return 1, [f"{environment.name}: {faults}"] if faults else []
 
     for number, environment in enumerate(chosen):
-        yield "surroundings that lack something", number, lambda e=environment: work(e)
+        yield "hostile environments", number, lambda e=environment: work(e)
 
 
 if __name__ == "__main__":

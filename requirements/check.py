@@ -1,9 +1,9 @@
-"""Whether what is installed is what is pinned, may be used by its licence, and is in NOTICE.
+"""Checks that installed packages are as pinned, have a permitted licence and are in NOTICE.
 
     python requirements/check.py
 
-Asks nothing of the network: it compares the pins in this folder with the packages beside the Python
-that runs it. Prints a line for each fault, and ends with 1 if there is one.
+Works offline: it compares the pins in this folder with the packages of the Python that runs it.
+Prints a line for each fault, and exits with 1 if there is one.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from packaging.utils import canonicalize_name
 
 HERE = Path(__file__).resolve().parent
 NOTICE = HERE.parent / "NOTICE"
-# All that is ever installed; and what users of tofuse install, of which NOTICE speaks.
+# All files of pins, and that of what users of tofuse install, which NOTICE names.
 ALL = ("dev", "docs", "extras", "release", "runtime")
 RUNTIME = "runtime"
 
 _PIN = re.compile(r"([A-Za-z0-9][\w.-]*)(?:\[[\w,-]+\])?==([^\s;\\]+)\s*(?:;\s*([^\\]+))?")
-_HASH = re.compile(r"--hash=sha256:[0-9a-f]{64}(?=\s|$)")
-# GPL and LGPL make demands on what imports them; of a package without a word nothing is known.
+_HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})(?=\s|$)")
+# GPL and LGPL impose conditions on programs that import the package.
 _REFUSED = re.compile(r"\b(A|L)?GPL|SSPL|General Public License|Commons Clause|BUSL", re.I)
 
 
 @dataclass(frozen=True)
 class Pin:
-    """One version of one package, where the marker holds, and how many files may be it."""
+    """A version of a package, its environment marker, and the SHA-256 sums of its files."""
 
     name: str
     version: str
     marker: str
-    hashes: int
+    hashes: tuple[str, ...]
 
     @property
     def here(self) -> bool:
-        """Whether it is meant for this system and Python."""
+        """Whether it applies to this system and Python."""
         return not self.marker or Marker(self.marker).evaluate()
 
 
 def pins(path: Path) -> list[Pin]:
-    """Return what a file of pins holds.
+    """Return the pins in a file.
 
     Raises
     ------
     ValueError
-        For a line that pins nothing.
+        For a line without an exact version.
     """
     found = []
     logical = re.sub(r"\\\n", " ", path.read_text(encoding="utf-8"))
@@ -63,36 +63,36 @@ def pins(path: Path) -> list[Pin]:
         if match is None:
             raise ValueError(f"{path.name}: {text[:60]!r} is no exact version")
         marker = re.split(r"\s--hash", match[3] or "")[0].strip()
-        hashes = len(_HASH.findall(text))
+        hashes = tuple(_HASH.findall(text))
         found.append(Pin(canonicalize_name(match[1]), match[2], marker, hashes))
     return found
 
 
 def unhashed(path: Path) -> Iterator[str]:
-    """Pins that any file of that version would satisfy."""
+    """Pins without a hash."""
     for pin in pins(path):
         if not pin.hashes:
             yield f"{path.name}: {pin.name} {pin.version} has no hash"
 
 
 def differing(path: Path) -> Iterator[str]:
-    """Installed packages that are of another version than their pin."""
+    """Installed packages with another version than their pin."""
     for pin in pins(path):
         if pin.here and (installed := _version(pin.name)) not in (None, pin.version):
             yield f"{path.name}: {pin.name} is {installed} here, and pinned to {pin.version}"
 
 
 def unlicensed(names: set[str]) -> Iterator[str]:
-    """Installed packages whose licence may not be used, or is not stated."""
+    """Installed packages whose licence is not permitted, or not stated."""
     for name in sorted(names):
         if _version(name) is None:
             continue
-        told = licence(name)
-        if not told:
+        stated = licence(name)
+        if not stated:
             yield f"{name}: states no licence"
-        # Where one may choose, one that can be used is enough.
-        elif all(map(_REFUSED.search, [told] if " AND " in told else told.split(" OR "))):
-            yield f"{name}: is under {told}"
+        # Of alternatives, one permitted licence is enough.
+        elif all(map(_REFUSED.search, [stated] if " AND " in stated else stated.split(" OR "))):
+            yield f"{name}: is under {stated}"
 
 
 def unnamed(names: set[str], notice: str) -> Iterator[str]:
@@ -103,7 +103,7 @@ def unnamed(names: set[str], notice: str) -> Iterator[str]:
 
 
 def licence(name: str) -> str:
-    """Return what an installed package says of its licence: an SPDX expression, or in words."""
+    """Return the licence that an installed package states: an SPDX expression, or free text."""
     about = metadata.metadata(name)
     if expression := about.get("License-Expression"):
         return str(expression)

@@ -1,8 +1,7 @@
-"""Runs of the program in surroundings that lack something.
+"""Runs of the program in hostile environments.
 
-What is promised of each: a result and a status that says so, or none and one line on standard error
-that says why; never a traceback, nor status 0 without a result, nor anything else of what was there
-before touched.
+Each must end with a result and the status of a result, or without one and with a line on standard
+error that states the reason; without a traceback, and with all other files unchanged.
 """
 
 from __future__ import annotations
@@ -29,24 +28,24 @@ sys.exit(console())
 
 @dataclass(frozen=True)
 class Environment:
-    """One of the surroundings.
+    """An environment, and what a run must do in it.
 
     Attributes
     ----------
     setup
-        Python that the child runs first.
+        Python code that the child executes first.
     shell
-        Where its streams lead, as a shell has it.
+        Redirection of its streams, in shell syntax.
     variables
-        Of the environment, that are changed.
+        Changed environment variables.
     words
-        Added to the command.
+        Arguments appended to the command.
     must
         "work", "refuse", or "either".
     says
-        What standard error has to say where it refuses.
+        Text required on standard error if it must refuse.
     leaves
-        Whether hidden files may stay, for the next run to remove.
+        Whether hidden files may remain, for the next run to remove.
     """
 
     name: str
@@ -65,7 +64,7 @@ def _limit(what: str, soft: int, hard: int | None = None) -> str:
 
 
 def _at(function: str, action: str, count: int = 1) -> str:
-    """Do something at a certain call of one of our functions, given as module:name."""
+    """Code that executes `action` at the `count`-th call of a function, given as module:name."""
     module, name = function.split(":")
     return f"""
 import importlib, signal
@@ -98,8 +97,8 @@ passed = itertools.count()
 time.time = lambda: 2e9 - 1000.0 * next(passed)
 time.time_ns = lambda: int(1e9 * time.time())
 """
-_STAGES = (
-    ("opening", "tofuse.pipeline.run:learnt"),
+STAGES = (
+    ("opening", "tofuse.pipeline.run:adapted"),
     ("tracking", "tofuse.pipeline.reconstruct:push_frames"),
     ("a model", "tofuse.pipeline.backend:BackEnd.run"),
     ("writing", "tofuse.results.output:_write_files"),
@@ -110,7 +109,7 @@ _STAGES = (
 _SIGNALS = ("SIGINT", "SIGTERM")
 
 ENVIRONMENTS: tuple[Environment, ...] = (
-    Environment("nothing lacks"),
+    Environment("ordinary"),
     *(
         Environment(f"{mb} MB of addresses", _limit("RLIMIT_AS", mb * _MB), must="refuse",
                     says="not enough memory")
@@ -127,7 +126,7 @@ ENVIRONMENTS: tuple[Environment, ...] = (
         for count in (7, 9, 12, 16, 24, 32, 64)
     ),
     Environment("no threads", _NO_THREADS, must="either", says=""),
-    Environment("no threads, and one asked for", _NO_THREADS, words=("--threads", "1"),
+    Environment("no threads, --threads 1", _NO_THREADS, words=("--threads", "1"),
                 must="either"),
     Environment("files of 20 kB at most", _limit("RLIMIT_FSIZE", 20_000), must="refuse",
                 says="can't be written"),
@@ -138,7 +137,7 @@ ENVIRONMENTS: tuple[Environment, ...] = (
     Environment("all closed", shell="<&- >&- 2>&-"),
     Environment("stdout full", shell="> /dev/full"),
     Environment("stderr full", shell="2> /dev/full"),
-    Environment("lines to a full disk", shell="> /dev/full", words=("--json",)),
+    Environment("JSON lines to a full disk", shell="> /dev/full", words=("--json",)),
     Environment("a reader that leaves", shell="| head -c 1 > /dev/null", words=("--json",)),
     Environment("a reader that never reads", shell="| true", words=("--json",)),
     Environment("a reader of errors that leaves", shell="2>&1 | head -c 1 > /dev/null"),
@@ -155,13 +154,13 @@ ENVIRONMENTS: tuple[Environment, ...] = (
     Environment("no home", variables=(("HOME", "/nonexistent"), ("XDG_CACHE_HOME", ""))),
     Environment("no folder for temporary files", variables=(("TMPDIR", "/nonexistent"),)),
     Environment("a clock that goes backwards", _CLOCK),
-    Environment("bound to one core", "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"),
+    Environment("one core", "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"),
     Environment("the output folder is read-only", must="refuse", folder="/proc/out",
                 says="can't be written"),
     *(
         Environment(f"{name} at {stage}",
                     _at(function, f"os.kill(os.getpid(), signal.{name})"), must="either")
-        for stage, function in _STAGES
+        for stage, function in STAGES
         for name in _SIGNALS
     ),
 )  # fmt: skip
@@ -169,7 +168,7 @@ ENVIRONMENTS: tuple[Environment, ...] = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run: its status, what it said, whether there is a result, and the faults."""
+    """Exit status and standard error of a run, whether there is a result, and the faults."""
 
     status: int | None
     said: str
@@ -178,7 +177,7 @@ class Outcome:
 
 
 def attempt(environment: Environment, recording: Path, where: Path, *words: str) -> Outcome:
-    """Run the program on a recording in such an environment, over an earlier result."""
+    """Run the program on a recording in an environment, over an earlier result."""
     out = Path(environment.folder) if environment.folder[0] == "/" else where / environment.folder
     mine = None
     if out.is_relative_to(where):
@@ -238,7 +237,7 @@ def _judged(
     if status not in (0, 3) and not old and mine is not None and not result:
         faults.append("neither the old result nor a new one")
     if mine is not None and (out / "notes.txt").read_bytes() != mine["notes.txt"]:
-        faults.append("a file of somebody else has changed")
+        faults.append("a file of the user has changed")
     if result and old:
         faults.append("a mixture of two results")
     hidden = sorted(name for name in there if name.startswith(".tofuse-"))

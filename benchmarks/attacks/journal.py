@@ -1,4 +1,4 @@
-"""What was tried so far, one line for each piece, so that a long benchmark can be done in parts."""
+"""A journal of completed attacks, so that a long benchmark can be continued."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Piece:
-    """Some attempts of one kind: how many, how many held, and what was wrong with the others."""
+    """Some attacks of one kind: how many were tried, how many passed, and the faults found."""
 
     name: str
     number: int
     tried: int
-    held: int
+    passed: int
     faults: tuple[str, ...] = ()
 
 
 class Journal:
-    """Pieces that are done, in a file of JSON lines; in memory alone where none is given."""
+    """The completed pieces, in a file of JSON lines, or only in memory if none is given."""
 
     def __init__(self, path: Path | None, settings: dict[str, object]) -> None:
-        """Read what there is.
+        """Read the file if it exists.
 
         Raises
         ------
         SystemExit
-            If it is the journal of other settings.
+            If it was written with other settings.
         """
         self._path = path
         self.pieces: dict[tuple[str, int], Piece] = {}
@@ -37,7 +37,7 @@ class Journal:
         if path.exists():
             first, *rest = path.read_text().splitlines()
             if json.loads(first) != settings:
-                raise SystemExit(f"{path} is of other settings: {first}")
+                raise SystemExit(f"{path}: was written with other settings: {first}")
             for line in rest:
                 piece = Piece(**json.loads(line))
                 self.pieces[piece.name, piece.number] = piece
@@ -46,7 +46,7 @@ class Journal:
             path.write_text(json.dumps(settings) + "\n")
 
     def do(self, name: str, number: int, work: Callable[[], tuple[int, list[str]]]) -> None:
-        """Do a piece unless it is done; `work` gives how many were tried, and a line per fault."""
+        """Do a piece unless it is done; `work` returns how many were tried, and faults."""
         if (name, number) in self.pieces:
             return
         tried, faults = work()
@@ -59,9 +59,9 @@ class Journal:
                 file.write(json.dumps(asdict(piece)) + "\n")
 
     def table(self) -> list[tuple[str, int, int]]:
-        """Name, tried and held of each kind."""
+        """Return name, tried and passed of each kind."""
         rows: dict[str, tuple[int, int]] = {}
         for piece in self.pieces.values():
-            tried, held = rows.get(piece.name, (0, 0))
-            rows[piece.name] = tried + piece.tried, held + piece.held
+            tried, passed = rows.get(piece.name, (0, 0))
+            rows[piece.name] = tried + piece.tried, passed + piece.passed
         return [(name, *counts) for name, counts in rows.items()]

@@ -1,4 +1,4 @@
-"""Loads what the readers need, for processes that are forked from the one that imports this."""
+"""Imports all modules of the readers, in the process from which the workers are forked."""
 
 from attacks import mutation
 

@@ -1,8 +1,8 @@
-"""Damaged files for every reader: seeded mutations of small valid files of each format.
+"""Mutation fuzzing of all readers: small valid files of each format, with seeded damage.
 
-What is promised: a recording, a frame that can't be read, or an error of ours on one line; within a
-few seconds and with bounded memory. Each subject is read in a process of its own, so that one that
-crashes is found out and the others go on.
+A reader must return a recording, report an unreadable frame, or raise a TofuseError with a message
+of one line, within limits of CPU time and memory. Each subject is read in a process of its own, so
+that a crash is recorded and the other subjects continue.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ import numpy as np
 
 _TESTS = Path(__file__).parents[2] / "tests"  # which make the files
 sys.path[:0] = [str(_TESTS / "helpers"), str(_TESTS / "recordings")]
-_SECONDS = 20  # of the processor, for one file
-_WAITING = 6  # times as long may pass on the clock of a busy machine
-_MORE_BYTES = 3 << 30  # of addresses, than what is loaded has
+_CPU_SECONDS = 20  # for one file
+_MAX_WALL_RATIO = 6  # of wall-clock time to CPU time, on a busy machine
+_MORE_BYTES = 3 << 30  # of address space, beyond that of the loaded program
 _DEEP = 100_000
-# Each process is forked from one that has loaded everything and read nothing: no threads yet.
+# Each process is forked from one that has loaded all modules and has no threads yet.
 _FORKED = multiprocessing.get_context("forkserver")
 _FORKED.set_forkserver_preload(["attacks.loaded"])
 _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
@@ -41,15 +41,18 @@ _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b
 
 @dataclass(frozen=True)
 class Subject:
-    """What is damaged: `make` writes it into a folder, `read` reads what lies there."""
+    """Files of a format: `make` writes them into a folder, `read` reads them.
+
+    `read` returns the name of the recording's format, or else None.
+    """
 
     make: Callable[[Path], None]
-    read: Callable[[Path], object]
+    read: Callable[[Path], str | None]
 
 
 @cache
 def subjects() -> dict[str, Subject]:
-    """Return all, by name; those whose optional packages are missing are left out."""
+    """Return all subjects by name, except those whose optional packages are missing."""
     import test_recordings_fuzz as plain
     import test_recordings_fuzz_cameras as cameras
 
@@ -63,12 +66,23 @@ def subjects() -> dict[str, Subject]:
     for name, (make, file, format_) in cameras.MAKERS.items():
         inside = f"original/{file}" if file else "original"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
+    found["redwood"] = Subject(_redwood, _recording("freiburg1", "redwood"))
     found["tiff"] = Subject(_in(made_exports.make_tiff3d, "original"), _tiffs)
     for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
     h5 = _possible({"ifm-h5": made_ifm.make_h5}, lambda _name: "original/a.h5")
-    return found | h5 | _scans() | _bags() | _small()
+    return found | h5 | _scans() | _bags() | _small() | _results()
+
+
+def _redwood(folder: Path) -> None:
+    """A recording with the optional intrinsics."""
+    import made_recordings
+
+    made_recordings.make_redwood(folder / "freiburg1")
+    K = [525.0, 0, 0, 0, 525.0, 0, 319.5, 239.5, 1]
+    camera = {"width": 640, "height": 480, "intrinsic_matrix": K}
+    (folder / "freiburg1" / "camera.json").write_text(json.dumps(camera))
 
 
 def _in(make: Callable[[Path], Any], inside: str) -> Callable[[Path], None]:
@@ -79,17 +93,18 @@ def _in(make: Callable[[Path], Any], inside: str) -> Callable[[Path], None]:
     return run
 
 
-def _recording(inside: str, format_: str | None) -> Callable[[Path], object]:
+def _recording(inside: str, format_: str | None) -> Callable[[Path], str]:
     from tofuse.errors import TofuseError
     from tofuse.recordings.open import open_recording
 
-    def read(folder: Path) -> None:
+    def read(folder: Path) -> str:
         recording = open_recording(folder / inside, format=format_)
         for item in recording.read_all():
             if isinstance(item, TofuseError):
                 _check_line(item)
             elif not np.isfinite(item.points).all():
                 raise AssertionError("a point is not finite")
+        return recording.format
 
     return read
 
@@ -174,12 +189,13 @@ def _bags() -> dict[str, Subject]:
     }
 
 
-def _bag(folder: Path, maker: str) -> None:
-    """Read what lies in the one folder: a bag is a file or a folder."""
+def _bag(folder: Path, maker: str) -> str:
+    """Read each entry of the folder: a bag is a file or a folder."""
     format_ = "ros" if maker == "rosbag" else f"{maker}-bag"
     (inside,) = (folder / "original").iterdir()
     for path in sorted(inside.iterdir()):
         _recording(str(path.relative_to(folder)), format_)(folder)
+    return format_
 
 
 def _possible(
@@ -198,11 +214,13 @@ def _possible(
 
 
 def _small() -> dict[str, Subject]:
-    """Single files: graphs, poses, descriptions, results, states."""
+    """Single files: graphs, poses, cameras, configurations, meshes, checkpoints."""
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
     from tofuse.files.arrays import read_npz, write_npz
+    from tofuse.files.geometry_record import GeometryRecord
+    from tofuse.files.glb import read_glb, write_glb
     from tofuse.files.pose import read_pose
     from tofuse.files.tables import read_columns
     from tofuse.files.trajectory_formats import read_poses
@@ -211,6 +229,7 @@ def _small() -> dict[str, Subject]:
     from tofuse.posegraph.g2o import read_g2o
     from tofuse.posegraph.given import read_loops
     from tofuse.recordings.camera_file import read_camera_file
+    from tofuse.recordings.open import read_reference
     from tofuse.recordings.rig import read_rig
     from tofuse.sensor.noise import NoiseModel, RangeLaw
 
@@ -252,11 +271,21 @@ def _small() -> dict[str, Subject]:
         try:
             decode(json.loads(arrays.pop("nodes").tobytes()), arrays)
         except (StateError, ValueError, KeyError, RecursionError):
-            return  # as `checkpoint` tells it
+            return  # as in `Checkpoints.load`
+
+    def mesh(path: Path) -> None:
+        import wavy_surface
+
+        made = wavy_surface.waves(8)
+        scalars = {"sigma": made.sigma, "views": made.views}
+        record = GeometryRecord(
+            made.vertices, made.faces, made.normals, made.color, scalars=scalars
+        )
+        write_glb(path, record)
 
     texts: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         "g2o": ("a.g2o", "\n".join([*vertices, *edges]) + "\n", read_g2o),
-        "tum poses": ("a.txt", tum, read_poses),
+        "tum poses": ("a.txt", tum, read_reference),
         "pose": ("a.txt", "\n".join(" ".join(map(str, row)) for row in pose), read_pose),
         "pose in json": ("a.json", json.dumps({"T_target_source": pose}), read_pose),
         "transforms.json": ("transforms.json", json.dumps({"frames": [
@@ -272,18 +301,33 @@ def _small() -> dict[str, Subject]:
     }  # fmt: skip
     found = {}
     for name, (file, text, read) in texts.items():
-        found[name] = Subject(
-            lambda folder, file=file, text=text: _text(folder / file, text),
-            lambda folder, file=file, read=read: read(folder / file),
-        )
-    found["a state"] = Subject(lambda f: state(f / "a.state"), lambda f: resume(f / "a.state"))
-    found["a result"] = Subject(lambda f: _result(f / "out"), lambda f: _load(f / "out"))
-    found["a plan"] = Subject(lambda f: _stopped(f / "out"), lambda f: _settle(f / "out"))
-    return found
+        found[name] = _file(file, lambda path, text=text: path.write_text(text), read)
+    return found | {
+        "glb": _file("a.glb", mesh, read_glb),
+        "a state": _file("a.state", state, resume),
+    }
 
 
-def _text(path: Path, text: str) -> None:
-    path.write_text(text)
+def _file(name: str, make: Callable[[Path], object], read: Callable[[Path], object]) -> Subject:
+    """A file that is no recording."""
+
+    def made(folder: Path) -> None:
+        make(folder / name)
+
+    def parsed(folder: Path) -> None:
+        read(folder / name)
+
+    return Subject(made, parsed)
+
+
+def _results() -> dict[str, Subject]:
+    """Output folders."""
+    return {
+        "a result": _file("out", _result, _load),
+        "a plan": _file("out", _stopped, _settle),
+        "tiles": _file("tiles", _tiles, _load_tiles),
+        "a session": _file("out", _session, _load_session),
+    }
 
 
 def _result(out: Path) -> None:
@@ -296,14 +340,45 @@ def _result(out: Path) -> None:
 
 def _load(out: Path) -> None:
     from tofuse.results.loading import load_result
-    from tofuse.viewer.view_file import read_view_file
+    from tofuse.viewer.content import read_content
 
     load_result(out)
-    read_view_file(out)
+    read_content(out)
+
+
+def _tiles(folder: Path) -> None:
+    import wavy_surface
+    from tofuse.results.tiles import write_tiles
+
+    write_tiles(wavy_surface.waves(8), np.eye(3), folder)
+
+
+def _load_tiles(folder: Path) -> None:
+    from tofuse.viewer.content import TiledLayer
+
+    TiledLayer.read(folder).overview()
+
+
+def _session(out: Path) -> None:
+    import made_sessions
+
+    made_sessions.made_result(out, made_sessions.HERE[:3], number=1)
+
+
+def _load_session(out: Path) -> None:
+    from tofuse.errors import InputError
+    from tofuse.pipeline.progress import Silent
+    from tofuse.pipeline.sessions import read_sessions
+
+    try:
+        read_sessions([out], 1, Silent())
+    except InputError as error:  # if there is nothing else to complain about
+        if "is a single session" not in str(error):
+            raise
 
 
 def _stopped(out: Path) -> None:
-    """A result, and moves of another one that were stopped in the middle."""
+    """A result, and an interrupted replacement by another one."""
     import made_results
     from attacks.power import Power, PowerCut
     from tofuse.files import moving
@@ -331,11 +406,11 @@ def _settle(out: Path) -> None:
         OutputFolder(out, overwrite=True).discard()
     finally:
         if before is not None and mine.read_bytes() != before:
-            raise AssertionError("what was mine has changed")
+            raise AssertionError("a file of the user has changed")
 
 
 def damage(folder: Path, rng: np.random.Generator) -> None:
-    """Damage one of the files of a folder, in one of many ways."""
+    """Damage a random file of a folder, in a random way."""
     files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
     if not files:
         return
@@ -353,7 +428,7 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
             for _ in range(1 + int(rng.integers(8))):
                 if data:
                     data[at()] ^= 1 << int(rng.integers(8))
-        case 2:  # within the header, where it hurts
+        case 2:  # within the header
             for _ in range(3):
                 if data:
                     data[at(300)] = int(rng.integers(256))
@@ -362,15 +437,15 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
             value = int(rng.choice([0, 1, 2**7, 2**15, 2**31 - 1, 2**31, 2**63 - 1, 2**64 - 1]))
             order = "little" if rng.integers(2) else "big"
             data[where : where + width] = (value % 256**width).to_bytes(width, order)
-        case 4:  # a number of a text
+        case 4:  # a number in a text
             digits = [k for k, c in enumerate(data[:4000]) if 48 <= c < 58]
             if digits:
                 k = digits[rng.integers(len(digits))]
                 data[k : k + 1] = _WORDS[rng.integers(len(_WORDS))]
-        case 5:  # a piece is taken out, or is there twice
+        case 5:  # a section is removed or duplicated
             a, b = sorted((at(), at()))
             data[a:b] = data[a:b] * int(rng.integers(3))
-        case 6:  # a piece of another file
+        case 6:  # a section of another file
             other = files[rng.integers(len(files))].read_bytes()
             a = at()
             data[a : a + 50] = other[:50]
@@ -387,7 +462,7 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
             (path.parent / f"{rng.integers(99)}{path.suffix}").write_bytes(data[: at()])
         case 11:
             _odd(path.parent / f"stray-{rng.integers(99)}{path.suffix}", rng)
-        case 12:  # what its name says, and something else inside
+        case 12:  # the content of another file
             data[:] = files[rng.integers(len(files))].read_bytes()
         case _:
             data[:] = rng.bytes(int(rng.integers(3000)))
@@ -395,7 +470,7 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _odd(path: Path, rng: np.random.Generator) -> None:
-    """Something that is no file."""
+    """Make an entry that is not a regular file, or none."""
     if os.path.lexists(path):
         return
     match int(rng.integers(6)):
@@ -418,7 +493,7 @@ class _TooLong(BaseException):
 
 
 def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
-    """Read one damaged copy; returns what happened: "read", "refused", or a fault."""
+    """Read one damaged copy, and return "read", "rejected", or the fault."""
     from tofuse.errors import TofuseError
 
     rng = np.random.default_rng([seed, *name.encode()])
@@ -430,8 +505,8 @@ def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
 
     signal.signal(signal.SIGALRM, stop)
     signal.signal(signal.SIGPROF, stop)
-    signal.alarm(_WAITING * _SECONDS)
-    signal.setitimer(signal.ITIMER_PROF, _SECONDS)
+    signal.alarm(_MAX_WALL_RATIO * _CPU_SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, _CPU_SECONDS)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -441,9 +516,9 @@ def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
             _check_line(error)
         except AssertionError as fault:
             return f"{type(error).__name__}: {fault}"
-        return "refused"
+        return "rejected"
     except _TooLong:
-        return f"took more than {_SECONDS} s"
+        return f"took more than {_CPU_SECONDS} s"
     except (Exception, RecursionError) as error:
         import traceback
 
@@ -462,34 +537,37 @@ def _check_line(error: Exception) -> None:
         raise AssertionError(f"{len(text)} characters on {len(text.splitlines())} lines")
 
 
-def _work(name: str, first: int, count: int, told: Connection) -> None:
+def _work(name: str, first: int, count: int, outcomes: Connection) -> None:
     """Attack one subject, and send seed and outcome of each attempt."""
     subject = subjects()[name]
     with tempfile.TemporaryDirectory(prefix="attack-") as base:
         original = Path(base) / "whole"
         original.mkdir()
         subject.make(original)
-        subject.read(original)  # and all is loaded
+        subject.read(original)  # loads all modules
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + _MORE_BYTES,) * 2)
         for seed in range(first, first + count):
             copy = Path(base) / "copy"
             shutil.copytree(original, copy, symlinks=True)
-            told.send((seed, attack(name, subject, seed, copy)))
+            outcomes.send((seed, attack(name, subject, seed, copy)))
             shutil.rmtree(copy)
 
 
 def run(name: str, count: int, first: int = 0) -> Iterator[tuple[int, str]]:
-    """Attack one subject with so many seeds, in processes of its own; gives seed and outcome."""
+    """Attack one subject with `count` seeds, in a process of its own; yields seed and outcome.
+
+    After a crash the remaining seeds are tried in a new process.
+    """
     done, end = first, first + count
     while done < end:
-        told, tells = _FORKED.Pipe(duplex=False)
-        worker = _FORKED.Process(target=_work, args=(name, done, end - done, tells))
+        receiver, sender = _FORKED.Pipe(duplex=False)
+        worker = _FORKED.Process(target=_work, args=(name, done, end - done, sender))
         worker.start()
-        tells.close()
-        with told, suppress(EOFError):
+        sender.close()
+        with receiver, suppress(EOFError):
             while True:
-                seed, outcome = told.recv()
+                seed, outcome = receiver.recv()
                 yield seed, outcome
                 done = seed + 1
         worker.join()

@@ -1,9 +1,8 @@
-"""A power cut after the n-th call to the system that changes a folder.
+"""A simulated power cut after the n-th system call that changes a folder.
 
-From the cut on no such call does anything, nor can anything be put right: what is there is what the
-next program finds. What was written to a file and not forced to the disk is lost, by half, as after
-a real one; names are taken to reach the disk in the order in which they were changed, as file
-systems with a journal have it.
+From then on every such call raises, so that the program can't clean up. Half of the data written to
+files and not synced is lost. Changes of names are assumed to reach the disk in order, as with a
+journalling file system.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ _CHANGING = ("replace", "rename", "mkdir", "rmdir", "unlink", "remove", "link", 
 
 
 class PowerCut(BaseException):
-    """The program is gone."""
+    """The power is off."""
 
 
 class Power:
-    """Counts calls, and goes off after some; `calls` is how many there were."""
+    """Counts the system calls in `calls`, and cuts the power after some number of them."""
 
     def __init__(self, cut_after: int | None = None) -> None:
         self.calls = 0
@@ -72,7 +71,7 @@ class Power:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """Let the block's calls go through here."""
+        """Intercept the system calls of a `with` block."""
         with ExitStack() as stack:
 
             def put(where: Any, name: str, what: Any) -> None:
@@ -88,7 +87,7 @@ class Power:
             yield
 
     def lose(self, folder: Path) -> None:
-        """Take away half of what was written and never forced to the disk."""
+        """Truncate the files that were written and not synced to half their size."""
         for path in folder.rglob("*"):
             status = path.lstat()
             if path.is_file() and (status.st_dev, status.st_ino) in self._dirty:
@@ -109,16 +108,16 @@ def cut_everywhere(
     check: Callable[[Path, int], None],
     every: int = 1,
 ) -> int:
-    """Do a job with a cut after each number of its calls; returns how many calls it makes.
+    """Do a job once for each of its calls with a cut after it; return the number of calls.
 
     Parameters
     ----------
     prepare
-        Makes a folder as it is before.
+        Creates a folder in its initial state.
     job
-        What is cut off.
+        The job.
     check
-        Looks at the folder, given after how many calls it was.
+        Checks the folder, given the number of calls before the cut.
     every
         Steps between cuts.
     """

@@ -1,16 +1,23 @@
-"""Some hundreds of the damaged files of `benchmarks/attack.py`, and a few of its power cuts."""
+"""Some hundreds of the fuzzed files of `benchmarks/attack.py`, and some of its power cuts."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import CodeType, FrameType, FunctionType
 
 import pytest
 
+import tofuse
 from paths import BENCHMARKS
+from tofuse.recordings.open import readers
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="alarms and queues of Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs alarms and FIFOs")
 
 SEEDS = 8
 
@@ -24,8 +31,11 @@ def attacks(monkeypatch):
     return attack, attacks.mutation
 
 
-def test_damaged_files_are_read_or_refused(attacks, tmp_path: Path) -> None:
+def test_fuzzed_files_are_read_or_rejected(attacks, tmp_path: Path) -> None:
+    """Of every format that is registered, and of every function that reads files."""
     _, mutation = attacks
+    called: set[CodeType] = set()
+    formats = set()
     seen: dict[str, int] = {}
     faults = []
     subjects = mutation.subjects()
@@ -34,27 +44,72 @@ def test_damaged_files_are_read_or_refused(attacks, tmp_path: Path) -> None:
         original = tmp_path / "whole"
         original.mkdir()
         subject.make(original)
-        subject.read(original)
+        with calls_recorded(called):
+            formats.add(subject.read(original))
         for seed in range(SEEDS):
             copy = tmp_path / "copy"
             shutil.copytree(original, copy, symlinks=True)
             outcome = mutation.attack(name, subject, seed, copy)
             shutil.rmtree(copy)
             seen[outcome] = seen.get(outcome, 0) + 1
-            if outcome not in ("read", "refused"):
+            if outcome not in ("read", "rejected"):
                 faults.append(f"{name}, seed {seed}: {outcome}")
         shutil.rmtree(original)
     assert faults == []
-    assert min(seen["read"], seen["refused"]) > 50
+    assert min(seen["read"], seen["rejected"]) > 50
+    assert formats == {None, *readers()}
+    assert [name for name, function in reading().items() if function.__code__ not in called] == []
 
 
-def test_processes_that_crash_are_told_and_the_others_go_on(attacks) -> None:
+@contextmanager
+def calls_recorded(called: set[CodeType]) -> Iterator[None]:
+    """Record the code of all Python functions that are called."""
+
+    def record(frame: FrameType, event: str, _argument: object) -> None:
+        if event == "call":
+            called.add(frame.f_code)
+
+    before = sys.getprofile()
+    sys.setprofile(record)
+    try:
+        yield
+    finally:
+        sys.setprofile(before)
+
+
+def reading() -> dict[str, FunctionType]:
+    """The functions of tofuse, by name, that read files as their names say."""
+    found = {}
+    for module in pkgutil.walk_packages(tofuse.__path__, "tofuse."):
+        if module.name == "tofuse.__main__":
+            continue
+        for name, each in vars(importlib.import_module(module.name)).items():
+            own = isinstance(each, FunctionType) and each.__module__ == module.name
+            if own and name.lstrip("_").startswith("read_"):
+                found[f"{module.name}.{name}"] = each
+    assert len(found) > 50
+    return found
+
+
+def test_a_crash_is_recorded_and_the_next_seed_tried(attacks) -> None:
     _, mutation = attacks
     found = list(mutation.run("pose", 3, first=7))
     assert [seed for seed, _ in found] == [7, 8, 9]
-    assert {outcome for _, outcome in found} <= {"read", "refused"}
+    assert {outcome for _, outcome in found} <= {"read", "rejected"}
     (crashed,) = mutation.run("no such format", 1)
     assert crashed == (0, "its process ended with 1")
+
+
+def test_signals_are_sent_in_functions_that_exist(attacks) -> None:
+    from attacks.environments import ENVIRONMENTS, STAGES
+
+    assert len(ENVIRONMENTS) >= 40
+    for _, place in STAGES:
+        module, name = place.split(":")
+        owner = importlib.import_module(module)
+        for part in name.split("."):
+            owner = getattr(owner, part)
+        assert callable(owner)
 
 
 def test_power_cuts(attacks) -> None:
@@ -62,7 +117,7 @@ def test_power_cuts(attacks) -> None:
     assert attack.cuts(0, 10, seed=3) == (10, [])
 
 
-def test_a_journal_goes_on_where_it_was_stopped(attacks, tmp_path: Path) -> None:
+def test_a_journal_continues_where_it_was_stopped(attacks, tmp_path: Path) -> None:
     from attacks.journal import Journal
 
     path, settings = tmp_path / "new" / "a.jsonl", {"seed": 1}
@@ -70,7 +125,7 @@ def test_a_journal_goes_on_where_it_was_stopped(attacks, tmp_path: Path) -> None
 
     def work(number: int) -> tuple[int, list[str]]:
         done.append(number)
-        return 10, ["it fell over"] if number == 1 else []
+        return 10, ["it crashed"] if number == 1 else []
 
     for most in (2, 3):
         journal = Journal(path, settings)

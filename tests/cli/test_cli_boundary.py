@@ -1,4 +1,4 @@
-"""The process in surroundings that lack something: a result, or one line that says why not."""
+"""The process in hostile environments: a result, or one line that states the reason."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", CHOSEN)
-def test_surroundings_that_lack_something(name: str, clouds: Path, tmp_path: Path) -> None:
+def test_hostile_environments(name: str, clouds: Path, tmp_path: Path) -> None:
     (environment,) = [e for e in ENVIRONMENTS if e.name == name]
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
     assert outcome.faults == (), outcome.said

@@ -104,10 +104,10 @@ def test_a_camera_in_motion_is_refused_and_says_what_to_do() -> None:
         Background().fit(frames)
 
 
-def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
+def test_the_filter_must_be_fitted_and_keeps_its_options() -> None:
     filter_ = Background(sigmas=5.0)
     case = shown("box")
-    with pytest.raises(InputError, match="has not learnt"):
+    with pytest.raises(InputError, match="is not fitted"):
         filter_.mask(case.frames[0], ())
     found = filter_.fit(case.frames)
     assert filter_.needs_fit

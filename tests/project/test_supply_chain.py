@@ -1,7 +1,8 @@
-"""What is installed is pinned by hash, under licences that may be used, and named in NOTICE."""
+"""Installed packages are pinned by hash, have permitted licences, and are named in NOTICE."""
 
 from __future__ import annotations
 
+import copy
 import re
 import sys
 import tomllib
@@ -33,11 +34,13 @@ def test_every_pin_has_hashes(check) -> None:
         found = check.pins(path)
         assert len(found) > 20
         assert list(check.unhashed(path)) == []
-        assert len(re.findall(r"--hash=", path.read_text())) == sum(pin.hashes for pin in found)
+        assert len(re.findall(r"--hash=", path.read_text())) == sum(
+            len(pin.hashes) for pin in found
+        )
 
 
-def test_what_users_install_is_what_is_developed_with(check) -> None:
-    """One version of each, and all that the package and its extras ask for."""
+def test_pins_of_users_and_developers_agree(check) -> None:
+    """One version of each package, which satisfies the requirements of tofuse and its extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = {k: v for k, v in project["optional-dependencies"].items() if k != "bench"}
     wanted = [*project["dependencies"], *(line for lines in extras.values() for line in lines)]
@@ -54,23 +57,23 @@ def test_what_users_install_is_what_is_developed_with(check) -> None:
         assert not same or pin.version in same, pin
 
 
-def test_notice_names_all_that_users_install(check) -> None:
+def test_notice_names_all_packages_of_users(check) -> None:
     names = {pin.name for pin in check.pins(FOLDER / "runtime.txt")}
     assert list(check.unnamed(names, check.NOTICE.read_text(encoding="utf-8"))) == []
     assert list(check.unnamed({"numpy", "left-pad"}, "NumPy.")) == ["NOTICE: left-pad is missing"]
 
 
-def test_licences_of_what_users_install(check, monkeypatch) -> None:
+def test_licences_of_packages_of_users(check, monkeypatch) -> None:
     names = {pin.name for pin in check.pins(FOLDER / "runtime.txt")}
     assert list(check.unlicensed(names)) == []
-    told = {
+    stated = {
         "numpy": "MIT OR GPL-2.0-only",
         "scipy": "MIT AND LGPL-2.1-or-later",
         "rich": "",
         "numba": "GNU General Public License v3 (GPLv3)",
     }
-    monkeypatch.setattr(check, "licence", told.__getitem__)
-    assert list(check.unlicensed(set(told))) == [
+    monkeypatch.setattr(check, "licence", stated.__getitem__)
+    assert list(check.unlicensed(set(stated))) == [
         "numba: is under GNU General Public License v3 (GPLv3)",
         "rich: states no licence",
         "scipy: is under MIT AND LGPL-2.1-or-later",
@@ -86,11 +89,68 @@ def test_pins_are_read(check, tmp_path: Path) -> None:
         "c==1\n"
     )
     first, numpy, old, last = check.pins(path)
-    assert (first.name, first.version, first.hashes, first.here) == ("a-b", "1.2", 2, True)
-    assert (numpy.here, old.here, last.hashes) == (True, False, 0)
+    assert (first.name, first.version, first.here) == ("a-b", "1.2", True)
+    assert first.hashes == (64 * "a", 64 * "b")
+    assert (numpy.here, old.here, last.hashes) == (True, False, ())
     assert list(check.unhashed(path)) == ["some.txt: c 1 has no hash"]
     (differs,) = check.differing(path)
     assert re.fullmatch(r"some.txt: numpy is \S+ here, and pinned to 0.0.1", differs)
     path.write_text("a>=1\n")
     with pytest.raises(ValueError, match="is no exact version"):
         check.pins(path)
+
+
+def test_a_bill_of_materials_lists_every_pin_with_its_hashes(check) -> None:
+    """`make sbom` completes and checks the bill with the same functions."""
+    import sbom
+
+    pinned = check.pins(FOLDER / "runtime.txt")
+    here = [pin for pin in pinned if pin.here]
+    bill = {
+        "components": [
+            {
+                "name": pin.name.replace("-", "_"),
+                "version": pin.version,
+                "purl": f"pkg:pypi/{pin.name}@{pin.version}",
+                "licenses": [{"license": {"id": "MIT"}}],
+            }
+            for pin in here
+        ]
+    }
+    assert len(here) > 50
+    assert list(sbom.faults(bill, pinned)) == sorted(f"{pin.name}: has no hash" for pin in here)
+    for _ in range(2):  # repeatable
+        sbom.complete(bill, pinned)
+        assert list(sbom.faults(bill, pinned)) == []
+        for component, pin in zip(bill["components"], here, strict=True):
+            (reference,) = component["externalReferences"]
+            assert [each["content"] for each in reference["hashes"]] == list(pin.hashes)
+            assert {each["alg"] for each in reference["hashes"]} == {"SHA-256"}
+
+    assert set(sbom.LICENCES) <= {pin.name for pin in pinned}
+    (partd,) = (each for each in bill["components"] if each["name"] == "partd")
+    del partd["licenses"]
+    assert list(sbom.faults(bill, pinned)) == ["partd: states no licence"]
+    sbom.complete(bill, pinned)
+    assert list(sbom.faults(bill, pinned)) == []
+
+    wrong = copy.deepcopy(bill)
+    first, second, *_ = wrong["components"]
+    first["version"] = "0.0.1"
+    del second["licenses"]
+    dropped = wrong["components"].pop()
+    wrong["components"].append({**dropped, "name": "left-pad"})
+    names = (here[0].name, here[1].name, here[-1].name)
+    assert list(sbom.faults(wrong, pinned)) == [
+        f"{names[2]}: is pinned, and not listed",
+        *sorted(
+            [
+                f"{names[0]}: is listed as 0.0.1, and pinned to {here[0].version}",
+                f"{names[0]}: has the package URL {first['purl']}",
+                f"{names[1]}: states no licence",
+                "left-pad: is listed, and not pinned",
+                f"left-pad: has the package URL {dropped['purl']}",
+            ],
+            key=lambda line: line.partition(":")[0],
+        ),
+    ]

@@ -16,7 +16,7 @@ from tofuse.arrays import UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes, write_text
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.reading import read_bytes
+from tofuse.files.reading import MALFORMED, read_bytes
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -236,7 +236,7 @@ def read_glb(path: str | Path) -> GeometryRecord:
                 if name.startswith("_")
             },
         )
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+    except (*MALFORMED, struct.error) as error:
         raise InputError(
             f"is not a mesh written by tofuse, or is damaged ({error})",
             where=path,

@@ -14,6 +14,15 @@ from tofuse.errors import InputError
 MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
 _MAX_DOTS = 1000  # on a line of TOML
+# Errors that malformed data cause in code that takes it apart.
+MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
 
 _REASONS = {
     errno.ENOENT: ("doesn't exist", "check the path"),

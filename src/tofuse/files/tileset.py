@@ -13,7 +13,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
-from tofuse.files.reading import read_bytes
+from tofuse.files.reading import MALFORMED, read_bytes
 
 # Tiles have z up; renderers rotate the y axis of glTF there: (x, y, z) becomes (x, -z, y).
 R_TILES_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -105,7 +105,7 @@ def read_tileset(path: str | Path) -> tuple[Tile, dict[str, Any]]:
         if document["asset"]["version"] != "1.1":
             raise ValueError(f"version {document['asset']['version']}")
         return _read(document["root"], 0), dict(document["extras"])
-    except (ValueError, KeyError, TypeError) as error:
+    except MALFORMED as error:
         raise InputError(
             f"is not a tileset written by tofuse, or is damaged ({error})",
             where=path,

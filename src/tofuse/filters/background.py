@@ -44,9 +44,9 @@ class Background(Bounded, Filter):
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`; InputError, as the background has not been estimated."""
         raise InputError(
-            "has not learnt the background",
+            "is not fitted to a recording",
             where="filter 'background'",
-            remedy="use tofuse.reconstruct, or the filter that its `fit` returns",
+            remedy="use the filter that its `fit` returns, or tofuse.reconstruct",
         )
 
     def fit(self, frames: Sequence[Frame]) -> Filter:

@@ -32,7 +32,8 @@ from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
 _MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
-_MISSING = "give `pip install 'tofuse[scan]'`"
+_MISSING = "run `pip install 'tofuse[scan]'`"
+_COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
@@ -79,11 +80,13 @@ def _las_header(path: Path) -> Any:
     packed = bool(getattr(header, "are_points_compressed", False))
     if count > MAX_POINTS or count * size > whole * (_MAX_COMPRESSION if packed else 1):
         raise InputError(
-            f"declares {count} points in {whole} bytes", where=path, remedy="copy the file again"
+            f"point count: {count} points don't fit into {whole} bytes", where=path, remedy=_COPY
         )
     if packed and count:
         try:
             _check_chunks(path, header)
+        except InputError:
+            raise
         except Exception as error:  # lazrs has its own exception types
             raise _damaged(error, path) from error
     return header
@@ -95,9 +98,9 @@ def _check_records(head: bytes, path: Path) -> None:
     more = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
     if 54 * count + 60 * more > path.stat().st_size:  # header sizes in bytes
         raise InputError(
-            f"declares {count + more} records beside its points",
+            f"header: {count + more} variable-length records don't fit into the file",
             where=path,
-            remedy="copy the file again",
+            remedy=_COPY,
         )
 
 
@@ -112,7 +115,12 @@ def _check_chunks(path: Path, header: Any) -> None:
     size, start = path.stat().st_size, int(header.offset_to_point_data)
     layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if layout.item_size() != header.point_format.size:
-        raise ValueError("the layout of its points is contradictory")
+        raise InputError(
+            f"LASzip record: a point has {layout.item_size()} bytes, in the header"
+            f" {header.point_format.size}",
+            where=path,
+            remedy=_COPY,
+        )
     with path.open("rb") as file:
         file.seek(start)
         (table,) = struct.unpack("<q", file.read(8))
@@ -120,17 +128,28 @@ def _check_chunks(path: Path, header: Any) -> None:
             file.seek(-8, os.SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         if not start + 8 <= table <= size - 8:
-            raise ValueError("its chunk table is not in the file")
+            raise InputError(
+                f"chunk table: offset {table} is outside the point data", where=path, remedy=_COPY
+            )
         file.seek(table)
         _, count = struct.unpack("<II", file.read(8))
         # Each chunk begins with an uncompressed point.
         if count * layout.item_size() > table - start:
-            raise ValueError(f"it declares {count} chunks")
+            raise InputError(
+                f"chunk table: {count} chunks don't fit into {table - start} bytes",
+                where=path,
+                remedy=_COPY,
+            )
         file.seek(start)
         chunks = lazrs.read_chunk_table(file, layout)
     points, packed = (sum(each) for each in zip(*chunks, strict=True)) if chunks else (0, 0)
     if packed > table - start or points < header.point_count:
-        raise ValueError(f"its {count} chunks contain {points} points in {packed} bytes")
+        raise InputError(
+            f"chunk table: {points} points in {packed} bytes, while the file has"
+            f" {header.point_count} in {table - start}",
+            where=path,
+            remedy=_COPY,
+        )
 
 
 def _shift(path: Path) -> Float64:
@@ -235,7 +254,11 @@ class E57Source(FileSource):
     def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"
         if self.counts[index] > MAX_POINTS:
-            raise InputError(f"declares {self.counts[index]} points", where=where)
+            raise InputError(
+                f"point count: {self.counts[index]} is more than the limit of {MAX_POINTS}",
+                where=where,
+                remedy="export the scan with fewer points",
+            )
         try:
             file = self._pye57.E57(str(self.path))
             try:
@@ -274,5 +297,5 @@ def _damaged(error: Exception, where: str | Path) -> InputError:
     return InputError(
         f"can't be read ({type(error).__name__}: {str(error)[:200]})",
         where=where,
-        remedy="copy or export it again",
+        remedy=_COPY,
     )
