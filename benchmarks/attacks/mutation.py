@@ -37,6 +37,9 @@ _FORKED = multiprocessing.get_context("forkserver")
 _FORKED.set_forkserver_preload(["attacks.loaded"])
 _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
           b"0", b"9" * 5000, b"[", b'{"a":', b"null")  # fmt: skip
+_CAMERA = {"schema": 1, "model": "brown", "width": 40, "height": 30, "fx": 40.0, "fy": 40.0,
+           "cx": 19.5, "cy": 14.5, "distortion": [0.1, 0.01, 0, 0, 0], "depth_unit_m": 0.001,
+           "depth_kind": "z", "frame_rate_hz": 30.0, "ambiguity_m": 7.5}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def subjects() -> dict[str, Subject]:
         inside = f"original/{file}" if file else "original"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
     found["redwood"] = Subject(_redwood, _recording("freiburg1", "redwood"))
-    found["tiff"] = Subject(_in(made_exports.make_tiff3d, "original"), _tiffs)
+    found["tiff"] = _with_camera(made_exports.make_tiff3d, "original", "tiff")
+    found["depth png"] = _with_camera(_depth_png, "original/a.png", "depth-png")
     for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
@@ -93,12 +97,32 @@ def _in(make: Callable[[Path], Any], inside: str) -> Callable[[Path], None]:
     return run
 
 
-def _recording(inside: str, format_: str | None) -> Callable[[Path], str]:
+def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subject:
+    """Images of 32 x 24 pixels without a camera, and a camera.json."""
+
+    def made(folder: Path) -> None:
+        _in(make, inside)(folder)
+        camera = _CAMERA | {"width": 32, "height": 24, "cx": 15.5, "cy": 11.5}
+        (folder / "camera.json").write_text(json.dumps(camera))
+
+    return Subject(made, _recording(inside, format_, camera="camera.json"))
+
+
+def _depth_png(path: Path) -> None:
+    from tofuse.files.images import png_bytes
+
+    path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
+
+
+def _recording(
+    inside: str, format_: str | None, camera: str | None = None
+) -> Callable[[Path], str]:
     from tofuse.errors import TofuseError
     from tofuse.recordings.open import open_recording
 
     def read(folder: Path) -> str:
-        recording = open_recording(folder / inside, format=format_)
+        about = None if camera is None else folder / camera
+        recording = open_recording(folder / inside, format=format_, camera=about)
         for item in recording.read_all():
             if isinstance(item, TofuseError):
                 _check_line(item)
@@ -107,17 +131,6 @@ def _recording(inside: str, format_: str | None) -> Callable[[Path], str]:
         return recording.format
 
     return read
-
-
-def _tiffs(folder: Path) -> None:
-    from tofuse.errors import TofuseError
-    from tofuse.files.tiff import read_tiff
-
-    for path in sorted((folder / "original").iterdir()):
-        try:
-            read_tiff(path)
-        except TofuseError as error:
-            _check_line(error)
 
 
 def _scans() -> dict[str, Subject]:
@@ -240,9 +253,6 @@ def _small() -> dict[str, Subject]:
     information = " ".join("100" if a == b else "0" for a in range(6) for b in range(a, 6))
     edges = [f"EDGE_SE3:QUAT {k} {k + 1} 1 0 0 0 0 0 1 {information}" for k in range(2)]
     tum = "".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(4))
-    camera = {"schema": 1, "model": "brown", "width": 40, "height": 30, "fx": 40.0, "fy": 40.0,
-              "cx": 19.5, "cy": 14.5, "distortion": [0.1, 0.01, 0, 0, 0], "depth_unit_m": 0.001,
-              "depth_kind": "z", "frame_rate_hz": 30.0, "ambiguity_m": 7.5}  # fmt: skip
     lens = {
         "image_width": 40,
         "image_height": 30,
@@ -290,7 +300,7 @@ def _small() -> dict[str, Subject]:
         "pose in json": ("a.json", json.dumps({"T_target_source": pose}), read_pose),
         "transforms.json": ("transforms.json", json.dumps({"frames": [
             {"file_path": f"{k}.png", "transform_matrix": pose} for k in range(3)]}), read_poses),
-        "camera.json": ("camera.json", json.dumps(camera), read_camera_file),
+        "camera.json": ("camera.json", json.dumps(_CAMERA), read_camera_file),
         "a lens": ("a.json", json.dumps(lens), read_lens_file),
         "rig.json": ("rig.json", json.dumps(rig), read_rig),
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
