@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+import made_exports
 from paths import BENCHMARKS
 from tofuse import cli
 from tofuse.cli import main, run_command
@@ -79,6 +83,26 @@ def test_what_only_prints_and_can_not_says_so(clouds: Path) -> None:
     assert "Traceback" not in said
     status, said = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
     assert (status, said) == (141, "")
+
+
+def test_a_damaged_image_is_reported_without_lines_of_its_library(tmp_path: Path) -> None:
+    made_exports.make_tiff3d(tmp_path / "a")
+    path = tmp_path / "a" / "00001.range.tif"
+    noise = np.random.default_rng(0).integers(1000, 3000, (24, 32)).astype(np.uint16)
+    cv2.imwrite(str(path), noise, [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW])
+    data = bytearray(path.read_bytes())
+    data[100:200] = 100 * b"\xff"
+    path.write_bytes(data)
+    camera = {"schema": 1, "model": "brown", "width": 32, "height": 24, "fx": 30.0, "fy": 30.0,
+              "cx": 15.5, "cy": 11.5, "distortion": [0.0] * 4, "depth_unit_m": 0.001,
+              "depth_kind": "range"}  # fmt: skip
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    _, said = shell(f"tofuse inspect {tmp_path}/a --camera {tmp_path}/camera.json")
+    assert said.count("\n") <= 1
+    assert "TIFF_Error" not in said
+    script = f"import cv2; cv2.imread({str(path)!r}, cv2.IMREAD_UNCHANGED)"
+    alone = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert b"TIFF" in alone.stderr  # which OpenCV alone says
 
 
 class Broken:

@@ -46,6 +46,8 @@ def prepare_process() -> None:
     """Set environment variables that libraries read when they are loaded."""
     # BLAS is limited to one thread anyway, but reserves memory for more; if that fails, it hangs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Otherwise it prints several lines for a damaged image, beside the message of this program.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
 @contextmanager
