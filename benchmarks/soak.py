@@ -81,7 +81,7 @@ class Usage:
         give_back()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         descriptors, threads = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
-        stores = [o for o in gc.get_objects() if isinstance(o, Spill) and len(o)]
+        stores = [o for o in gc.get_objects() if type(o) is Spill and len(o)]  # no weak proxies
         stored, budget = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
         memory = pages * os.sysconf("SC_PAGE_SIZE")
         blocks = sys.getallocatedblocks()
