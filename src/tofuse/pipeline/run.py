@@ -18,7 +18,7 @@ from tofuse.filters.base import apply_filters
 from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
-from tofuse.parts import name_of, to_dict
+from tofuse.parts import name_of
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
@@ -421,13 +421,13 @@ def _title(path: Path) -> str:
 def _final_config(config: Config, result: Reconstruction) -> Config:
     """Return the configuration with the corrections of the result, after self-calibration.
 
-    Parts keep what they estimated from the recording, which their options don't state.
+    Self-calibration adds its corrections before the others. Those are kept as they are, as parts
+    contain what they estimated from the recording, which their options don't state.
     """
     final = {"corrections": result.config["corrections"]}
     corrections = changed(config, final, where="the result's config").corrections
-    estimated = {str(to_dict(part)): part for part in config.corrections}
-    kept = tuple(estimated.get(str(to_dict(part)), part) for part in corrections)
-    return replace(config, corrections=kept)
+    added = len(corrections) - len(config.corrections)
+    return replace(config, corrections=(*corrections[:added], *config.corrections))
 
 
 def _filter_steps(
