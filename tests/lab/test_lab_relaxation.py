@@ -11,7 +11,8 @@ from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
 from tofuse.posegraph.build import Measured, build_graph, chain
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.levenberg import minimise
+from tofuse.posegraph.robust import Settings
 from tofuse.posegraph.sparse import PairSystem
 
 
@@ -86,7 +87,7 @@ def test_small_loops_converge_to_the_minimum(seed):
     done = LuMilios(tolerance=1e-12).optimise(graph)
     assert done.converged
     assert len(done.objective) < 15
-    least = LevenbergMarquardt(robust="none", tolerance=1e-14).optimise(graph).graph
+    least = minimise(graph, Settings("none", tolerance=1e-14)).graph
     assert done.graph.chi2() == pytest.approx(least.chi2(), rel=1e-3)
     np.testing.assert_allclose(done.graph.poses, least.poses, atol=1e-3)
     assert done.graph.chi2() < 0.1 * graph.chi2()
@@ -95,7 +96,7 @@ def test_small_loops_converge_to_the_minimum(seed):
 
 def test_relaxation_that_only_makes_it_worse_leaves_the_input():
     graph, _ = ring(20, 0.01)
-    best = LevenbergMarquardt(robust="none", tolerance=1e-14).optimise(graph).graph
+    best = minimise(graph, Settings("none", tolerance=1e-14)).graph
     done = LuMilios().optimise(best)
     assert done.graph.chi2() <= best.chi2()
     np.testing.assert_allclose(done.graph.poses, best.poses, atol=1e-6)
