@@ -23,6 +23,7 @@ from tofuse.geometry.cameras import BrownConrady, Pinhole
 from tofuse.inspection import channels
 from tofuse.inspection.finding import CODES, Finding
 from tofuse.inspection.inspect import inspect_recording
+from tofuse.inspection.planar import Distortion
 from tofuse.inspection.sample import Sample
 from tofuse.pipeline.run import with_findings
 from tofuse.recordings.frames import CloudFrame, RangeFrame
@@ -341,11 +342,23 @@ def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool)
         assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
 
 
+def test_a_lens_that_folds_the_image_is_none() -> None:
+    def distortion(t1: float, t2: float) -> Distortion:
+        return Distortion(np.array([0.0, t1, t2]), 1e-4 * np.eye(3), 8, 0.007, 0.0067)
+
+    assert distortion(-0.571, -0.274).folds  # what a round body looked like
+    assert distortion(-0.5, 0.1).folds
+    assert not distortion(-0.25, 0.05).folds
+    assert not distortion(0.4, -0.2).folds
+
+
 def test_how_the_camera_moves() -> None:
     still = turning(6, 0.0)
     assert codes(still) == {"static"}
     assert codes(turning(6, 13.0)) == {"fast_motion"}
-    assert "little_overlap" in codes(turning(6, 40.0))
+    fast = tofuse.inspect(of(turning(6, 40.0)))
+    # What comes of little overlap is for the run to state.
+    assert ("little_overlap", "warning") in {(f.code, f.severity) for f in fast.findings}
     assert "moving_objects" in codes(walking(still))
     found = tofuse.inspect(of(walking(still)), turning=True)
     assert not {"static", "moving_objects"} & {f.code for f in found.findings}

@@ -77,6 +77,37 @@ def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
         assert off[part].std() == pytest.approx(1, rel=0.15)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
+def test_scattered_gaps_cost_resolution_not_the_planes(share: float) -> None:
+    camera = Pinhole(352, 288, 460.0, 460.0, 175.5, 143.5)
+    frame = wall(camera, 0.005)
+    rng = np.random.default_rng(4)
+    sparse = frame.keep(rng.random(frame.depth.shape) >= share)
+    view = prepare_view(sparse, OPTIONS)
+    assert view.planar_fraction > 0.8
+    found = view.planes[view.planes[..., 3] > 0][:, :3]
+    assert np.median(found, axis=0) == pytest.approx(PLANE, abs=0.01)
+
+
+def test_depth_projected_into_a_finer_image_is_halved_until_it_is_dense() -> None:
+    camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
+    frame = wall(camera, 0.005)
+    grid = np.zeros(frame.depth.shape, bool)
+    grid[1::4, 2::4] = True
+    view = prepare_view(frame.keep(grid), OPTIONS)
+    assert view.z.shape == (60, 80)
+    assert view.planar_fraction > 0.8
+
+
+def test_gaps_that_hang_together_cost_no_resolution() -> None:
+    camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
+    frame = wall(camera, 0.005)
+    kept = np.ones(frame.depth.shape, bool)
+    kept[60:180, 40:200] = False
+    assert prepare_view(frame.keep(kept), OPTIONS).z.shape == (240, 320)
+    assert prepare_view(frame.keep(np.zeros_like(kept)), OPTIONS).z.shape == (240, 320)
+
+
 def test_the_cameras_own_noise_is_believed_up_to_a_factor():
     frame = wall(sigma=0.004)
     ramp = np.linspace(0.5, 2, 72, dtype=np.float32)[:, None].repeat(88, 1)

@@ -108,7 +108,9 @@ class RangeView:
             smoothed, variance, measured,
         )  # fmt: skip
         mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
-        valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
+        share = _reduced(frame.valid.astype(np.float32), shape)
+        # Half of the pixels of a block; of a sparse image, half of what a block usually has.
+        valid = share >= 0.5 * (median(share[share > 0]) if share.any() else 1.0)
         valid |= measured & _dilated(valid.view(np.uint8), 1) & (jump == 0)
         z = np.where(valid, smoothed, np.float32(0))
         good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))

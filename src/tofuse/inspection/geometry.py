@@ -68,7 +68,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
     found = _distortion(sample)
     kind = sample.images[0].depth_kind if sample.images else "z"
     lens = None if found is None else fit_distortion(sample.regions, sample.radius, kind)
-    if lens is None or lens.rms_after > _FLAT:
+    if lens is None or lens.rms_after > _FLAT or lens.folds:
         return  # too few surfaces, or no planes
     stretch, sigma = lens.stretch
     scale, scale_sigma = lens.first

@@ -172,6 +172,16 @@ class Distortion:
         g = np.array([0.0, 1.0, 1.0])
         return float(g @ self.values), float(np.sqrt(g @ self.covariance @ g))
 
+    @property
+    def folds(self) -> bool:
+        """Whether it would map two rays of the image onto one, as no lens does.
+
+        Such a fit follows surfaces that are not planar.
+        """
+        r2 = np.linspace(0, 1, 21)
+        _, t1, t2 = self.values
+        return bool((1 + 3 * t1 * r2 + 5 * t2 * r2**2).min() <= 0)
+
 
 def fit_distortion(regions: Sequence[Region], radius: float, model: Model) -> Distortion | None:
     """Fit the three parameters; None if there are no regions.

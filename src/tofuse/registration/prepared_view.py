@@ -26,6 +26,8 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
 # the result does not depend on the number of threads.
 _CHUNK_ROWS = 60
+# Sparse images are not halved below this width and height.
+_MIN_SIDE = 16
 # Relative difference of depths up to which they belong to one surface when an image is halved.
 _HALVING_JUMP = 0.02
 # Range of usable colour levels: darker ones are noise, brighter ones saturated.
@@ -76,7 +78,7 @@ class SurfaceOptions:
     Attributes
     ----------
     columns
-        Images are halved until they have at most this many columns.
+        Images are halved until they have at most this many columns (further if they are sparse).
     radii
         Half widths of the windows of the plane fits, pixels: the smallest gives the depth, the
         widest one that contains a single surface gives the slope.
@@ -336,7 +338,8 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     The noise is the frame's own `sigma_image` if there is one, else a law of the sensor family
     (inversely proportional to the amplitude, or quadratic in the depth). Its scale is estimated
     from the view, as the median misfit of small planes; stated noise is never scaled down, as
-    planes do not reveal noise that is correlated between neighbours.
+    planes do not reveal noise that is correlated between neighbours. Images with so many missing
+    pixels that hardly any plane fits are halved until the gaps are closed.
     """
     projection, z, light, own = _at_working_resolution(frame, options.columns)
     rays = projection.rays
@@ -346,7 +349,9 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     # d(1/z) = dz / z^2
     weight = _inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = _typical_noise(w, weight)
-    options = options.for_noise(noise)
+    wider, options = options, options.for_noise(noise)
+    if min(z.shape) >= 2 * _MIN_SIDE and _is_sparse(z, options):
+        return prepare_view(frame, replace(wider, columns=z.shape[1] // 2))
     if options.edge_margin:
         jump = max(options.edge_jump, options.edge_sigmas * noise)
         weight[_edge_pixels(w, jump, options.edge_margin)] = 0
@@ -623,6 +628,22 @@ def _fit(
 
 def _chunks(rows: int) -> int:
     return max(2, rows // _CHUNK_ROWS)
+
+
+def _is_sparse(z: Float32, options: SurfaceOptions) -> bool:
+    """Whether most valid pixels lack neighbours for a plane fit, as missing pixels are scattered.
+
+    Such are images of cameras that drop single pixels, of spot projectors, and depth that was
+    projected into an image of higher resolution.
+    """
+    valid = (z > 0).astype(np.uint8)
+    usable = valid
+    if options.edge_margin:
+        beside = cv2.dilate(1 - valid, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+        usable = (~_dilate(beside, options.edge_margin)).astype(np.uint8)
+    size = 2 * options.radii[0] + 1
+    filled = cv2.blur(usable.astype(np.float32), (size, size)) >= options.fill
+    return 2 * np.count_nonzero(filled & (z > 0)) < np.count_nonzero(valid)
 
 
 def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:

@@ -1,0 +1,277 @@
+"""Simulated recordings with cameras, scenes and motions that no other benchmark has; part of
+`variants.py`.
+
+Taken without multipath and smear, with all other errors of the camera. Poses are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation import paths, sensor
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.paths import Path
+from tofuse.lab.simulation.record import Plan
+from tofuse.lab.simulation.scenes.assembly import Assembly, placed, shell
+from tofuse.lab.simulation.scenes.furniture import chair
+from tofuse.lab.simulation.texture import Material
+from tofuse.recordings.native import corrected_depth
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.models import CameraModel, camera_model
+
+WALL = Material("wall", 0.65, 0.1, "noise", (0.5, 0.5, 0.5))
+GROUND = Material("ground", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))
+WHITE = Material("ceiling", 0.78, 0.05, "tiles", (0.6, 0.6, 0.6))
+WOOD = Material("wood", 0.45, 0.2, "wood", (0.9, 0.9, 0.05))
+THINGS = tuple(Material(f"thing {k}", 0.25 + 0.1 * k, 0.1, "print", (0.1,) * 3) for k in range(5))
+
+
+@dataclass(frozen=True)
+class Unusual:
+    """One recording: what is seen, how the camera moves, which camera, how often.
+
+    Attributes
+    ----------
+    scene, path
+        Functions of the seed.
+    """
+
+    scene: Callable[[int], scenes.Scene]
+    path: Callable[[int], Path]
+    camera: CameraModel
+    frames: int = 80
+    rate_hz: float = 15.0
+
+
+def pinhole(model: str, width: int, height: int, degrees: float) -> CameraModel:
+    """Return a camera with another size and horizontal field of view."""
+    base = camera_model(model)
+    f = width / 2 / np.tan(np.radians(degrees) / 2)
+    camera = Pinhole(width, height, f, f, (width - 1) / 2, (height - 1) / 2)
+    return replace(base, name=f"{model}, {width} x {height}, {degrees:g} degrees", camera=camera)
+
+
+# ---- Motions -------------------------------------------------------------------------------------
+
+
+def handheld(
+    rng: np.random.Generator, metres: float, degrees: float, fastest_hz: float = 0.5
+) -> Path:
+    """Sway smoothly in all directions about the identity, with the given rms."""
+    sizes = np.repeat([metres, np.radians(degrees)], 3)
+    rates = rng.uniform(0.05, fastest_hz, (5, 6))
+    phases = rng.uniform(0, 2 * np.pi, (5, 6))
+
+    def path(t: float) -> Float64:
+        waves = np.sin(2 * np.pi * rates * t + phases).sum(0) * np.sqrt(2 / 5)
+        return se3.exp(sizes * waves)
+
+    return path
+
+
+def jerks(rng: np.random.Generator, degrees: float, seconds: float = 0.15) -> Path:
+    """Turn by an angle about a random axis within a moment, about once a second, and back."""
+    axes = rng.standard_normal((100, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+
+    def path(t: float) -> Float64:
+        k, u = divmod(t, 1.0)
+        share = paths.smooth_step((u - 0.2) / seconds) - paths.smooth_step((u - 0.7) / seconds)
+        return paths.rotation(np.radians(degrees) * share * axes[int(k) % 100])
+
+    return path
+
+
+def together(*parts: Path) -> Path:
+    """Compose paths: the later ones in the frame of the earlier ones."""
+
+    def path(t: float) -> Float64:
+        T = np.eye(4)
+        for part in parts:
+            T = T @ part(t)
+        return T
+
+    return path
+
+
+def straight(start: Float64, velocity: tuple[float, float, float]) -> Path:
+    """Move steadily in the room (m/s), without turning."""
+
+    def path(t: float) -> Float64:
+        T = start.copy()
+        T[:3, 3] += np.asarray(velocity) * t
+        return T
+
+    return path
+
+
+def around(
+    radius: float, height: float, target: tuple[float, float, float], seconds: float
+) -> Path:
+    """Walk once around a target."""
+
+    def path(t: float) -> Float64:
+        a = 2 * np.pi * t / seconds
+        x, y, _ = target
+        return paths.look_at((x + radius * np.cos(a), y + radius * np.sin(a), height), target)
+
+    return path
+
+
+# ---- Scenes --------------------------------------------------------------------------------------
+
+
+def known(name: str) -> Callable[[int], scenes.Scene]:
+    """Return one of the simulator's scenes."""
+    return lambda seed: scenes.build(name, seed=seed)[0]
+
+
+Fill = Callable[[Assembly, np.random.Generator], None]
+
+
+def built(name: str, fill: Fill) -> Callable[[int], scenes.Scene]:
+    """Return a scene of its own."""
+
+    def make(seed: int) -> scenes.Scene:
+        assembly = Assembly([])
+        fill(assembly, np.random.default_rng([seed, 11]))
+        return scenes.Scene(name, assembly.materials, assembly.mesh(), seed=seed)
+
+    return make
+
+
+def _stairs(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add 16 steps of 28 x 18 cm along y between two walls, landings before and after."""
+    assembly.add(WALL, meshes.quad((-0.6, -3, 0), (0, 10, 0), (0, 0, 6)))
+    assembly.add(WALL, meshes.quad((0.6, -3, 0), (0, 0, 6), (0, 10, 0)))
+    assembly.add(GROUND, meshes.quad((-0.6, -3, 0), (1.2, 0, 0), (0, 3, 0)))
+    for k in range(16):
+        low, high = (-0.6, 0.28 * k, 0.18 * k), (0.6, 0.28 * (k + 1), 0.18 * (k + 1))
+        assembly.add(WOOD, meshes.box_between(low, high))
+    assembly.add(GROUND, meshes.quad((-0.6, 4.48, 2.88), (1.2, 0, 0), (0, 2.5, 0)))
+    assembly.add(WALL, meshes.quad((-0.6, 6.98, 0), (1.2, 0, 0), (0, 0, 6)))
+
+
+def _table(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add a large table with five small things."""
+    assembly.add(WOOD, meshes.box_between((-0.8, -0.8, -0.04), (0.8, 0.8, 0)))
+    for material in THINGS:
+        x, y, yaw = *rng.uniform(-0.3, 0.3, 2), rng.uniform(0, 3)
+        size = rng.uniform(0.05, 0.14, 3)
+        T = placed((x, y), yaw)
+        assembly.add(material, meshes.box(size, (0, 0, size[2] / 2)).moved(T))
+
+
+def _yard(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add ground, a wall at one side, and a few poles and crates; no sky."""
+    assembly.add(GROUND, meshes.quad((-20, -20, 0), (40, 0, 0), (0, 40, 0)))
+    assembly.add(WALL, meshes.quad((-20, 3.5, 0), (40, 0, 0), (0, 0, 2.2)))
+    for k in range(12):
+        x, y = rng.uniform(-1, 9), rng.uniform(-2.5, 2.8)
+        if k % 2:
+            assembly.add(WOOD, meshes.rod((x, y, 0), (x, y, 3.0), 0.06))
+        else:
+            size = rng.uniform(0.3, 0.7, 3)
+            crate = meshes.box(size, (0, 0, size[2] / 2)).moved(placed((x, y), rng.uniform(0, 3)))
+            assembly.add(THINGS[k % 5], crate)
+
+
+def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add a room with a few chairs, for looking down."""
+    shell(assembly, (-3, -2.5, 0), (3, 2.5, 2.5), [WALL] * 4, GROUND, WHITE)
+    for k in range(4):
+        at = tuple(rng.uniform((-1.5, -1.2), (1.5, 1.2)))
+        chair(assembly, THINGS[k], placed(at, rng.uniform(0, 6)))
+
+
+IFM = camera_model("ifm-o3r")
+SR4000 = camera_model("sr4000")
+EYE = paths.look_at((0, 0, 1.1), (1, 0.2, 0.9))
+
+
+def _in_room(*more: Callable[[np.random.Generator], Path]) -> Callable[[int], Path]:
+    """Stand in the room, turn slowly, and move as told."""
+
+    def made(seed: int) -> Path:
+        rng = np.random.default_rng([seed, 12])
+        turning = paths.camera_turn(EYE, 12.0)
+        return together(turning, *(make(rng) for make in more))
+
+    return made
+
+
+def _fixed(path: Path, metres: float = 0.02, degrees: float = 1.5) -> Callable[[int], Path]:
+    return lambda seed: together(path, handheld(np.random.default_rng([seed, 13]), metres, degrees))
+
+
+def _elsewhere_in_flat(seed: int) -> Path:
+    """Walk through the flat from 20 s on."""
+    sequence = scenes.build("flat", seed=seed)[1]
+    return lambda t: sequence.camera_path(20.0 + t)
+
+
+calm = partial(handheld, metres=0.08, degrees=4.0)
+slow_turns = partial(handheld, metres=0.03, degrees=30.0, fastest_hz=0.25)
+up_the_stairs = straight(paths.look_at((0, -1.5, 1.5), (0, 0.6, 0.7)), (0, 0.5, 0.28))
+through_the_yard = straight(paths.look_at((-2, 0, 1.4), (1, 0.3, 1.0)), (0.6, 0, 0))
+over_the_floor = straight(paths.look_at((-1.5, -0.1, 1.6), (-0.9, 0.1, 0.0)), (0.4, 0.1, 0))
+below_the_ceiling = straight(paths.look_at((-1.5, 0.2, 1.0), (-1.1, 0.4, 2.5)), (0.4, 0, 0))
+UNUSUAL: dict[str, Unusual] = {
+    "field of view of 30 degrees": Unusual(
+        known("room"), _in_room(calm), pinhole("sr4000", 176, 144, 30)
+    ),
+    "field of view of 100 degrees": Unusual(
+        known("room"), _in_room(calm), pinhole("ifm-o3r", 224, 172, 100)
+    ),
+    "80 x 60 pixels": Unusual(known("room"), _in_room(calm), pinhole("ifm-o3r", 80, 60, 60)),
+    "5 Hz": Unusual(known("room"), _in_room(calm), IFM, 50, 5.0),
+    "jerks of 12 degrees": Unusual(
+        known("room"), _in_room(calm, partial(jerks, degrees=12.0)), IFM
+    ),
+    "rotation in all directions": Unusual(known("room"), _in_room(slow_turns), IFM),
+    "elsewhere in the flat": Unusual(known("flat"), _elsewhere_in_flat, IFM),
+    "up the stairs": Unusual(built("stairs", _stairs), _fixed(up_the_stairs), IFM, 90),
+    "things on a table": Unusual(
+        built("table", _table), _fixed(around(0.7, 0.5, (0, 0, 0.03), 8.0), 0.01, 1.0), IFM, 120
+    ),
+    "yard": Unusual(built("yard", _yard), _fixed(through_the_yard), IFM, 90),
+    "floor and chairs from above": Unusual(
+        built("chairs", _chairs), _fixed(over_the_floor), SR4000
+    ),
+    "ceiling": Unusual(known("room"), _fixed(below_the_ceiling), SR4000),
+}
+
+
+def record(one: Unusual, seed: int) -> Recording:
+    """Simulate a recording in memory; the true poses are its reference."""
+    sequence = scenes.Sequence(one.frames, 1, one.rate_hz, one.path(seed))
+    model = replace(one.camera, frame_rate_hz=one.rate_hz)
+    effects = Effects().without("multipath", "smear")
+    made = Plan(one.scene(seed), sequence, model, effects, seed, np.arange(one.frames))
+    factory = sensor.calibrated(model, effects)
+    frames = [
+        replace(
+            r.frame,
+            depth=corrected_depth(factory, r.frame.camera, r.frame.depth, r.frame.depth_kind),
+        )
+        for r in made.frames(None)
+    ]
+    metadata = {
+        "frame_rate_hz": one.rate_hz,
+        "ambiguity_m": model.ambiguity_m,
+        "amplitude_kind": model.amplitude_kind,
+        "sensor": model.name,
+    }
+    if model.confidence_max is not None:
+        metadata["confidence_max"] = model.confidence_max
+    source = ArraySource(frames, made.poses, metadata=metadata)
+    return Recording.of(source, "simulated", "simulated")
