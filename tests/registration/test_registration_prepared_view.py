@@ -84,7 +84,7 @@ def test_scattered_gaps_cost_resolution_not_the_planes(share: float) -> None:
     rng = np.random.default_rng(4)
     sparse = frame.keep(rng.random(frame.depth.shape) >= share)
     view = prepare_view(sparse, OPTIONS)
-    assert view.planar_fraction > 0.8
+    assert np.count_nonzero(view.planes[..., 3]) > 1000
     found = view.planes[view.planes[..., 3] > 0][:, :3]
     assert np.median(found, axis=0) == pytest.approx(PLANE, abs=0.01)
 
@@ -104,6 +104,9 @@ def test_gaps_that_hang_together_cost_no_resolution() -> None:
     frame = wall(camera, 0.005)
     kept = np.ones(frame.depth.shape, bool)
     kept[60:180, 40:200] = False
+    blocks = np.random.default_rng(5).random((30, 40)) >= 0.4
+    scattered = np.kron(blocks, np.ones((8, 8), bool))
+    assert prepare_view(frame.keep(scattered), OPTIONS).z.shape == (240, 320)
     assert prepare_view(frame.keep(kept), OPTIONS).z.shape == (240, 320)
     assert prepare_view(frame.keep(np.zeros_like(kept)), OPTIONS).z.shape == (240, 320)
 

@@ -338,8 +338,10 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     The noise is the frame's own `sigma_image` if there is one, else a law of the sensor family
     (inversely proportional to the amplitude, or quadratic in the depth). Its scale is estimated
     from the view, as the median misfit of small planes; stated noise is never scaled down, as
-    planes do not reveal noise that is correlated between neighbours. Images with so many missing
-    pixels that hardly any plane fits are halved until the gaps are closed.
+    planes do not reveal noise that is correlated between neighbours. Images with so many scattered
+    missing pixels that most pixels have no plane are halved further, until the gaps are closed:
+    those of cameras that drop single pixels, of spot projectors, and depth that was projected into
+    an image of higher resolution.
     """
     projection, z, light, own = _at_working_resolution(frame, options.columns)
     rays = projection.rays
@@ -349,9 +351,10 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     # d(1/z) = dz / z^2
     weight = _inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = _typical_noise(w, weight)
-    wider, options = options, options.for_noise(noise)
-    if min(z.shape) >= 2 * _MIN_SIDE and _is_sparse(z, options):
-        return prepare_view(frame, replace(wider, columns=z.shape[1] // 2))
+    given, options = options, options.for_noise(noise)
+    columns = _columns_without_gaps(frame, z, options)
+    if columns < z.shape[1]:
+        return prepare_view(frame, replace(given, columns=columns))
     if options.edge_margin:
         jump = max(options.edge_jump, options.edge_sigmas * noise)
         weight[_edge_pixels(w, jump, options.edge_margin)] = 0
@@ -630,20 +633,37 @@ def _chunks(rows: int) -> int:
     return max(2, rows // _CHUNK_ROWS)
 
 
-def _is_sparse(z: Float32, options: SurfaceOptions) -> bool:
-    """Whether most valid pixels lack neighbours for a plane fit, as missing pixels are scattered.
+def _columns_without_gaps(frame: RangeFrame, z: Float32, options: SurfaceOptions) -> int:
+    """Return the columns of the resolution at which most pixels can have a plane.
 
-    Such are images of cameras that drop single pixels, of spot projectors, and depth that was
-    projected into an image of higher resolution.
+    It is that of the image z (H, W), unless most of its valid pixels lack neighbours. Halving it
+    closes gaps of scattered pixels; larger ones stay, and halving costs pixels.
     """
-    valid = (z > 0).astype(np.uint8)
-    usable = valid
+    best, valid = _filled(z, options)
+    columns = z.shape[1]
+    if 2 * best >= valid:
+        return columns
+    rows, halved = z.shape[0] // 2, columns // 2
+    while min(rows, halved) >= _MIN_SIDE:
+        filled, _ = _filled(_at_working_resolution(frame, halved)[1], options)
+        if filled > best:
+            best, columns = filled, halved
+        rows, halved = rows // 2, halved // 2
+    return columns
+
+
+def _filled(z: Float32, options: SurfaceOptions) -> tuple[int, int]:
+    """Return how many pixels have the neighbours for a plane fit, and how many are valid."""
+    missing = (z <= 0).view(np.uint8)
+    usable = z > 0
     if options.edge_margin:
-        beside = cv2.dilate(1 - valid, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
-        usable = (~_dilate(beside, options.edge_margin)).astype(np.uint8)
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        beside = np.asarray(cv2.dilate(missing, cross), np.uint8)
+        usable = ~_dilate(beside, options.edge_margin)
     size = 2 * options.radii[0] + 1
-    filled = cv2.blur(usable.astype(np.float32), (size, size)) >= options.fill
-    return 2 * np.count_nonzero(filled & (z > 0)) < np.count_nonzero(valid)
+    share = cv2.blur(usable.astype(np.float32), (size, size))
+    filled = (share >= options.fill) & (z > 0)
+    return int(np.count_nonzero(filled)), int(np.count_nonzero(z > 0))
 
 
 def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
