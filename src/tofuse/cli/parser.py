@@ -703,10 +703,14 @@ def _evaluate(commands: Any) -> None:
 
 def _optimize(commands: Any) -> None:
     p = _command(commands, "optimize", "optimise a pose graph")
-    p.add_argument("input", type=Path, metavar="IN.g2o")
-    p.add_argument("--out", required=True, type=Path, metavar="OUT.g2o")
+    p.add_argument("input", type=Path, metavar="IN.g2o", help="the pose graph")
     p.add_argument(
-        "--optimiser", metavar="NAME", help="method (default: levenberg-marquardt; castellani, ...)"
+        "--out", required=True, type=Path, metavar="OUT.g2o", help="the optimised pose graph"
+    )
+    p.add_argument(
+        "--optimiser",
+        metavar="NAME",
+        help="levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic",
     )
     _overwrite(p, "an existing OUT.g2o")
 
