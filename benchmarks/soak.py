@@ -11,9 +11,9 @@ with missing, duplicate and late frames: it is recorded first, then fed into a m
 
 Each prints, at ten points, the resident memory, open file descriptors and threads, and how much of
 the memory is in stores with a budget out of `--memory`. A store may grow until it reaches its
-budget. Over the second half, all other memory may not grow by more than what is retained of a frame
-by design (its record and its tracking), or by 1 MB per 100 runs; descriptors and threads may not
-grow at all. Exits with 1 if any does. Linux only.
+budget, and then spills to a temporary file. Over the second half, all other memory may not grow by
+more than what is retained of a frame by design (its record and its tracking), or by 1 MB per 100
+runs; descriptors and threads may not grow at all. Exits with 1 if any does. Linux only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import numpy as np
 from hours import there_and_back
 from scaling import LENGTH, made_frames
 from tofuse.files.memory import give_back
-from tofuse.files.spill import Spill
+from tofuse.files.spill import Spill, SpillFile
 from tofuse.lab.simulation.record import simulate
 from tofuse.live.device import DeviceError, Settings, Stream
 from tofuse.live.recorder import record
@@ -56,7 +56,8 @@ SAMPLES = 10
 class Usage:
     """Resources of this process: resident memory in bytes, file descriptors, threads.
 
-    `stored` bytes of the memory are in a mapper's stores, whose budgets sum to `budget` bytes.
+    `stored` bytes of the memory are in a mapper's stores, whose budgets sum to `budget` bytes. The
+    temporary file of a store that has exceeded its budget is not counted.
     `blocks` counts the blocks allocated by Python, which shows a leak of objects more clearly than
     the memory does, as that depends on fragmentation.
     """
@@ -81,7 +82,10 @@ class Usage:
         give_back()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         descriptors, threads = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
-        stores = [o for o in gc.get_objects() if type(o) is Spill and len(o)]  # no weak proxies
+        objects = gc.get_objects()  # compared by type: a weak proxy passes for what it refers to
+        descriptors -= sum(type(o) is SpillFile and o.size > 0 for o in objects)
+        stores = [o for o in objects if type(o) is Spill and len(o)]
+        del objects
         stored, budget = (sum(getattr(s, n) for s in stores) for n in ("resident_bytes", "budget"))
         memory = pages * os.sysconf("SC_PAGE_SIZE")
         blocks = sys.getallocatedblocks()

@@ -6,6 +6,7 @@ import itertools
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from paths import BENCHMARKS
@@ -49,6 +50,17 @@ def test_a_store_may_fill_but_not_overflow(soak) -> None:
 
     assert soak.bounded(filling(10**8), soak.RUN_BYTES)
     assert not soak.bounded(filling(5 * 10**7), soak.RUN_BYTES)
+
+
+def test_descriptors_are_counted_without_those_of_stores(soak) -> None:
+    before = soak.Usage.measured(1).descriptors
+    spilled = soak.SpillFile()
+    spilled.append(np.zeros(10, np.uint8))
+    assert soak.Usage.measured(2).descriptors == before
+    with open("/dev/null"):
+        assert soak.Usage.measured(3).descriptors == before + 1
+    spilled.close()
+    assert soak.Usage.measured(4).descriptors == before
 
 
 def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) -> None:
