@@ -14,9 +14,9 @@ from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.search import SearchOptions
+from tofuse.registration.view_descriptor import mutual_dissimilarity, view_descriptor
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)
@@ -152,8 +152,8 @@ def test_what_would_need_too_much_drift_is_another_place(once_round):
 
 def test_unlikeness_against_a_slow_twin(once_round):
     views, _ = once_round
-    looks = [look_of(view) for view in views[:7]]
-    looks[3][1] = np.nan  # a view without light
+    descriptors = [view_descriptor(view) for view in views[:7]]
+    descriptors[3][1] = np.nan  # a view without light
 
     def slow(a, b, shift=0.25):
         best = 1.0
@@ -174,14 +174,14 @@ def test_unlikeness_against_a_slow_twin(once_round):
                 best = min(best, far)
         return best
 
-    expected = [[min(slow(a, b), slow(b, a)) for b in looks] for a in looks]
+    expected = [[min(slow(a, b), slow(b, a)) for b in descriptors] for a in descriptors]
     with threads(2):
-        np.testing.assert_allclose(mutual_unlikeness(looks, 0.25), expected, atol=1e-5)
+        np.testing.assert_allclose(mutual_dissimilarity(descriptors, 0.25), expected, atol=1e-5)
 
 
 def test_the_same_place_is_more_alike_than_any_other(once_round):
     views, _truth = once_round
-    far = mutual_unlikeness([look_of(view) for view in views], 0.25)
+    far = mutual_dissimilarity([view_descriptor(view) for view in views], 0.25)
     # The last two views show again what the first two did.
     assert far[0, 18] < 0.1
     assert far[1, 19] < 0.1
@@ -192,30 +192,32 @@ def test_the_same_place_is_more_alike_than_any_other(once_round):
 def test_exposure_does_not_count():
     frame = room(0.3, 0)
     brighter = replace(frame, amplitude_image=3 * frame.amplitude_image)
-    looks = [look_of(prepare_view(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)]
-    assert mutual_unlikeness(looks, 0.25)[0, 1] < 0.01
+    descriptors = [
+        view_descriptor(prepare_view(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)
+    ]
+    assert mutual_dissimilarity(descriptors, 0.25)[0, 1] < 0.01
 
 
 def test_candidates_left_and_came_back(once_round):
     views, _truth = once_round
-    looks = [look_of(view) for view in views]
+    descriptors = [view_descriptor(view) for view in views]
 
-    def candidates(looks, possible=lambda i, j: True, known=(), **options):
-        return Appearance(**options).candidates(looks, possible, known)
+    def candidates(descriptors, possible=lambda i, j: True, known=(), **options):
+        return Appearance(**options).candidates(descriptors, possible, known)
 
-    pairs, refused = candidates(looks, pairs=10)
+    pairs, refused = candidates(descriptors, pairs=10)
     assert (0, 18) in pairs
     assert (1, 19) in pairs
     assert all(j - i > 3 for i, j in pairs)
     assert refused == []
-    assert candidates(looks, pairs=0) == ([], [])
-    assert candidates(looks[:2]) == ([], [])
+    assert candidates(descriptors, pairs=0) == ([], [])
+    assert candidates(descriptors[:2]) == ([], [])
     # Standing still is no coming back, and where a loop is known none is looked for.
-    assert candidates([looks[0]] * 8) == ([], [])
-    assert all(j < 16 or i > 3 for i, j in candidates(looks, known=[(0, 18)], pairs=10)[0])
-    assert len(candidates(looks, pairs=1)[0]) == 1
+    assert candidates([descriptors[0]] * 8) == ([], [])
+    assert all(j < 16 or i > 3 for i, j in candidates(descriptors, known=[(0, 18)], pairs=10)[0])
+    assert len(candidates(descriptors, pairs=1)[0]) == 1
     # What the trajectory forbids takes nobody's place.
-    kept, refused = candidates(looks, lambda i, j: i > 0, pairs=1)
+    kept, refused = candidates(descriptors, lambda i, j: i > 0, pairs=1)
     assert kept == [(1, 19)]
     assert refused == [(0, 18)]
 

@@ -16,7 +16,11 @@ from tofuse.posegraph.calibration_check import CalibrationCheck, of_submaps
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.submaps import cut, submaps
 from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, nearby, overlaps
-from tofuse.registration.likeness import alike, mutual_unlikeness, unlikeness_of_pairs
+from tofuse.registration.view_descriptor import (
+    mutual_dissimilarity,
+    pairwise_dissimilarity,
+    similar_views,
+)
 
 COUNT = 40
 
@@ -139,20 +143,20 @@ def test_the_nearest_views_are_those_that_overlap(swing, monkeypatch) -> None:
     assert len(some) > 0.6 * len(every)
 
 
-def test_the_index_of_looks_finds_what_looks_most_alike() -> None:
+def test_the_index_of_descriptors_finds_the_most_similar_views() -> None:
     rng = np.random.default_rng(4)
     places = rng.normal(0, 0.3, (200, 2, 15, 24)).astype(np.float32)
     # 200 places, each seen again later, turned by two cells and with noise.
     first, again = places[:, :, 3:12, 6:18], places[:, :, 3:12, 4:16]
     noise = 0.02 * rng.standard_normal(again.shape).astype(np.float32)
-    looks = np.concatenate([first, again + noise])
-    looks[rng.random(looks.shape) < 0.05] = np.nan
-    i, j = alike(looks, 0.25)
+    descriptors = np.concatenate([first, again + noise])
+    descriptors[rng.random(descriptors.shape) < 0.05] = np.nan
+    i, j = similar_views(descriptors, 0.25)
     pairs = set(zip(i.tolist(), j.tolist(), strict=True))
     assert sum((k, k + 200) in pairs for k in range(200)) > 180
     assert len(pairs) < 0.5 * 400 * 399 / 2
-    far = unlikeness_of_pairs(looks, i, j, 0.25)
-    np.testing.assert_allclose(far, mutual_unlikeness(list(looks), 0.25)[i, j], atol=0.06)
+    far = pairwise_dissimilarity(descriptors, i, j, 0.25)
+    np.testing.assert_allclose(far, mutual_dissimilarity(list(descriptors), 0.25)[i, j], atol=0.06)
     true = np.array([b == a + 200 for a, b in zip(i, j, strict=True)])
     assert far[true].max() < far[~true].min()
 

@@ -22,8 +22,8 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.methods.variants import Tricp
 from tofuse.registration.coarse_to_fine import CoarseToFine
-from tofuse.registration.hold import Hold
 from tofuse.registration.reduce import averaged
+from tofuse.registration.remapping import Remapping
 from tofuse.registration.surface_metrics import PointToPlane
 
 
@@ -118,11 +118,11 @@ def test_what_slides_is_reported_and_left_as_guessed(walls, count, noise):
     assert found.unobservable.shape == (count, 6)
     np.testing.assert_allclose(np.linalg.norm(found.unobservable, axis=1), 1)
     # What is held is found, the rest is that of the guess.
-    hold = Hold.of(found.unobservable, source_of(source, T)) if count else None
+    remapping = Remapping.of(found.unobservable, source_of(source, T)) if count else None
     missed = se3.inverse(T) @ found.T_target_source
     moved = se3.inverse(guess) @ found.T_target_source
-    if hold:
-        missed, slid = hold.across(missed), hold.along(moved)
+    if remapping:
+        missed, slid = remapping.across(missed), remapping.along(moved)
         np.testing.assert_allclose(slid, np.eye(4), atol=1e-3)
     assert np.linalg.norm(se3.log(missed)) < 0.3 * noise + 2e-3
 
@@ -140,10 +140,12 @@ def test_a_ball_can_turn():
 def test_hold_projects_motions():
     points = rng(1).normal(size=(50, 3)) + np.array([0, 0, 2])
     slide = np.array([[1.0, 0, 0, 0, 0, 0]])
-    hold = Hold.of(slide, points)
+    remapping = Remapping.of(slide, points)
     xi = np.array([0.1, 0.02, 0.03, 0, 0, 0])
-    np.testing.assert_allclose(se3.log(hold.along(se3.exp(xi))), [0.1, 0, 0, 0, 0, 0], atol=1e-12)
-    across = se3.log(hold.across(se3.exp(xi)))
+    np.testing.assert_allclose(
+        se3.log(remapping.along(se3.exp(xi))), [0.1, 0, 0, 0, 0, 0], atol=1e-12
+    )
+    across = se3.log(remapping.across(se3.exp(xi)))
     np.testing.assert_allclose(across, [0, 0.02, 0.03, 0, 0, 0], atol=1e-12)
 
 

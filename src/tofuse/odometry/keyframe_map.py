@@ -9,10 +9,10 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
-from tofuse.registration.likeness import look_of, unlikeness
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
 from tofuse.registration.verification import IN_SIGHT
+from tofuse.registration.view_descriptor import dissimilarity, view_descriptor
 
 # Maximum number of keyframes, so that memory is constant.
 CAPACITY = 40
@@ -35,9 +35,9 @@ class Keyframe:
         return self.view.depth
 
     @cached_property
-    def look(self) -> Float32:
-        """See `look_of`."""
-        return look_of(self.view)
+    def descriptor(self) -> Float32:
+        """See `view_descriptor`."""
+        return view_descriptor(self.view)
 
     @cached_property
     def target(self) -> Target:
@@ -102,7 +102,9 @@ class KeyframeMap:
         others = [k for k in self._keyframes if k.component != component]
         if not others:
             return None
-        far = unlikeness(look_of(view), np.stack([k.look for k in others]), _MAX_SHIFT)
+        far = dissimilarity(
+            view_descriptor(view), np.stack([k.descriptor for k in others]), _MAX_SHIFT
+        )
         return others[int(np.flatnonzero(far == far.min())[-1])]
 
     def _most_redundant(self) -> int:

@@ -68,7 +68,7 @@ class Optimised:
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
-    told: SensorPriors
+    sensors: SensorPriors
     visual: VisualEvidence
 
 
@@ -194,25 +194,25 @@ class BackEnd:
         # Without loops: with and without external sensors.
         sequential = guided = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
-        told = measure_all(self._config.priors, sensed, tracked)
-        graph = with_sensors(graph, told)
+        sensors = measure_all(self._config.priors, sensed, tracked)
+        graph = with_sensors(graph, sensors)
         optimisation = Optimisation(graph, (), True)
-        if graph.loop.any() or told:
+        if graph.loop.any() or sensors:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation = self._config.optimiser.optimise(graph)
-                if told and graph.loop.any():  # the poses that loops are compared with
-                    without_loops = with_sensors(tracked, told)
+                if sensors and graph.loop.any():  # the poses that loops are compared with
+                    without_loops = with_sensors(tracked, sensors)
                     guided = self._config.optimiser.optimise(without_loops).graph.poses
             loops = _without_rejected(loops, optimisation)
             optimisation = accepted_only(optimisation)
         graph = optimisation.graph
         visual = VisualEvidence(guided, optimisation)
-        if told:
+        if sensors:
             # The verdict rests on the images alone: external sensors can't improve it.
             images_only = self.graph(loops).with_poses(graph.poses)
             visual = VisualEvidence(guided, replace(optimisation, graph=images_only))
-        return Optimised(loops, sequential, optimisation, told, visual)
+        return Optimised(loops, sequential, optimisation, sensors, visual)
 
     def _search_loops_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
         """Search loops again once those found have corrected the poses in between.
@@ -236,14 +236,14 @@ class BackEnd:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
-            refinement = self._kept.refiner.finish(graph.ids.tolist(), graph.poses, closed.told)
+            refinement = self._kept.refiner.finish(graph.ids.tolist(), graph.poses, closed.sensors)
             if refinement.kept:
-                graph = with_sensors(self.graph(closed.loops, refinement), closed.told)
+                graph = with_sensors(self.graph(closed.loops, refinement), closed.sensors)
         return Refined(graph, refinement)
 
     def _fuse(self, closed: Optimised, refined: Refined) -> Fused:
         graph, refinement, model = refined.graph, refined.refinement, self._kept.model
-        moved = bool(graph.loop.any()) or refinement.kept or bool(closed.told)
+        moved = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
         self._progress.stage("fusing", model.views)
         with self._watch.timing("fusion"):
             ids = graph.ids.tolist()
@@ -289,7 +289,7 @@ class BackEnd:
                 kept.ambiguity_m,
                 tuple(log.repeated),
                 tuple(log.interruptions),
-                closed.told.records,
+                closed.sensors.records,
                 components,
                 tuple((e.record.index, e.moving) for e in self._posed if e.moving > 0),
                 tuple(
@@ -316,7 +316,7 @@ class BackEnd:
                 fused.before,
                 refined.refinement,
                 optimisation.parts,
-                closed.told.records,
+                closed.sensors.records,
                 accuracy=accuracy,
                 joins=tuple(self._joins),
             ),
@@ -325,7 +325,7 @@ class BackEnd:
             seed=0,
             threads=1,
             components=components,
-            up=closed.told.up(graph),
+            up=closed.sensors.up(graph),
         )
 
     def graph(
@@ -404,7 +404,7 @@ class BackEnd:
             return Accuracy(), pose_covariances(closed.optimisation.graph)
         refinement = refined.refinement
         graph = images_only = self._measured(refined.graph, refinement)
-        if closed.told:  # like the verdict, the accuracy rests on the images alone
+        if closed.sensors:  # like the verdict, the accuracy rests on the images alone
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
                 without_sensors = self.graph(closed.loops, refinement)

@@ -9,11 +9,11 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
-from tofuse.registration.likeness import (
-    alike,
-    mutual_unlikeness,
-    unlikeness,
-    unlikeness_of_pairs,
+from tofuse.registration.view_descriptor import (
+    dissimilarity,
+    mutual_dissimilarity,
+    pairwise_dissimilarity,
+    similar_views,
 )
 
 # Pairs whose views differ by at most this many positions are similar, and at most this many of them
@@ -54,7 +54,7 @@ class Appearance:
 
     def candidates(
         self,
-        looks: Sequence[Float32],
+        descriptors: Sequence[Float32],
         possible: Callable[[int, int], bool],
         known: Collection[tuple[int, int]] = (),
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -62,8 +62,8 @@ class Appearance:
 
         Parameters
         ----------
-        looks
-            Descriptors of all views in the order of time, see `likeness.look_of`.
+        descriptors
+            Descriptors of all views in the order of time, see `view_descriptor`.
         possible
             Whether the trajectory allows that views i and j show the same place.
         known
@@ -76,42 +76,44 @@ class Appearance:
         """
         chosen: list[tuple[int, int]] = []
         refused: list[tuple[int, int]] = []
-        if self.pairs == 0 or len(looks) < 3:
+        if self.pairs == 0 or len(descriptors) < 3:
             return chosen, refused
-        for _, i, j in self._most_alike(looks):
+        for _, i, j in self._most_alike(descriptors):
             mine = chosen if possible(i, j) else refused
             full = len(mine) >= self.pairs or _similar(i, j, mine) >= _MAX_SIMILAR
             if not full and not _similar(i, j, known):
                 mine.append((i, j))
         return chosen, refused
 
-    def _most_alike(self, looks: Sequence[Float32]) -> list[tuple[float, int, int]]:
+    def _most_alike(self, descriptors: Sequence[Float32]) -> list[tuple[float, int, int]]:
         """Return (difference, i, j) of similar views i < j that the camera left in between."""
-        if len(looks) > _ALL:
-            return self._most_alike_of_many(np.stack(looks))
-        far = mutual_unlikeness(looks, self.shift)
+        if len(descriptors) > _ALL:
+            return self._most_alike_of_many(np.stack(descriptors))
+        far = mutual_dissimilarity(descriptors, self.shift)
         away = far >= self.min_difference
         found = [
             (float(far[i, j]), int(i), int(j))
-            for j in range(2, len(looks))
+            for j in range(2, len(descriptors))
             for i in np.flatnonzero(far[: j - 1, j] <= self.max_difference)
             if (away[i, i + 1 : j] & away[i + 1 : j, j]).any()
         ]
         return sorted(found)
 
-    def _most_alike_of_many(self, looks: Float32) -> list[tuple[float, int, int]]:
+    def _most_alike_of_many(self, descriptors: Float32) -> list[tuple[float, int, int]]:
         """As `_most_alike`, with candidates from an index instead of all pairs."""
-        i, j = alike(looks, self.shift)
-        far = unlikeness_of_pairs(looks, i, j, self.shift)
+        i, j = similar_views(descriptors, self.shift)
+        far = pairwise_dissimilarity(descriptors, i, j, self.shift)
         found = []
         for k in np.lexsort((j, i, far)):
             if far[k] > self.max_difference:
                 break
             a, b = int(i[k]), int(j[k])
             between = np.unique(np.linspace(a + 1, b - 1, min(b - a - 1, _BETWEEN)).round())
-            some = looks[between.astype(np.intp)]
-            left = unlikeness(looks[a], some, self.shift) >= self.min_difference
-            if (left & (unlikeness(looks[b], some, self.shift) >= self.min_difference)).any():
+            some = descriptors[between.astype(np.intp)]
+            left = dissimilarity(descriptors[a], some, self.shift) >= self.min_difference
+            if (
+                left & (dissimilarity(descriptors[b], some, self.shift) >= self.min_difference)
+            ).any():
                 found.append((float(far[k]), a, b))
         return found
 

@@ -33,16 +33,16 @@ from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.confidence import CONTRADICTION, logistic
-from tofuse.registration.likeness import (
-    alike,
-    look_of,
-    mutual_unlikeness,
-    unlikeness_of_pairs,
-)
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD, SearchOptions, differ
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
+from tofuse.registration.view_descriptor import (
+    mutual_dissimilarity,
+    pairwise_dissimilarity,
+    similar_views,
+    view_descriptor,
+)
 from tofuse.registration.view_pair import follow, register_pair
 
 How = Literal["links", "motion"]
@@ -323,15 +323,15 @@ class _Joiner:
         if len(self._islands) < 2 or len(views) < 2:
             return
         component = np.array([self._component_of[v.index] for v in views])
-        looks = np.stack([look_of(v.view) for v in views])
-        if len(looks) <= _ALL:
+        descriptors = np.stack([view_descriptor(v.view) for v in views])
+        if len(descriptors) <= _ALL:
             i, j = np.nonzero(np.triu(component[:, None] != component))
-            far = mutual_unlikeness(looks, _SHIFT)[i, j]
+            far = mutual_dissimilarity(descriptors, _SHIFT)[i, j]
         else:  # by an index, as all pairs would be too many
-            i, j = alike(looks, _SHIFT)
+            i, j = similar_views(descriptors, _SHIFT)
             across = component[i] != component[j]
             i, j = i[across], j[across]
-            far = unlikeness_of_pairs(looks, i, j, _SHIFT)
+            far = pairwise_dissimilarity(descriptors, i, j, _SHIFT)
         order = np.lexsort((j, i, far))
         between: dict[tuple[int, int], int] = {}
         for k in order.tolist():

@@ -37,11 +37,11 @@ from tofuse.posegraph.view_store import (
 )
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
-from tofuse.registration.likeness import look_of
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit
+from tofuse.registration.view_descriptor import view_descriptor
 from tofuse.registration.view_pair import follow, register_pair
 
 View = PosedView[PreparedView]
@@ -79,7 +79,7 @@ class _Entry:
     """What candidates are selected by: little memory per view."""
 
     middle: Float64
-    look: Float32
+    descriptor: Float32
     kept: Spilled[Outline]
 
     @property
@@ -222,7 +222,7 @@ class _RevisitLoops(Loops):
         return True
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.look`. Poses are comparable only within the current component so far."""
+        """See `Loops.descriptor`. Poses are comparable only within the current component so far."""
         posed = self._chosen.views
         if not posed or posed[-1].index != next(reversed(self._poses)):
             return None
@@ -281,7 +281,7 @@ class _RevisitLoops(Loops):
         surface = posed.view.without_caches()
         outline = KeptView.of(surface, _POINTS).outline
         kept = Spilled(outline, self._store.outlines)
-        return _Entry(outline.middle, look_of(surface), kept)
+        return _Entry(outline.middle, view_descriptor(surface), kept)
 
     def _learn(self, posed: Sequence[View]) -> None:
         """Learn the usual fit of neighbouring views of this camera."""
@@ -352,7 +352,7 @@ class _RevisitLoops(Loops):
         known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
         appearance = replace(self._appearance, pairs=self._appearance.pairs * times)
         both = appearance.candidates(
-            [s.look for s in seen],
+            [s.descriptor for s in seen],
             lambda i, j: self._plausible(posed[i], posed[j], np.eye(4), ALIKE),
             known,
         )

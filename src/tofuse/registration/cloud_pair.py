@@ -24,10 +24,10 @@ from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobs
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.confidence import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.fpfh import Fpfh
-from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.remapping import Remapping
 from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
@@ -205,8 +205,8 @@ def _registered(
     if guess is None or best.guess is not None or not len(found.unobservable):
         return views.measured(found)
     # Poses that differ along degenerate directions only: keep the guess there.
-    hold = Hold.of(found.unobservable, views.there.view.points.astype(np.float64))
-    across = hold.across(se3.inverse(near.T_target_source) @ found.T_target_source)
+    remapping = Remapping.of(found.unobservable, views.there.view.points.astype(np.float64))
+    across = remapping.across(se3.inverse(near.T_target_source) @ found.T_target_source)
     if views.differ(near.T_target_source, near.T_target_source @ across):
         return views.measured(found)
     return views.measured(_registration(views, near, [best]))

@@ -15,12 +15,12 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
 from tofuse.registration.pairs import FEWEST_PAIRS
 from tofuse.registration.reduce import averaged, extent, reduced
 from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.remapping import Remapping
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.shape import shape_at
 from tofuse.registration.stopping import SmallStep
@@ -235,10 +235,10 @@ def _kept(
     """Return the registration with degenerate directions fixed to the guess (4, 4)."""
     if len(found.unobservable) == 0:
         return found
-    hold = Hold.of(found.unobservable, data.points.astype(np.float64))
+    remapping = Remapping.of(found.unobservable, data.points.astype(np.float64))
     T = found.T_target_source
-    T = T @ hold.along(se3.inverse(T) @ guess)
-    return icp.register(data, model, T, rng, hold)
+    T = T @ remapping.along(se3.inverse(T) @ guess)
+    return icp.register(data, model, T, rng, remapping)
 
 
 def spacing(view: Frame) -> float:

@@ -14,7 +14,6 @@ from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.hold import Hold
 from tofuse.registration.interfaces import (
     Alignment,
     History,
@@ -28,6 +27,7 @@ from tofuse.registration.interfaces import (
 from tofuse.registration.matchers import ClosestPoint
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.rejectors import MaxDistance, Unique
+from tofuse.registration.remapping import Remapping
 from tofuse.registration.selectors import Random, at_most
 from tofuse.registration.shape import NEIGHBOURS
 from tofuse.registration.stopping import TwoLoops
@@ -86,13 +86,13 @@ class Icp(Registrar):
         target: Frame,
         guess: Float64,
         rng: np.random.Generator,
-        hold: Hold | None = None,
+        remapping: Remapping | None = None,
     ) -> Registration:
         """Register `source` into the frame of `target`, starting from `guess` (T_target_source).
 
         Number of correspondences, E and rms are those of the last matching, just before the last
         motion. If the iterations run out before the stopping rule is met, the result is the
-        estimate so far with `converged` False. The directions of `hold` are fixed.
+        estimate so far with `converged` False. The directions of `remapping` are fixed.
 
         Raises
         ------
@@ -122,7 +122,11 @@ class Icp(Registrar):
                 matches = rejector.reject(matches, alignment)
             before = moved
             motion = self.metric.motion(matches, alignment)
-            T = motion @ T if hold is None else T @ hold.across(se3.inverse(T) @ motion @ T)
+            T = (
+                motion @ T
+                if remapping is None
+                else T @ remapping.across(se3.inverse(T) @ motion @ T)
+            )
             # R^T is used as the inverse of R: without this, rounding errors grow with every
             # iteration.
             T = se3.orthonormalise(T)

@@ -10,8 +10,8 @@ import pytest
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.registration.likeness import look_of, mutual_unlikeness, unlikeness
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.view_descriptor import dissimilarity, mutual_dissimilarity, view_descriptor
 from tofuse.sensor.models import camera_model
 
 
@@ -28,13 +28,13 @@ def views():
 
 
 @pytest.fixture(scope="module")
-def looks(views):
-    return np.stack([look_of(view) for view in views])
+def descriptors(views):
+    return np.stack([view_descriptor(view) for view in views])
 
 
-def test_a_look_is_the_mean_log_depth_and_albedo_of_each_cell(views, looks) -> None:
+def test_a_descriptor_is_the_mean_log_depth_and_albedo_of_each_cell(views, descriptors) -> None:
     view = views[0]
-    made = looks[0]
+    made = descriptors[0]
     assert made.shape == (2, 9, 12)
     rows, columns = view.z.shape
     for i, j in ((0, 0), (4, 7), (8, 11)):
@@ -53,35 +53,37 @@ def test_a_look_is_the_mean_log_depth_and_albedo_of_each_cell(views, looks) -> N
             assert np.isnan(made[1, i, j])
     assert np.isfinite(made[1]).sum() > 20
     empty = replace(view, z=np.where(np.arange(columns) < columns // 2, 0, view.z))
-    assert np.isnan(look_of(empty)[0, :, :6]).all()
-    np.testing.assert_array_equal(look_of(empty)[0, :, 6:], made[0, :, 6:])
+    assert np.isnan(view_descriptor(empty)[0, :, :6]).all()
+    np.testing.assert_array_equal(view_descriptor(empty)[0, :, 6:], made[0, :, 6:])
 
 
-def test_the_same_place_is_likest(looks) -> None:
-    for k, look in enumerate(looks):
-        far = unlikeness(look, looks, 0.25)
+def test_the_same_place_is_the_most_similar(descriptors) -> None:
+    for k, descriptor in enumerate(descriptors):
+        far = dissimilarity(descriptor, descriptors, 0.25)
         assert far[k] == 0
         assert np.delete(far, k).min() > 0.02
 
 
-def test_neighbours_are_liker_than_what_is_elsewhere(looks) -> None:
+def test_neighbours_are_more_similar_than_distant_views(descriptors) -> None:
     """They share more than half of what they see: at a shift of half the width each comes first."""
-    for k, look in enumerate(looks[:-1]):
-        far = unlikeness(look, looks, 0.5)
+    for k, descriptor in enumerate(descriptors[:-1]):
+        far = dissimilarity(descriptor, descriptors, 0.5)
         far[k] = np.inf
         assert {k - 1, k + 1} & set(np.argsort(far)[:2]), k
 
 
-def test_one_against_many_is_what_all_against_each_other_are(looks) -> None:
-    mutual = mutual_unlikeness(looks, 0.25)
-    for k, look in enumerate(looks):
-        np.testing.assert_array_equal(mutual[k, k:], unlikeness(look, looks[k:], 0.25))
+def test_one_against_many_is_what_all_against_each_other_are(descriptors) -> None:
+    mutual = mutual_dissimilarity(descriptors, 0.25)
+    for k, descriptor in enumerate(descriptors):
+        np.testing.assert_array_equal(
+            mutual[k, k:], dissimilarity(descriptor, descriptors[k:], 0.25)
+        )
 
 
-def test_what_is_unknown_is_unlike(looks) -> None:
-    look = looks[0]
-    nothing = np.full_like(look, np.nan)
-    far = unlikeness(look, np.stack([nothing, look, look + 10.0]), 0.25)
+def test_unknown_cells_are_dissimilar(descriptors) -> None:
+    descriptor = descriptors[0]
+    nothing = np.full_like(descriptor, np.nan)
+    far = dissimilarity(descriptor, np.stack([nothing, descriptor, descriptor + 10.0]), 0.25)
     assert far[1] == 0
     # What differs by the same everywhere is exposure, to the albedo, but another place, to depth.
     np.testing.assert_allclose(far[[0, 2]], [1.0, 0.5], atol=1e-5)

@@ -11,7 +11,7 @@ from tofuse.geometry import se3
 
 
 @dataclass(frozen=True, eq=False)
-class Hold:
+class Remapping:
     """Directions of the right perturbation along which a registration must not move.
 
     Attributes
@@ -29,7 +29,7 @@ class Hold:
     size: float
 
     @classmethod
-    def of(cls, directions: Float64, points: Float64) -> Hold:
+    def of(cls, directions: Float64, points: Float64) -> Remapping:
         """Fix `directions` (k, 6) of a source with the given points (n, 3)."""
         centre = points.mean(0)
         size = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))

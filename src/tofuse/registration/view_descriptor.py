@@ -26,7 +26,7 @@ _LIT = 0.2
 _COMPONENTS, _ANSWERS = 8, 6
 
 
-def look_of(view: PreparedView) -> Float32:
+def view_descriptor(view: PreparedView) -> Float32:
     """Return the descriptor (2, 9, 12): mean log depth and log albedo per cell, NaN if unknown."""
     rows, columns = view.z.shape
     i = np.arange(rows) * _ROWS // rows
@@ -34,18 +34,18 @@ def look_of(view: PreparedView) -> Float32:
     cell = (i[:, None] * _COLUMNS + j).ravel()
     size = _ROWS * _COLUMNS
     third = np.bincount(cell, minlength=size) / 3
-    look = np.full((2, size), np.nan, np.float32)
+    descriptor = np.full((2, size), np.nan, np.float32)
     depth = np.log(np.where(view.z > 0, view.z, np.float32(np.nan)))
-    for image, out in ((depth, look[0]), (view.albedo[..., 0], look[1])):
+    for image, out in ((depth, descriptor[0]), (view.albedo[..., 0], descriptor[1])):
         known = np.isfinite(image).ravel()
         count = np.bincount(cell[known], minlength=size)
         total = np.bincount(cell[known], image.ravel()[known].astype(float), minlength=size)
         enough = (count > third) & (count > 0)
         out[enough] = total[enough] / count[enough]
-    return look.reshape(2, _ROWS, _COLUMNS)
+    return descriptor.reshape(2, _ROWS, _COLUMNS)
 
 
-def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
+def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64:
     """Return the distances (N,) of descriptors to one, each at its best shift.
 
     0 for the same image, 1 for nothing in common. The mean difference of log albedo is exposure,
@@ -53,7 +53,7 @@ def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
 
     Parameters
     ----------
-    look, others
+    descriptor, others
         Descriptors (2, 9, 12) and (N, 2, 9, 12).
     shift
         Largest shift, as a fraction of the width.
@@ -62,27 +62,27 @@ def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
     best = np.ones(len(others))
     for v in range(-down, down + 1):
         for u in range(-across, across + 1):
-            here = look[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
+            here = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
             there = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
             np.minimum(best, _differ(here, there), out=best)
     return best
 
 
-def mutual_unlikeness(looks: Sequence[Float32] | Float32, shift: float) -> Float64:
-    """Return the pairwise distances (N, N) of descriptors (N, 2, 9, 12), see `unlikeness`."""
-    stack = np.asarray(looks)
+def mutual_dissimilarity(descriptors: Sequence[Float32] | Float32, shift: float) -> Float64:
+    """Return the pairwise distances (N, N) of descriptors (N, 2, 9, 12), see `dissimilarity`."""
+    stack = np.asarray(descriptors)
     far = np.ones((len(stack), len(stack)))
 
     def rows(a: int, b: int) -> None:
         for k in range(a, b):
-            far[k, k:] = unlikeness(stack[k], stack[k:], shift)
+            far[k, k:] = dissimilarity(stack[k], stack[k:], shift)
 
     run_chunks(rows, len(stack), _CHUNKS)
     return np.minimum(far, far.T)
 
 
-def unlikeness_of_pairs(looks: Float32, i: Intp, j: Intp, shift: float) -> Float64:
-    """Return the distances (M,) of the pairs i, j of descriptors, see `unlikeness`."""
+def pairwise_dissimilarity(descriptors: Float32, i: Intp, j: Intp, shift: float) -> Float64:
+    """Return the distances (M,) of the pairs i, j of descriptors, see `dissimilarity`."""
     out = np.ones(len(i))
     order = np.argsort(i, kind="stable")
     different, begin = np.unique(i[order], return_index=True)
@@ -91,21 +91,21 @@ def unlikeness_of_pairs(looks: Float32, i: Intp, j: Intp, shift: float) -> Float
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             rows = order[begin[k] : end[k]]
-            out[rows] = unlikeness(looks[different[k]], looks[j[rows]], shift)
+            out[rows] = dissimilarity(descriptors[different[k]], descriptors[j[rows]], shift)
 
     run_chunks(work, len(different), _CHUNKS)
     return out
 
 
-def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
+def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     """Return candidate pairs i < j of similar descriptors (N, 2, 9, 12), some for each view.
 
     A k-d tree over the first principal components of blocks of cells is queried for each view at
-    each shift (see `unlikeness`). Callers compare the candidates cell by cell. Consecutive views
+    each shift (see `dissimilarity`). Callers compare the candidates cell by cell. Consecutive views
     are left out, as these are always similar.
     """
-    n = len(looks)
-    described = _blocks(looks, 0, 0)
+    n = len(descriptors)
+    described = _blocks(descriptors, 0, 0)
     mean = described.mean(0)
     _, _, axes = np.linalg.svd(described - mean, full_matrices=False)
     axes = axes[:_COMPONENTS]
@@ -114,7 +114,7 @@ def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
     across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     for v in range(-down, down + 1):
         for u in range(-across, across + 1):
-            asked = (_blocks(looks, v, u) - mean) @ axes.T
+            asked = (_blocks(descriptors, v, u) - mean) @ axes.T
             _, near = tree.query(asked, k=min(_ANSWERS, n))
             here.append(np.repeat(np.arange(n), near.shape[1]))
             there.append(near.ravel())
@@ -125,16 +125,16 @@ def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
     return i, j
 
 
-def _blocks(looks: Float32, v: int, u: int) -> Float64:
+def _blocks(descriptors: Float32, v: int, u: int) -> Float64:
     """Return means (N, 24) over blocks of 3 x 3 cells of descriptors shifted by v rows, u columns.
 
     Unknown blocks get the mean of all views; log albedo is relative to the view's mean.
     """
-    moved = np.full_like(looks, np.nan)
+    moved = np.full_like(descriptors, np.nan)
     to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
     to, fro = slice(max(-u, 0), _COLUMNS - max(u, 0)), slice(max(u, 0), _COLUMNS + min(u, 0))
-    moved[:, :, to_rows, to] = looks[:, :, from_rows, fro]
-    cells = moved.reshape(len(looks), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
+    moved[:, :, to_rows, to] = descriptors[:, :, from_rows, fro]
+    cells = moved.reshape(len(descriptors), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
     known = np.isfinite(cells)
     count = known.sum((3, 5))
     total = np.where(known, cells, 0).sum((3, 5))
@@ -144,7 +144,7 @@ def _blocks(looks: Float32, v: int, u: int) -> Float64:
     own = np.where(seen, means, 0).sum((2, 3)) / np.maximum(seen.sum((2, 3)), 1)
     means[:, 1] -= own[:, 1, None, None]
     typical = np.where(seen, means, 0).sum(0) / np.maximum(seen.sum(0), 1)
-    return np.where(seen, means, typical).reshape(len(looks), -1)
+    return np.where(seen, means, typical).reshape(len(descriptors), -1)
 
 
 def _differ(here: Float32, there: Float32) -> Float64:
