@@ -77,6 +77,17 @@ def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
         assert off[part].std() == pytest.approx(1, rel=0.15)
 
 
+def test_a_floor_in_a_coarse_image_is_no_edge() -> None:
+    """Its depth changes by more than `edge_jump` from row to row, far from any edge."""
+    camera = Pinhole(64, 48, 45.0, 45.0, 31.5, 23.5)
+    rays = camera.rays().astype(float)
+    z = 1.2 / (rays[..., 1] + 0.75)  # 1.2 m below, seen at 53 degrees and less
+    assert np.median(np.abs(np.diff(z, axis=0)) / z[1:]) > 0.025
+    noise = np.random.default_rng(6).normal(0, 0.004, z.shape) * z
+    view = prepare_view(RangeFrame(0, 0.0, camera, (z + noise).astype(np.float32)), OPTIONS)
+    assert view.planar_fraction > 0.7
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
 def test_scattered_gaps_cost_resolution_not_the_planes(share: float) -> None:
     camera = Pinhole(352, 288, 460.0, 460.0, 175.5, 143.5)

@@ -28,6 +28,8 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 _CHUNK_ROWS = 60
 # Sparse images are not halved below this width and height.
 _MIN_SIDE = 16
+# Tangent of the incidence (80 degrees) up to which neighbouring pixels belong to one surface.
+_STEEPEST = 5.67
 # Relative difference of depths up to which they belong to one surface when an image is halved.
 _HALVING_JUMP = 0.02
 # Range of usable colour levels: darker ones are noise, brighter ones saturated.
@@ -84,8 +86,9 @@ class SurfaceOptions:
         widest one that contains a single surface gives the slope.
     edge_jump, edge_margin, edge_sigmas
         Pixels within `edge_margin` pixels of a depth edge are left out of the fits, as they mix
-        light of both sides. An edge is a relative difference above `edge_jump`, and above
-        `edge_sigmas` times the view's typical noise.
+        light of both sides. An edge is a relative difference above `edge_jump`, above that of
+        neighbouring pixels on a surface at an incidence of 80 degrees, and above `edge_sigmas`
+        times the view's typical noise.
     misfit
         Largest ratio of the residual variance of a window to that of the smallest windows.
     flatness
@@ -115,6 +118,14 @@ class SurfaceOptions:
     albedo_radius: int = 1
     falloff: float | None = None
     smoothed: Smoothed = Smoothed()
+
+    def for_pitch(self, pitch: float) -> SurfaceOptions:
+        """Return the options for images with this difference of x/z between neighbouring pixels.
+
+        In coarse images slanted surfaces have larger differences of depth, which are no edges.
+        """
+        jump = max(self.edge_jump, _STEEPEST * pitch)
+        return self if jump == self.edge_jump else replace(self, edge_jump=jump)
 
     def for_noise(self, noise: float) -> SurfaceOptions:
         """Return the options for a view with this noise between neighbours, relative to depth."""
@@ -351,7 +362,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     # d(1/z) = dz / z^2
     weight = _inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = _typical_noise(w, weight)
-    given, options = options, options.for_noise(noise)
+    given, options = options, options.for_noise(noise).for_pitch(projection.pitch)
     columns = _columns_without_gaps(frame, z, options)
     if columns < z.shape[1]:
         return prepare_view(frame, replace(given, columns=columns))
@@ -417,7 +428,7 @@ def with_extended_planes(
     w = _inverse(surface.z, known)
     noise = np.where(known, surface.sigma * w, np.float32(0))
     typical = median(noise[known])
-    options = options.for_noise(float(np.sqrt(2) * typical))
+    options = options.for_noise(float(np.sqrt(2) * typical)).for_pitch(surface.projection.pitch)
     missing = known & (surface.planes[..., 3] == 0)
     quiet = surface.planes
     if np.count_nonzero(missing & (noise > _NOISY_RATIO * typical)) >= _MIN_NOISY * known.size:
