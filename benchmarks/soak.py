@@ -185,9 +185,14 @@ def runs(count: int, base: Path, samples: int = SAMPLES) -> bool:
 
 @dataclass
 class Sent:
-    """How many frames a camera sent, and how many were missing, duplicate or late."""
+    """How many frames a camera sent, and how many were missing, duplicate or late.
+
+    `repeated` counts images equal to the previous one: duplicates, and the images on both sides of
+    a turning point that is missing.
+    """
 
     frames: int = 0
+    repeated: int = 0
     missing: int = 0
     doubled: int = 0
     late: int = 0
@@ -205,6 +210,7 @@ class Camera(Stream):
         self.sent = Sent()
         self._rate = rate
         self._feed = self._frames(count)
+        self._depth: object = None
         # Limits how far ahead another thread reads, so that no frame is dropped.
         self._free = None if ahead is None else threading.Semaphore(ahead)
 
@@ -221,6 +227,8 @@ class Camera(Stream):
         if frame is None:
             raise DeviceError("was switched off", where="made")
         self.sent.frames += 1
+        self.sent.repeated += frame.depth is self._depth
+        self._depth = frame.depth
         return replace(frame, index=index)
 
     def close(self) -> None:
@@ -289,8 +297,8 @@ def live(
     good &= bounded(trace.samples, FRAME_BYTES)
     result = mapper.finish()
     repeated = len(mapper.log.repeated)
-    print(f"{len(result.trajectory)} of {sent.frames} frames have a pose, {repeated} duplicates")
-    return good and len(result.trajectory) == sent.frames and repeated == sent.doubled
+    print(f"{len(result.trajectory)} of {sent.frames} frames have a pose, {repeated} repeated")
+    return good and len(result.trajectory) == sent.frames and repeated == sent.repeated
 
 
 def main() -> int:

@@ -74,6 +74,13 @@ def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) 
     assert sum(step == 0 for step in steps) == sent.sent.doubled
     assert sum(step < 0 for step in steps) >= 1
     assert "1200" not in capsys.readouterr().err
+    again = soak.Camera(32, 1200, 10.0)
+    images = [frame.depth for frame in again._frames(1200)]
+    repeated = sum(a is b for a, b in itertools.pairwise(images))
+    with soak.Camera(32, 1200, 10.0) as camera, pytest.raises(soak.DeviceError):
+        for _ in camera:
+            pass
+    assert camera.sent.repeated == repeated >= camera.sent.doubled
 
 
 def test_a_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
