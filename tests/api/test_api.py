@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ import tofuse
 from tofuse.cli.progress import TerminalProgress
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
+from tofuse.recordings.convert import convert
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.icp import Icp
 
@@ -309,3 +313,30 @@ def test_a_registration_is_shown_in_one_line() -> None:
         "Registration: not verified, translation 0.0000 m, rotation 0.000 degrees, "
         "100% inliers, rms 0.00 mm"
     )
+
+
+def test_options_are_given_as_in_a_file(arrays) -> None:
+    recording = tofuse.from_arrays(arrays[0][:2], arrays[1])
+    options = {"method": "thesis", "fusion": {"voxel_m": 0.1}}
+    found = tofuse.reconstruct(recording, options, threads=1)
+    assert found.config["method"] == "thesis"
+    assert found.config["fusion"]["voxel_m"] == 0.1
+    for wrong, says in (({"fusio": {}}, "fusio"), ({"method": "thesys"}, "thesys")):
+        with pytest.raises(InputError, match=says):
+            tofuse.reconstruct(recording, wrong)
+
+
+def test_a_filter_that_learned_from_the_recording_is_in_the_report(tmp_path) -> None:
+    simulate("box", tmp_path / "rec", every=20, frames=9, effects=Effects.none(shot_noise=True))
+    options = {"filters": [{"part": "background"}]}
+    found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), options, threads=1)
+    found.save(tmp_path / "out")
+    assert "background" in (tmp_path / "out/report.html").read_text()
+
+
+def test_a_result_is_saved_after_its_recording_is_gone(arrays, tmp_path) -> None:
+    convert(tofuse.from_arrays(arrays[0][:2], arrays[1]), tmp_path / "rec")
+    found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), threads=1)
+    shutil.rmtree(tmp_path / "rec")
+    found.save(tmp_path / "out")
+    assert (tmp_path / "out/report.html").stat().st_size > 10_000

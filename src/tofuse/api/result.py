@@ -6,11 +6,11 @@ import html
 import sys
 import tempfile
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.cli.progress import TerminalProgress
 from tofuse.errors import InputError
+from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.evaluating import Evaluation, evaluate
 from tofuse.pipeline.merging import merge as merge_results
@@ -48,12 +49,20 @@ class Result(Reconstruction):
     ----------
     source
         The recording that it was made from; None for a result that was loaded.
+    fitted
+        The configuration after its parts were fitted to the recording, if known.
     """
 
     source: Recording | None = None
+    fitted: Config | None = None
 
     @classmethod
-    def of(cls, found: Reconstruction, source: Recording | None = None) -> Self:
+    def of(
+        cls,
+        found: Reconstruction,
+        source: Recording | None = None,
+        fitted: Config | None = None,
+    ) -> Self:
         """Make a result of a reconstruction, such as that of `Mapper.finish`.
 
         Parameters
@@ -62,9 +71,11 @@ class Result(Reconstruction):
             The reconstruction.
         source
             The recording that it was made from, if known.
+        fitted
+            The configuration after its parts were fitted to the recording, if known.
         """
         own = {f.name: getattr(found, f.name) for f in fields(Reconstruction)}
-        return cls(**own, source=source)
+        return cls(**own, source=source, fitted=fitted)
 
     @property
     def accuracy(self) -> str:
@@ -98,7 +109,8 @@ class Result(Reconstruction):
         from tofuse.viewer.view_file import write_report_and_view
 
         if self.source is not None:
-            write_report_files(self.source, self._configuration(self.source), result, folder)
+            config = self.fitted or adapted(self._configuration(self.source), self.source)
+            write_report_files(self.source, config, result, folder)
             return
         title = Path(str(result.recording["path"])).name
         write_report_and_view(result, folder, ReportExtras(title))
@@ -235,7 +247,7 @@ class Plot:
 
 def reconstruct(
     recording: Recording,
-    config: Config | str = "default",
+    config: Config | str | Mapping[str, Any] = "default",
     *,
     seed: int = 0,
     threads: int | None = None,
@@ -251,7 +263,8 @@ def reconstruct(
     recording
         A recording of `tofuse.open` or `tofuse.from_arrays`.
     config
-        A configuration or the name of one ("default", "thesis").
+        The name of a configuration ("default", "thesis"); or options that differ from the default,
+        as in a TOML file of ``--config``: ``{"fusion": {"voxel_m": 0.01}}``; or a configuration.
     seed
         Random seed.
     threads
@@ -264,8 +277,9 @@ def reconstruct(
     Raises
     ------
     InputError
-        If `recording` is not a recording; if no frame can be read, or none has enough valid points
-        for a pose; or if a filter can't estimate its parameters from the recording.
+        If `recording` is not a recording or an option does not exist; if no frame can be read, or
+        none has enough valid points for a pose; or if a filter can't estimate its parameters from
+        the recording.
     """
     if not isinstance(recording, Recording):
         raise InputError(
@@ -274,10 +288,21 @@ def reconstruct(
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
     with _shown(progress) as seen:
+        fitted = adapted(_configuration(config, recording), recording, threads, seen)
         found = reconstruct_recording(
-            recording, config, seed=seed, threads=threads, loops=loops, progress=seen
+            recording, fitted, seed=seed, threads=threads, loops=loops, progress=seen
         )
-    return Result.of(found, recording)
+    return Result.of(found, recording, fitted)
+
+
+def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
+    kind = view_kind(recording)
+    if isinstance(config, str):
+        return from_method(config, kind)
+    if isinstance(config, Mapping):
+        options = {name: value for name, value in config.items() if name != "method"}
+        return changed(from_method(config.get("method", "default"), kind), options, where="config")
+    return config
 
 
 def merge(

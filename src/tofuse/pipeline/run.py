@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.corrections.raw_amplitude import range_and_amplitude
 from tofuse.corrections.unwrap import Unwrap
-from tofuse.errors import InputError
+from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
@@ -433,12 +433,15 @@ def _final_config(config: Config, result: Reconstruction) -> Config:
 def _filter_steps(
     config: Config, recording: Recording, result: Reconstruction
 ) -> tuple[tuple[str, Frame], ...]:
-    """Return one frame, raw and after each filter (figure 3.2)."""
+    """Return one frame, raw and after each filter (figure 3.2); none if it can't be read again."""
     posed = np.flatnonzero(result.has_pose)
     k = int(posed[len(posed) // 2])
-    frame = recording[k]
     index = int(recording.indices[k])
-    history = past_frames(recording, index, config.window - 1)
+    try:
+        frame = recording[k]
+        history = past_frames(recording, index, config.window - 1)
+    except UnreadableFrameError:  # the recording has been moved or deleted
+        return ()
     steps: list[tuple[str, Frame]] = [("raw", frame)]
     for correction in config.corrections:
         corrector = correction.start()
