@@ -262,7 +262,7 @@ def off_and_belief(pair: Pair, found: Registration | Float64) -> tuple[bool, boo
     """Whether a pose is right, whether it is accepted, and its probability."""
     if isinstance(found, Registration):
         T = found.T_target_source
-        return pair.is_right(T), bool(found.accepted), found.probability or 0.0
+        return pair.is_right(T), bool(found.believed), found.probability or 0.0
     return pair.is_right(found), False, 0.0
 
 

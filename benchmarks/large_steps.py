@@ -132,7 +132,7 @@ def look(
     right = False
     if true is not None:
         right = is_right(found.T_target_source, true)
-    return Outcome(right, found.probability or 0.0, bool(found.accepted), seconds)
+    return Outcome(right, found.probability or 0.0, bool(found.believed), seconds)
 
 
 def neighbours(taken: Views, options: SearchOptions) -> list[Outcome]:
@@ -201,7 +201,7 @@ def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
     options = SurfaceOptions()
     views = prepare_view(source, options), prepare_view(target, options)
     found = register_pair(*views, options=SearchOptions(mode="auto"), always_search=True)
-    return found.T_target_source if found is not None and found.accepted else None
+    return found.T_target_source if found is not None and found.believed else None
 
 
 def by_part(part: Features | Fpfh | PlaneSets) -> Method:

@@ -299,7 +299,7 @@ def outcome(case: Case) -> Outcome | None:
         found: Registration = tofuse.register(case.source, case.target)
     except RegistrationError:
         return None
-    if not found.accepted:
+    if not found.believed:
         return None
     p = case.source.points.astype(np.float64)
     J = np.zeros((len(p), 3, 6))

@@ -180,7 +180,7 @@ def outcome(method: Method, source: RangeFrame, target: RangeFrame, true: Float6
         return Outcome(np.inf, np.inf, time.perf_counter() - start)
     seconds = time.perf_counter() - start
     if isinstance(found, Registration):
-        accepted, probability = bool(found.accepted), found.probability or 0.0
+        accepted, probability = bool(found.believed), found.probability or 0.0
         return Outcome(*off(found.T_target_source, true), seconds, accepted, probability)
     return Outcome(*off(found, true), seconds)
 
@@ -298,7 +298,7 @@ def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
                 except RegistrationError:
                     refused += 1
     if found:
-        accepted = sum(bool(f.accepted) for f in found)
+        accepted = sum(bool(f.believed) for f in found)
         highest = max(f.probability or 0.0 for f in found)
         print(
             f"\nof {len(found) + refused} pairs of different places {accepted} accepted,", end=" "

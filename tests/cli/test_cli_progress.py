@@ -67,7 +67,7 @@ def test_health_tells_of_the_newest_frame_and_of_what_was_lost() -> None:
         ("skipped", None),
         ("tracked", None),
     ):
-        health.update(FrameRecord(0, 0.0, status, inlier_ratio=share))
+        health.update(FrameRecord(0, 0.0, status, inlier_share=share))
         seen.append(health.markup)
     assert seen == [
         "[green]97% inliers[/]",
@@ -101,19 +101,19 @@ def test_who_looks_decides(monkeypatch) -> None:
 def test_programs_hear_how_far_it_is(capsys) -> None:
     with JsonProgress() as progress:
         progress.stage("tracking", 2)
-        progress.advance(FrameRecord(4, 0.0, "tracked", inlier_ratio=0.912345))
-        progress.advance(FrameRecord(6, 0.1, "lost", "why", inlier_ratio=float("nan")))
+        progress.advance(FrameRecord(4, 0.0, "tracked", inlier_share=0.912345))
+        progress.advance(FrameRecord(6, 0.1, "lost", "why", inlier_share=float("nan")))
         progress.stage("fusing", 3)
         progress.advance()
         progress.note("words")
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["event"] for line in lines] == ["stage", "frame", "frame", "stage", "note"]
     first, last = lines[1:3]
-    assert (first["index"], first["status"], first["inlier_ratio"]) == (4, "tracked", 0.9123)
+    assert (first["index"], first["status"], first["inlier_share"]) == (4, "tracked", 0.9123)
     assert (first["done"], first["total"], last["done"]) == (1, 2, 2)
     assert first["per_second"] > 0
     assert first["seconds_left"] >= 0
-    assert (last["seconds_left"], last["inlier_ratio"], last["reason"]) == (0, None, "why")
+    assert (last["seconds_left"], last["inlier_share"], last["reason"]) == (0, None, "why")
 
 
 _SHOW = """
@@ -125,7 +125,7 @@ with progress_for(as_json=False) as progress:
     progress.note("read [this]")
     for k in range(40):
         time.sleep(0.01)
-        progress.advance(FrameRecord(k, 0.0, "lost" if k == 5 else "tracked", inlier_ratio=0.93))
+        progress.advance(FrameRecord(k, 0.0, "lost" if k == 5 else "tracked", inlier_share=0.93))
     progress.stage("refining")
     time.sleep(0.2)
 print("done")

@@ -77,7 +77,7 @@ def test_two_frames_of_a_recording(room_recording, tmp_path, capfd) -> None:
         capfd, f"{room_recording}#3", f"{room_recording}#0", "--out", out, "--threads", 2
     )
     assert status == 0
-    assert said["accepted"] is True
+    assert said["believed"] is True
     assert said["probability"] > 0.9
     assert said["reason"] == ""
     assert (said["source"]["frame"], said["target"]["frame"]) == (3, 0)
@@ -138,7 +138,7 @@ def test_clouds_of_each_format(suffix, clouds, capfd) -> None:
         write_cloud(other, points)
     status, said = told(capfd, *paths)
     assert status == 0
-    assert said["accepted"] is True
+    assert said["believed"] is True
     assert said["probability"] > 0.9
     assert said["source"]["format"] == ("las" if suffix == ".laz" else suffix[1:])
     near(said["T_target_source"], T_SMALL)
@@ -473,14 +473,14 @@ def made(T: np.ndarray, **more: object) -> Registration:
 @pytest.mark.parametrize(
     ("more", "status", "says"),
     [
-        ({"accepted": True, "probability": 0.97}, 0, "accepted: probability 97 %"),
-        ({"accepted": True, "probability": 0.9999}, 0, "accepted: probability above 99 %"),
+        ({"believed": True, "probability": 0.97}, 0, "accepted: probability 97 %"),
+        ({"believed": True, "probability": 0.9999}, 0, "accepted: probability above 99 %"),
         (
-            {"accepted": False, "probability": 0.2, "reason": "too little overlap"},
+            {"believed": False, "probability": 0.2, "reason": "too little overlap"},
             3,
             "rejected: probability 20 %; too little overlap",
         ),
-        ({"accepted": False}, 3, "rejected"),
+        ({"believed": False}, 3, "rejected"),
         ({}, 3, "not verified: the method can't verify its result"),
     ],
 )
@@ -494,7 +494,7 @@ def test_belief_decides_the_exit_status(
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
     again, said = told(capfd, *clouds)
     assert again == status
-    assert said["accepted"] is more.get("accepted")
+    assert said["believed"] is more.get("believed")
     assert said["runner_up"] is said["margin"] is said["overlap"] is None
 
 
@@ -561,7 +561,7 @@ def test_information_that_is_no_good_gives_no_accuracy(clouds, capfd, monkeypatc
 
 def test_the_runner_up_is_told_by_margin_and_place(clouds, capfd, monkeypatch) -> None:
     other = se3.exp([0.3, 0, 0, 0, 0, 0])
-    found = made(np.eye(4), runner_up=other, margin=0.125, accepted=True, probability=0.95,
+    found = made(np.eye(4), runner_up=other, margin=0.125, believed=True, probability=0.95,
                  overlap=0.8, support=0.7, contradiction=0.01)  # fmt: skip
     said = printed(capfd, monkeypatch, clouds, found)
     assert said["runner-up"] == "0.300 m and 0.0° away, fits 12 % fewer of the points"

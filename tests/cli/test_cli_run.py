@@ -158,8 +158,8 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
             "timestamp",
             "status",
             "reason",
-            "valid_fraction",
-            "inlier_ratio",
+            "valid_share",
+            "inlier_share",
             "rms_m",
             "covariance",
             "unobservable",
@@ -167,9 +167,9 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
             "session",
         }
         assert frame["status"] == "tracked"
-        assert 0 < frame["valid_fraction"] <= 1
+        assert 0 < frame["valid_share"] <= 1
         if frame["index"]:
-            assert 0 < frame["inlier_ratio"] <= 1
+            assert 0 < frame["inlier_share"] <= 1
             assert 0 < frame["rms_m"] < 0.1
             covariance = np.array(frame["covariance"]).reshape(6, 6)
             assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -751,7 +751,7 @@ def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
     data = json.loads(capsys.readouterr().out)
     assert data["ate_rms_m"] < 0.1
     assert data["coverage"] == 1
-    assert data["map_consistency"]["inlier_ratio"] > 0.5
+    assert data["map_consistency"]["inlier_share"] > 0.5
     assert main(words) == 0
     table = capsys.readouterr().out
     for part in ("ATE rms", "RPE over 1 frame", "RPE over 30 frames", "map consistency"):

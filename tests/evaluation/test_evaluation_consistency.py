@@ -224,7 +224,7 @@ def test_nothing_overlaps() -> None:
     found = consistency_of_frames(look(PINHOLE, away), away)
     assert found.pairs == 0
     plain = found.to_dict()
-    assert plain == {"rms_m": None, "inlier_ratio": None, "pairs": 0, "frames": 2}
+    assert plain == {"rms_m": None, "inlier_share": None, "pairs": 0, "frames": 2}
     json.dumps(plain, allow_nan=False)
     empty = [RangeFrame(k, k, PINHOLE, np.zeros((60, 80), np.float32)) for k in range(2)]
     assert consistency_of_frames(empty, away).pairs == 0

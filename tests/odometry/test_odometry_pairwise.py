@@ -40,7 +40,7 @@ class Scripted(AnyPair):
             information=np.eye(6),
             unobservable=ALONG_X if degenerate else np.zeros((0, 6)),
             errors=(),
-            accepted=True,
+            believed=True,
             probability=0.99,
             reason="",
         )

@@ -332,7 +332,7 @@ def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
     ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
     made = [register_pair(*reversed(ends[0])), follow(*reversed(ends[1]), np.eye(4))]
     links = [
-        Link(target.index, source.index, found, bool(found.accepted), found.how)
+        Link(target.index, source.index, found, bool(found.believed), found.how)
         for (target, source), found in zip(ends, made, strict=True)
     ]
     (group,) = SPARSELY.join(three, links)

@@ -89,7 +89,7 @@ def registered(T, probability):
     reason = "" if accepted else "another pose fits nearly as well"
     return Registration(
         T, True, 9, 1800, 2000, 0.1, 0.003, 1e4 * np.eye(6), margin=0.1,
-        accepted=accepted, probability=probability, reason=reason,
+        believed=accepted, probability=probability, reason=reason,
     )  # fmt: skip
 
 

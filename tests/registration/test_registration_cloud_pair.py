@@ -256,7 +256,7 @@ def test_scans_with_any_heading(scans):
     found = tofuse.register(source, target)
     assert off(found.T_target_source, true, source)[0] < 0.02
     assert off(found.T_target_source, true, source)[1] < 0.5
-    assert found.accepted
+    assert found.believed
     assert found.probability > 0.9
     assert found.contradiction < 0.01
 
@@ -286,7 +286,7 @@ def test_lengths_do_not_matter(scans, scale):
     scaled[:3, 3] *= scale
     found = tofuse.register(source * scale, target * scale)
     assert off(found.T_target_source, scaled, source * scale)[0] < 0.02 * scale
-    assert found.accepted
+    assert found.believed
 
 
 def test_views_that_share_nothing_are_rejected(scans, frames):
@@ -299,14 +299,14 @@ def test_views_that_share_nothing_are_rejected(scans, frames):
             found = tofuse.register(source, target)
         except tofuse.RegistrationError:
             continue
-        assert found.accepted is False
+        assert found.believed is False
         assert found.reason
 
 
 def test_a_corridor_that_fits_in_several_ways_is_rejected():
     """Two parallel walls and a floor: along them nothing tells where."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
-    assert found.accepted is False
+    assert found.believed is False
     assert "degenerate" in found.reason
     assert len(found.unobservable) >= 1
 
@@ -315,7 +315,7 @@ def test_a_corridor_that_fits_in_several_ways_is_rejected():
 def test_other_units_are_named(scans, scale):
     source, target, _ = scans
     found = tofuse.register(source * scale, target)
-    assert found.accepted is False
+    assert found.believed is False
     assert f"{1 / scale:g} times as large" in found.reason
     assert "unit" in found.reason
 
@@ -363,14 +363,14 @@ def test_lines_planes_and_points_get_an_honest_answer():
             found = tofuse.register(points, points)
         except tofuse.TofuseError:
             continue
-        assert found.accepted is False
+        assert found.believed is False
 
 
 def test_an_image_and_a_cloud_and_a_wide_image(frames):
     target, source, true = frames
     found = tofuse.register(source, CloudFrame.of(target.points))
     assert off(found.T_target_source, true, source.points)[0] < 0.05
-    assert found.accepted
+    assert found.believed
 
 
 def test_registration_between_other_frames():

@@ -47,7 +47,7 @@ def test_a_pair_far_apart_is_found_and_accepted(far):
     metres, degrees = error(far.T_target_source)
     assert metres < 0.02
     assert degrees < 0.5
-    assert far.accepted
+    assert far.believed
     assert far.probability >= ACCEPTED
     assert far.reason == ""
     assert far.margin > 0.1
@@ -81,7 +81,7 @@ def test_a_camera_on_its_side_is_found(quarters):
     metres, degrees = error(found.T_target_source @ roll, se3.inverse(A) @ at(-0.3, 0.4, 0.4))
     assert metres < 0.02
     assert degrees < 0.5
-    assert found.accepted
+    assert found.believed
 
 
 def test_views_of_different_rooms_are_rejected(pair):
@@ -89,7 +89,7 @@ def test_views_of_different_rooms_are_rejected(pair):
         half = (3.4, 1.6, 2.9)
         other = seen(at(0.8, -1.0, 2.4 + k), 7, half=half, boxes=boxes, scene=11 + k)
         found = tofuse.register(other, pair[1])
-        assert not found.accepted
+        assert not found.believed
         assert found.probability < ACCEPTED
         assert found.reason
 
@@ -97,7 +97,7 @@ def test_views_of_different_rooms_are_rejected(pair):
 def test_views_of_one_room_that_share_nothing_are_rejected(pair):
     away = seen(at(-0.4, 0.3, 0.1 + np.pi), 5)
     found = tofuse.register(away, pair[1])
-    assert not found.accepted
+    assert not found.believed
     assert found.probability < ACCEPTED
 
 
@@ -114,7 +114,7 @@ def test_a_flat_wall_is_degenerate_and_says_so():
     found = tofuse.register(wall(T, 1), wall(np.eye(4), 0))
     assert len(found.unobservable) == 3
     np.testing.assert_allclose(np.linalg.norm(found.unobservable, axis=1), 1)
-    assert not found.accepted
+    assert not found.believed
     assert "3 directions are degenerate" in found.reason
 
 
@@ -123,7 +123,7 @@ def test_what_a_wall_does_not_hold_stays_as_guessed():
     guess = T @ se3.exp([0, 0, 0.04, 0.02, 0.02, 0])
     found = tofuse.register(wall(T, 1), wall(np.eye(4), 0), guess=guess)
     assert len(found.unobservable) == 3
-    assert not found.accepted
+    assert not found.believed
     # Along the wall's normal it is found, across as guessed.
     gap = found.T_target_source @ se3.inverse(T)
     normal_error = gap[2, 3] + (gap[2, :3] - [0, 0, 1]) @ [0, 0, 2]
@@ -137,7 +137,7 @@ def test_a_room_that_repeats_fits_in_several_ways():
     room = {"half": (9.0, 1.1, 1.8), "boxes": posts, "spots": 0}
     source, target = (seen(at(x, -0.6, 0.0), k, **room) for k, x in enumerate((0.3, -0.6)))
     found = tofuse.register(source, target)
-    assert not found.accepted
+    assert not found.believed
     assert found.margin < 0.1
     metres, degrees = error(found.runner_up, found.T_target_source)
     assert metres > 0.05 or degrees > 4.9
@@ -149,21 +149,21 @@ def test_a_good_guess_is_followed_without_a_search(pair):
     true = se3.exp([0.1, 0.02, -0.05, 0.02, 0.1, 0.0])
     found = tofuse.register(near, pair[1], guess=true @ se3.exp([0.02, 0, 0.02, 0, 0.03, 0]))
     assert found.margin is None  # nothing was compared with it
-    assert found.accepted
+    assert found.believed
     assert error(found.T_target_source, true)[0] < 0.01
 
 
 def test_a_wrong_guess_is_not_trusted(pair, far):
     for wrong in ([0.8, 0, -0.5, 0, 0.6, 0], [0, 0.6, 0, 0.4, 0, 0.3]):
         found = tofuse.register(*pair, guess=se3.exp(wrong))
-        assert found.accepted
+        assert found.believed
         assert error(found.T_target_source, far.T_target_source)[0] < 0.02
 
 
 def test_a_small_scene_is_registered_as_a_large_one(pair, far):
     small = [replace(f, depth=f.depth * np.float32(0.25)) for f in pair]
     found = tofuse.register(*small)
-    assert found.accepted
+    assert found.believed
     gap = se3.inverse(far.T_target_source) @ found.T_target_source
     np.testing.assert_allclose(
         found.T_target_source[:3, 3], 0.25 * far.T_target_source[:3, 3], atol=0.01
@@ -198,7 +198,7 @@ def test_equal_depths_are_rejected(pair):
     flat = replace(pair[0], depth=np.full_like(pair[0].depth, 1.5), amplitude_image=None)
     for views in ((flat, flat), (flat, pair[1])):
         found = tofuse.register(*views)
-        assert not found.accepted
+        assert not found.believed
         assert found.reason
 
 
@@ -212,13 +212,13 @@ def test_few_pixels_are_registered_but_rejected(pair):
     depth = np.where(np.arange(pair[0].depth.size) % 97 == 0, pair[0].depth.ravel(), 0)
     sparse = replace(pair[0], depth=depth.reshape(pair[0].depth.shape))
     found = tofuse.register(sparse, pair[1], guess=TRUE)
-    assert found.accepted is False
+    assert found.believed is False
     assert "1 direction is degenerate" in found.reason
 
 
 def test_other_methods_do_not_say(pair):
     found = tofuse.register(*pair, guess=TRUE, method=CoarseToFine())
-    assert found.accepted is None
+    assert found.believed is None
     assert found.probability is None
     assert found.reason == ""
 
@@ -290,7 +290,7 @@ def test_a_square_room_without_furniture_is_rejected():
     bare = {"boxes": (), "spots": 0, "half": (1.8, 1.1, 1.8)}
     views = [surface(seen(at(0, 0, yaw), k, **bare)) for k, yaw in enumerate((0.0, np.pi / 4))]
     found = register_pair(views[1], views[0])
-    assert not found.accepted
+    assert not found.believed
     assert "another pose" in found.reason
 
 
@@ -326,5 +326,5 @@ def test_a_search_and_an_alignment_that_agree_need_nothing_else(pair):
         (False, 0.6, False),
         (True, 0.4, False),
     ):
-        made = replace(near, accepted=False, confirmed=confirmed, probability=probability)
+        made = replace(near, believed=False, confirmed=confirmed, probability=probability)
         assert made.stands_alone == alone

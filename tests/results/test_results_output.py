@@ -207,7 +207,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
     assert data["frames"][0]["unobservable"] == [[1.0] * 6] * 2
     assert data["frames"][0]["rms_m"] == 0.25
     lost = data["frames"][1]
-    assert (lost["inlier_ratio"], lost["rms_m"], lost["covariance"]) == (None, None, None)
+    assert (lost["inlier_share"], lost["rms_m"], lost["covariance"]) == (None, None, None)
     assert lost["unobservable"] == []
     assert data["filters"] == {"median": {"removed": 0.25}}
 

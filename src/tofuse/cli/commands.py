@@ -240,7 +240,7 @@ def register(arguments: argparse.Namespace) -> int:
         return exit_status(result)
     console = make_console()
     head, tail = decision(result)
-    color = _STATUS_COLORS[result.found.accepted]
+    color = _STATUS_COLORS[result.found.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
     for line in registering.text(result):
         console.print(line, markup=False)
@@ -660,7 +660,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         m = data["map_consistency"]
         value = "no two images overlap enough"
         if m["rms_m"] is not None:
-            value = f"{m['rms_m']:.5f} m rms, {m['inlier_ratio']:.4f} inliers, {m['pairs']} pairs"
+            value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
     make_console().print(table)
     return 0

@@ -77,7 +77,7 @@ class Health:
         elif record.status == "predicted":
             self._words, self._color = "predicting", "yellow"
         else:
-            inliers = record.inlier_ratio
+            inliers = record.inlier_share
             self._words = "tracking" if inliers is None else f"{inliers:.0%} inliers"
             self._color = "green" if inliers is None or inliers >= _GOOD_FRACTION else "yellow"
 
@@ -189,7 +189,7 @@ class JsonProgress(Silent):
                 "index": record.index,
                 "status": record.status,
                 "reason": record.reason,
-                "inlier_ratio": _rounded(record.inlier_ratio, 4),
+                "inlier_share": _rounded(record.inlier_share, 4),
                 "done": self._pace.done,
                 "total": self._pace.total,
                 "per_second": _rounded(self._pace.per_second, 3),

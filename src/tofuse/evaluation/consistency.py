@@ -125,7 +125,7 @@ class Consistency:
         """Return the pooled figures as plain data; None instead of NaN."""
         return {
             "rms_m": _known(self.rms_m),
-            "inlier_ratio": _known(self.inlier_ratio),
+            "inlier_share": _known(self.inlier_ratio),
             "pairs": self.pairs,
             "frames": self.frames,
         }

@@ -207,7 +207,7 @@ class _Registered:
 
     @property
     def accepted(self) -> bool:
-        return bool(self.registration.accepted)
+        return bool(self.registration.believed)
 
     @property
     def needs_no_search(self) -> bool:

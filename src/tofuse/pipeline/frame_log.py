@@ -59,8 +59,8 @@ def record_of(frame: Frame, step: Step) -> FrameRecord:
         frame.timestamp,
         step.status,
         step.reason,
-        valid_fraction=len(frame) / frame.valid.size if frame.valid.size else 0.0,
-        inlier_ratio=None if r is None else r.inlier_ratio,
+        valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
+        inlier_share=None if r is None else r.inlier_ratio,
         rms_m=None if r is None else r.rms_m,
         unobservable=np.zeros((0, 6)) if r is None else r.unobservable,
     )

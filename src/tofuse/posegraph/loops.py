@@ -193,7 +193,7 @@ class Confirmation(Bounded):
 
         A method that verifies its pose itself (`accepted`) decides.
         """
-        if registration.accepted is not None:
+        if registration.believed is not None:
             return registration.reason
         if registration.correspondences == 0 or registration.inlier_ratio < self.min_fraction:
             return (
@@ -229,7 +229,7 @@ class Confirmation(Bounded):
                 found.append(self._register(source, target, start, seed))
             except RegistrationError as error:
                 failure = failure or str(error)
-            if found and found[-1].accepted is not None:
+            if found and found[-1].believed is not None:
                 break  # it searched for rival poses itself
         if not found:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))

@@ -453,7 +453,7 @@ class _RevisitLoops(Loops):
             return f"only {made.overlap:.0%} of the points project into the other view"
         if len(made.unobservable) > _MAX_DEGENERATE:
             return f"{len(made.unobservable)} directions are degenerate"
-        return "" if made.accepted else made.reason
+        return "" if made.believed else made.reason
 
 
 def register_near(

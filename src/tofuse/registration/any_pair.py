@@ -67,7 +67,7 @@ class AnyPair(Registrar):
         seen = _registered_as_images(source, target, guess, proposals, search=searches)
         if seen is not None and are_images:
             return seen
-        if seen is not None and seen.accepted:
+        if seen is not None and seen.believed:
             return measured_as_clouds(source, target, seen, rng)
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)

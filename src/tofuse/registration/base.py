@@ -45,7 +45,7 @@ class Registration:
     margin
         Score of the pose minus that of its best rival, as a fraction of the points, for methods
         that search; None for those that follow a guess.
-    accepted
+    believed
         Whether the pose is verified; None for methods that don't verify. `converged` does not imply
         it: iterations converge at wrong poses too.
     probability
@@ -78,7 +78,7 @@ class Registration:
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     errors: tuple[float, ...] = ()
     margin: float | None = None
-    accepted: bool | None = None
+    believed: bool | None = None
     probability: float | None = None
     reason: str = ""
     runner_up: Float64 | None = None
@@ -89,7 +89,7 @@ class Registration:
     confirmed: bool = False
 
     def __repr__(self) -> str:
-        decided = {True: "accepted", False: "rejected", None: "not verified"}[self.accepted]
+        decided = {True: "accepted", False: "rejected", None: "not verified"}[self.believed]
         t, w = self.T_target_source[:3, 3], se3.so3_log(self.T_target_source[:3, :3])
         return (
             f"Registration: {decided}, translation {np.linalg.norm(t):.4f} m, "
@@ -113,7 +113,7 @@ class Registration:
 
         It is accepted, or a search and an alignment agree on a probable pose.
         """
-        return bool(self.accepted) or (self.is_probable and self.confirmed)
+        return bool(self.believed) or (self.is_probable and self.confirmed)
 
     @property
     def how(self) -> str:

@@ -165,7 +165,7 @@ def register_clouds(
         found = _registered_scaled(source, target, scale, rng)
         if found is not None:
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
-            return replace(found, accepted=False, reason=reason)
+            return replace(found, believed=False, reason=reason)
     try:
         return _registered(source, target, guess, rng, seen, always_search=always_search)
     except RegistrationError as error:
@@ -231,7 +231,7 @@ def _registered_scaled(
         found = _registered(scaled, target, None, rng)
     except RegistrationError:
         return None
-    return found if found.accepted else None
+    return found if found.believed else None
 
 
 def measured_as_clouds(
@@ -349,7 +349,7 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     return replace(
         found,
         margin=lead,
-        accepted=not reason,
+        believed=not reason,
         probability=evidence.probability,
         reason=reason,
         runner_up=None if rival is None or rival is _NOWHERE else rival.T_target_source,

@@ -50,12 +50,12 @@ def register(
 
     Returns
     -------
-    `T_target_source` maps points of the source into the target's frame, m. `accepted` states
+    `T_target_source` maps points of the source into the target's frame, m. `believed` states
     whether the pose is verified, `probability` how probably it is right (images: within 5 % of the
     depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is rejected: too
     little support or too little lead over `runner_up`, contradiction, degenerate directions.
     `converged` implies none of that. Degenerate directions (three on a flat wall) are in
-    `unobservable`, and keep the guess. A `method` without verification leaves `accepted` None.
+    `unobservable`, and keep the guess. A `method` without verification leaves `believed` None.
 
     Raises
     ------

@@ -134,7 +134,7 @@ def register_pair(
     if prepared is None or match is None:
         return None
     found = pair.chosen(near, match, prepared, guess is not None)
-    if found.accepted or proposals is None:
+    if found.believed or proposals is None:
         return found
     return pair.chosen(near, prepared.among(proposals(), match), prepared, guess is not None)
 
@@ -280,7 +280,7 @@ class _Pair:
         return replace(
             found,
             margin=evidence.margin,
-            accepted=not reason,
+            believed=not reason,
             probability=evidence.probability,
             reason=reason,
             runner_up=None if rival is None else rival.T_target_source,

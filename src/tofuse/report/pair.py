@@ -50,7 +50,7 @@ def render_pair(result: PairResult) -> str:
         version=__version__,
         style=asset("style.css"),
         script=script(),
-        tone=_TONES[result.found.accepted],
+        tone=_TONES[result.found.believed],
         head=head,
         tail=tail,
         facts=_facts(result, scene),

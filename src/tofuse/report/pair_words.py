@@ -17,9 +17,9 @@ def decision(result: PairResult) -> tuple[str, str]:
     """Return whether the pose is accepted, and the rest of the sentence."""
     found = result.found
     chance = "" if found.probability is None else f"probability {_chance(found.probability)}"
-    if found.accepted:
+    if found.believed:
         return "Accepted", chance
-    if found.accepted is None:
+    if found.believed is None:
         return "Not verified", "; ".join(
             text for text in (chance, found.reason or "the method can't verify its result") if text
         )
@@ -91,7 +91,7 @@ def sigma(result: PairResult) -> str:
 def sigma_note(result: PairResult) -> str:
     """Return an explanation of `sigma`."""
     note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
-    if result.found.accepted is None:
+    if result.found.believed is None:
         note += "; from point noise only, usually too small"
     return note
 

@@ -63,7 +63,7 @@ def frames(s: Subject) -> Values:
     bad = index[[r.status in ("lost", "skipped") for r in records]]
     if len(bad):
         out["health_legend"] = [("bad", "x", "lost or skipped")]
-    share = np.array([np.nan if r.inlier_ratio is None else r.inlier_ratio for r in records], float)
+    share = np.array([np.nan if r.inlier_share is None else r.inlier_share for r in records], float)
     rms = np.array([np.nan if r.rms_m is None else r.rms_m for r in records], float)
     for values, scale, ylabel, label in (
         (share, 100.0, "inliers, %", "Inliers over frames"),
@@ -89,8 +89,8 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
     parts = [f"Frame {record.index}: {record.status}"]
     if record.reason:
         parts[0] += f" – {record.reason}"
-    if record.inlier_ratio is not None:
-        parts.append(f"{words.share(record.inlier_ratio)} inliers")
+    if record.inlier_share is not None:
+        parts.append(f"{words.share(record.inlier_share)} inliers")
     if record.rms_m is not None:
         parts.append(f"rms residual {words.length(record.rms_m)}")
     if len(record.unobservable):

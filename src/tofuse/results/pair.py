@@ -202,7 +202,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "target": _view_json(result.target),
             "guess": result.guess,
             "T_target_source": result.T_target_source,
-            "accepted": found.accepted,
+            "believed": found.believed,
             "probability": found.probability,
             "reason": found.reason,
             "converged": found.converged,

@@ -62,9 +62,9 @@ class FrameRecord:
         "tracked", "predicted", "lost" (no pose) or "skipped" (unreadable).
     reason
         Why it was not tracked; may be empty.
-    valid_fraction
+    valid_share
         Fraction of its pixels that are valid after filtering, 0 to 1.
-    inlier_ratio
+    inlier_share
         Fraction of its points with a correspondence, 0 to 1.
     rms_m
         Rms residual of the correspondences, m.
@@ -80,8 +80,8 @@ class FrameRecord:
     timestamp: float
     status: Status
     reason: str = ""
-    valid_fraction: float | None = None
-    inlier_ratio: float | None = None
+    valid_share: float | None = None
+    inlier_share: float | None = None
     rms_m: float | None = None
     covariance: Float64 | None = None
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
