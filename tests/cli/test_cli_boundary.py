@@ -33,7 +33,7 @@ CHOSEN = (
     "no threads",
     "files of 20 kB at most",
     "all closed",
-    "lines to a full disk",
+    "JSON lines to a full disk",
     "a reader that leaves",
     "Windows-1252",
     "a name in ASCII streams",
