@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test lint docs format lock audit sbom clean
+.PHONY: help demo test lint docs gallery format lock audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -27,15 +27,14 @@ lint: .venv/.ready          ## formatting, style, strict types, and who may impo
 	$(BIN)/lint-imports
 	$(BIN)/python requirements/check.py
 
-# Pictures of the gallery are of results of this code: made again where it changed.
-docs/gallery/index.md: .venv/.ready $(wildcard website/*.py) $(shell find src -name '*.py')
+gallery: .venv/.ready       ## simulate, reconstruct and draw the gallery of the documentation anew, some minutes
 	$(BIN)/python website/gallery.py
 
 .venv/.docs-ready: requirements/docs.txt .venv/.ready
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/docs.txt
 	@touch $@
 
-docs: .venv/.docs-ready docs/gallery/index.md  ## the documentation site, in build/site/
+docs: .venv/.docs-ready     ## the documentation site, in build/site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 format: .venv/.ready        ## put the code into its standard form

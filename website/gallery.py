@@ -3,7 +3,7 @@
     python website/gallery.py [DIR]        default: docs/gallery
 
 Simulates the recordings, reconstructs them, draws the results, and writes the page with the
-verdicts and errors that it just saw. Nothing on that page is written by hand but the captions.
+verdicts and errors of these runs. Only the captions are written by hand.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Made:
-    """A recording to simulate; `camera_file` is what is then changed in its camera.json."""
+    """A recording to simulate, and the wrong values that are written into its camera.json."""
 
     scene: str
     texture: bool = True
@@ -68,16 +68,16 @@ RESULTS = (
     ),
     Exhibit(
         "torso", "A mannequin's torso", Made("torso"), {"object": True, "max_depth": 2.2},
-        "Smooth and round, so that geometry alone lets it spin about its axis: the pattern of its"
-        " surface holds it.",
+        "Smooth and nearly rotationally symmetric: geometry alone does not constrain the rotation"
+        " about its axis, the albedo of its surface does.",
     ),
 )  # fmt: skip
 FAILURES = (
     Exhibit(
         "uniform", "An empty room without any texture", Made("empty-room", texture=False), {},
-        "Four plain walls look alike from everywhere. What the walls do not hold is"
-        " predicted from the motion before, and the verdict names those frames. Put something"
-        " into the scene, or hang a poster on the wall.",
+        "Plain walls of one albedo do not constrain the motion along them. It is extrapolated in"
+        " these directions, and the verdict names the frames. Put objects into the scene, or hang a"
+        " poster on the wall.",
     ),
     Exhibit(
         "thesis", "The same furnished room by the method of 2010", _ROOM, {"method": "thesis"},
@@ -86,19 +86,20 @@ FAILURES = (
     ),
     Exhibit(
         "steps", "Too few frames", _ROOM, {"every": 16},
-        "Every 16th frame of the turn: neighbours hardly see the same things. Frames that could"
-        " not be placed carry no pose instead of a wrong one. Move slower, or keep more frames.",
+        "Every 16th frame of the turn: consecutive frames hardly overlap. Frames that can't be"
+        " registered get no pose instead of a wrong one. Move more slowly, or keep more frames.",
     ),
     Exhibit(
-        "range", "Radial range taken for z", Made("room", camera_file={"depth_kind": "z"}), {},
-        "`depth_kind` in `camera.json` says *z*, but the camera measured along the rays: every"
-        " wall bulges towards its edges. `tofuse inspect` measures that.",
+        "range", "Depth taken for radial range", Made("room", camera_file={"depth_kind": "range"}),
+        {},
+        "`depth_kind` in `camera.json` says *range*, but the images contain z: walls are"
+        " concave. `tofuse inspect` measures that.",
     ),
     Exhibit(
         "unit", "A depth unit ten times too large",
         Made("room", camera_file={"depth_unit_m": 0.001}), {},
-        "The model has the right shape and the wrong size, so nothing in it disagrees: only what"
-        " is known of rooms and cameras speaks against it.",
+        "The model has the right shape and the wrong size, and is consistent. Only the typical"
+        " size of rooms and the ambiguity range of the camera reveal the error.",
     ),
 )  # fmt: skip
 
@@ -131,11 +132,11 @@ def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
     yield f"{exhibit.caption}\n"
     yield (
         f"Verdict: **{told['verdict']}**; {posed} of {len(told['frames'])} frames have a pose;"
-        f" error against the exact path {1000 * error.ate_rms_m:.1f} mm and"
+        f" error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
         f" {np.degrees(error.rotation_rms_rad):.2f} degrees."
     )
     if told["reasons"]:
-        yield "\nWhat the verdict gives as reasons:\n"
+        yield "\nReasons of the verdict, and notes:\n"
         yield from (f"- `{r['code']}`: {r['text']}" for r in told["reasons"])
     yield ""
 
@@ -148,7 +149,10 @@ def exhibit_lines(exhibit: Exhibit, recordings: Path, out: Path) -> Iterator[str
     as_made = camera.read_text()
     result = recordings / f"result-{exhibit.name}"
     try:
-        camera.write_text(json.dumps({**json.loads(as_made), **exhibit.made.camera_file}))
+        stated = json.loads(as_made)
+        if any(stated.get(key) == value for key, value in exhibit.made.camera_file.items()):
+            raise ValueError(f"{exhibit.name}: camera.json is no different from the correct one")
+        camera.write_text(json.dumps({**stated, **exhibit.made.camera_file}))
         run([recording], Options(out=result, **exhibit.options))  # type: ignore[arg-type]
     finally:
         camera.write_text(as_made)
@@ -163,15 +167,16 @@ def main() -> None:
     out.mkdir(parents=True)
     page = [
         "# Gallery\n",
-        "Made by the build of this page from simulated recordings of an SR4000 with all its errors"
+        "Drawn by `make gallery` from simulated recordings of an SR4000 with all its errors"
         " (noise, mixed pixels, multipath, wiggling, scatter, motion). Rooms are seen from above,"
-        " without the surfaces that show their back. Orange: the path found; white: the exact one.",
+        " without the surfaces that show their back. Orange: the estimated path; white: the ground"
+        " truth.",
         "\n## Results\n",
     ]
     with tempfile.TemporaryDirectory() as folder:
         for exhibit in RESULTS:
             page += exhibit_lines(exhibit, Path(folder), out)
-        page.append("## Failures, and how they are told\n")
+        page.append("## Failures, and how they are reported\n")
         for exhibit in FAILURES:
             page += exhibit_lines(exhibit, Path(folder), out)
     (out / "index.md").write_text("\n".join(page), encoding="utf-8")
