@@ -232,7 +232,11 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "unknown method": ((*RUN, "--method", "magic"), ("--method", "'magic'", "thesis"), "tofuse: "),
     "unknown format": ((*RUN, "--format", "magic"), ("--format", "'magic'", "native"), "tofuse: "),
     "wrong format": ((*RUN, "--format", "tum"), ("REC",), "tofuse: "),
-    "nothing selected": ((*RUN, "--start", "9"), ("REC", "selection leaves none", "--start"), "tofuse: "),
+    "nothing selected": (
+        (*RUN, "--start", "9"),
+        ("REC", "selection leaves none", "--start"),
+        "tofuse: ",
+    ),
     "end before start": ((*RUN, "--start", "2", "--end", "1"), ("REC", "--end"), "tofuse: "),
     "no odometry": ((*RUN, "--guess", "odometry"), ("--guess", "odometry.txt"), "tofuse: "),
     "no config": ((*RUN, "--config", "none.toml"), ("none.toml",), "tofuse: "),
