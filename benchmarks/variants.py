@@ -30,6 +30,7 @@ import numpy as np
 
 import scoring
 import sequences
+import stress
 import unusual
 from recorded import RECORDED
 from tofuse.arrays import Float64, Intp
@@ -39,57 +40,52 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve, with_findings
-from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.frames import IMAGES, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
-IMAGES = (
-    "depth",
-    "amplitude_image",
-    "confidence_image",
-    "color_image",
-    "sigma_image",
-    "shared_sigma_image",
-    "normal_image",
-)
 SEED = 7
 MOST_FRAMES = 100
 PLACED_SHARE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class Take:
-    """Frames in memory, and their poses (N, 4, 4) T_world_camera; NaN where unknown."""
+class Take(stress.Take):
+    """Frames of a recording in memory, with poses NaN where unknown; its path and format."""
 
-    frames: tuple[RangeFrame, ...]
-    poses: Float64
-    recording: Recording
+    path: str
+    format: str
 
     def at(self, order: Sequence[int] | Intp) -> Take:
         """Return frames in another order, with their times where these ascend."""
-        order = np.asarray(order, int)
-        frames = [self.frames[k] for k in order]
-        times = np.array([frame.timestamp for frame in frames])
+        taken = super().at(np.asarray(order, int))
+        times = np.array([frame.timestamp for frame in taken.frames])
         if (np.diff(times) <= 0).any():
             steps = np.abs(np.diff(times))
             steps[steps == 0] = self.step_s
             times = np.concatenate([[0.0], np.cumsum(steps)])
-        frames = [replace(f, timestamp=float(t)) for f, t in zip(frames, times, strict=True)]
-        return replace(self, frames=tuple(frames), poses=self.poses[order])
+        timed = zip(taken.frames, times, strict=True)
+        return replace(
+            self, frames=tuple(replace(f, timestamp=float(t)) for f, t in timed), poses=taken.poses
+        )
 
     def each(self, change: Callable[[RangeFrame], RangeFrame]) -> Take:
         """Return the take with changed frames."""
         return replace(self, frames=tuple(change(frame) for frame in self.frames))
 
-    @property
-    def step_s(self) -> float:
-        """Median time between frames."""
-        return float(np.median(np.diff([frame.timestamp for frame in self.frames])))
-
     def as_recording(self) -> Recording:
         """Return the take as a recording of the original's camera."""
         frames = [replace(frame, index=k) for k, frame in enumerate(self.frames)]
-        source = ArraySource(frames, metadata=dict(self.recording.metadata))
-        return Recording.of(source, self.recording.path, self.recording.format)
+        return Recording.of(ArraySource(frames, metadata=self.metadata), self.path, self.format)
+
+
+def take_of(recording: Recording, poses: Float64 | None = None) -> Take:
+    """Read a recording into memory; its poses (N, 4, 4) are unknown unless given."""
+    frames = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
+    unknown = np.full((len(frames), 4, 4), np.nan)
+    metadata = dict(recording.metadata)
+    return Take(
+        frames, unknown if poses is None else poses, metadata, recording.path, recording.format
+    )
 
 
 # ---- Changes of images ---------------------------------------------------------------------------
@@ -309,8 +305,7 @@ def load(name: str, data: Path, most: int) -> Take:
     """Read up to so many frames of a recording into memory."""
     recording = RECORDED[name].open(data)
     recording = replace(recording, indices=recording.indices[:most])
-    frames = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
-    return Take(frames, np.full((len(frames), 4, 4), np.nan), recording)
+    return take_of(recording)
 
 
 def line(name: str, take: Take, outcome: Outcome, bound_m: float) -> str:
@@ -367,10 +362,7 @@ def rows(name: str, options: argparse.Namespace) -> Iterator[str]:
 def simulated(name: str, seed: int, threads: int) -> str:
     """Return the row of a simulated recording, compared with the truth."""
     recording = unusual.record(unusual.UNUSUAL[name], seed)
-    frames = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
-    poses = recording.reference
-    assert poses is not None
-    take = Take(frames, poses, recording)
+    take = take_of(recording, recording.reference)
     return line(f"{name}, {seed}", take, run(take.as_recording(), threads), 0.0)
 
 

@@ -33,10 +33,10 @@ class Bounds:
         if self.low == -math.inf and self.high == math.inf:
             return "a finite number"
         if self.high == math.inf:
-            return f"above {self.low:g}" if self.exclusive else f"{self.low:g} or more"
+            return f"above {self.low:.10g}" if self.exclusive else f"{self.low:.10g} or more"
         if self.exclusive:
-            return f"between {self.low:g} and {self.high:g}"
-        return f"{self.low:g} to {self.high:g}"
+            return f"between {self.low:.10g} and {self.high:.10g}"
+        return f"{self.low:.10g} to {self.high:.10g}"
 
 
 class Bounded:

@@ -105,7 +105,7 @@ FORGED: dict[str, tuple[str, Callable[[Any], None], str]] = {
     "an option out of its bounds": (
         "tracking",
         lambda t: put(t.mapper.config, "memory_mb", -1),
-        "memory_mb must be 500 to 1e+07",
+        "memory_mb must be 500 to 10000000",
     ),
 }
 

@@ -109,16 +109,11 @@ class Result(Reconstruction):
         from tofuse.viewer.view_file import write_report_and_view
 
         if self.source is not None:
-            config = self.fitted or adapted(self._configuration(self.source), self.source)
+            config = self.fitted or adapted(_configuration(self.config, self.source), self.source)
             write_report_files(self.source, config, result, folder)
             return
         title = Path(str(result.recording["path"])).name
         write_report_and_view(result, folder, ReportExtras(title))
-
-    def _configuration(self, source: Recording) -> Config:
-        method = self.config["method"]
-        config = from_method(method, view_kind(source))
-        return changed(config, self.config, where="the result's configuration")
 
     def evaluate(
         self,

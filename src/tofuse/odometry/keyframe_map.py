@@ -102,9 +102,8 @@ class KeyframeMap:
         others = [k for k in self._keyframes if k.component != component]
         if not others:
             return None
-        far = dissimilarity(
-            view_descriptor(view), np.stack([k.descriptor for k in others]), _MAX_SHIFT
-        )
+        descriptors = np.stack([k.descriptor for k in others])
+        far = dissimilarity(view_descriptor(view), descriptors, _MAX_SHIFT)
         return others[int(np.flatnonzero(far == far.min())[-1])]
 
     def _most_redundant(self) -> int:

@@ -110,10 +110,9 @@ class Appearance:
             a, b = int(i[k]), int(j[k])
             between = np.unique(np.linspace(a + 1, b - 1, min(b - a - 1, _BETWEEN)).round())
             some = descriptors[between.astype(np.intp)]
-            left = dissimilarity(descriptors[a], some, self.shift) >= self.min_difference
-            if (
-                left & (dissimilarity(descriptors[b], some, self.shift) >= self.min_difference)
-            ).any():
+            from_a = dissimilarity(descriptors[a], some, self.shift)
+            from_b = dissimilarity(descriptors[b], some, self.shift)
+            if (np.minimum(from_a, from_b) >= self.min_difference).any():
                 found.append((float(far[k]), a, b))
         return found
 

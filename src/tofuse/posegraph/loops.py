@@ -191,7 +191,7 @@ class Confirmation(Bounded):
     def objection(self, registration: Registration) -> str:
         """Return why a registration is rejected; empty if it is accepted.
 
-        A method that verifies its pose itself (`accepted`) decides.
+        A method that verifies its pose itself (`believed`) decides.
         """
         if registration.believed is not None:
             return registration.reason

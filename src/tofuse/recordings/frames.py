@@ -77,6 +77,18 @@ class View(Protocol):
         ...
 
 
+# Names of all images of a `RangeFrame`, which have one size.
+IMAGES = (
+    "depth",
+    "amplitude_image",
+    "confidence_image",
+    "color_image",
+    "sigma_image",
+    "shared_sigma_image",
+    "normal_image",
+)
+
+
 @dataclass(frozen=True, eq=False)
 class RangeFrame:
     """One image of a depth camera.
@@ -138,14 +150,7 @@ class RangeFrame:
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
-        for name in (
-            "depth",
-            "amplitude_image",
-            "confidence_image",
-            "color_image",
-            "sigma_image",
-            "shared_sigma_image",
-        ):
+        for name in IMAGES:
             image = getattr(self, name)
             if image is not None and image.shape[:2] != shape:
                 raise InputError(
