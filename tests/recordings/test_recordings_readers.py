@@ -22,11 +22,13 @@ from made_recordings import (
 )
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.images import write_png
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.geometry.se3 import exp
 from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.noise import family_of
 from tofuse.recordings.open import open_recording
 
 
@@ -110,6 +112,10 @@ def test_tum_asks_for_the_camera_of_an_unknown_name(tmp_path: Path) -> None:
     assert isinstance(frame, RangeFrame)
     assert frame.camera == Pinhole(640, 480, 481.2, 480.0, 319.5, 239.5)
     assert frame.depth_kind == "range"
+    camera |= {"sensor": "ifm O3R222"}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    recording = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")
+    assert family_of(recording, frame) == "ifm-o3r"
 
 
 @pytest.mark.parametrize(
@@ -148,6 +154,19 @@ def test_7scenes(tmp_path: Path) -> None:
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
     assert frame.color_image is None
     assert "only 2 of 3 frames have colour" in recording.warnings[0]
+
+
+def test_7scenes_of_another_camera(tmp_path: Path) -> None:
+    for k in range(2):
+        write_png(tmp_path / f"frame-{k:06d}.depth.png", COUNTS[0][:240, :320])
+    with pytest.raises(InputError, match="640 x 480"):
+        open_recording(tmp_path)
+    (tmp_path / "camera-intrinsics.txt").write_text("270 0 161\n0 271 118\n0 0 1\n")
+    recording = open_recording(tmp_path)
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(320, 240, 270.0, 271.0, 161.0, 118.0)
+    assert family_of(recording, frame) == "unknown"
 
 
 @pytest.mark.parametrize("color", ["color", "image", "rgb"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,19 @@ def _check_whole(data: bytes, path: str | Path) -> None:
             return
         at = end
     raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image with a readable header."""
+    error: InputError | None = None
+    for path in files:
+        try:
+            header = read_header(path)
+        except InputError as trouble:
+            error = error or trouble
+            continue
+        return header.width, header.height
+    raise error or InputError("has no images", where="depth", remedy="check the recording")
 
 
 def read_image(

@@ -31,6 +31,8 @@ class DepthImageSource(FileSource):
         None, or one image per frame, None where there is none.
     color_registered
         Whether colour is registered to depth.
+    sensor
+        Name of the camera, unless `options` has a camera.json that names it; empty if unknown.
     options
         Of the reader.
 
@@ -51,6 +53,7 @@ class DepthImageSource(FileSource):
         *,
         color: Sequence[Path | None] | None = None,
         color_registered: bool = True,
+        sensor: str = "",
         options: ReaderOptions | None = None,
     ) -> None:
         super().__init__(timestamps)
@@ -61,13 +64,15 @@ class DepthImageSource(FileSource):
         if options is not None and options.camera is not None:
             description, camera = load_camera(options.camera)
             depth_unit_m, kind = description.depth_unit_m, description.depth_kind
-            where = str(options.camera)
+            where, sensor = str(options.camera), description.sensor or sensor
         if camera is None:
             raise InputError(
                 "has no camera", where=self.files[0].parent, remedy="give one by --camera"
             )
         self.camera, self.depth_unit_m, self.depth_kind = camera, depth_unit_m, kind
         self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
+        if sensor:
+            self.metadata["sensor"] = sensor
         colored = sum(path is not None for path in self.color or ())
         if 0 < colored < len(self.files):
             self.warnings.append(f"only {colored} of {len(self.files)} frames have colour")

@@ -35,8 +35,6 @@ _SIZES = {
     (256, 192): "iphone",
     (192, 256): "iphone",
 }
-# Formats of a single camera family.
-_FORMATS = {"7scenes": "kinect1", "redwood": "kinect1", "tum": "kinect1"}
 _SAMPLED_FRAMES = 3
 _MAX_RATIO = 3.0  # of observed to predicted noise
 _NORMAL_MEDIAN = 0.6745
@@ -45,7 +43,7 @@ _NORMAL_MEDIAN = 0.6745
 def noise_model_for(recording: Recording) -> NoiseModel:
     """Choose the noise model of a recording.
 
-    A noise.json in its folder comes first, then the sensor's name, the format, and the size of the
+    A noise.json in its folder comes first, then the sensor's name, then the size of the
     images. Amplitude counts have no common unit: where the noise predicted from amplitude differs
     by more than a factor of three from that between neighbouring pixels, the amplitude law is
     rescaled by an unknown gain.
@@ -72,8 +70,6 @@ def family_of(recording: Recording, frame: RangeFrame | None) -> str:
     for words, family in _WORDS:
         if any(word in sensor for word in words):
             return family
-    if recording.format in _FORMATS:
-        return _FORMATS[recording.format]
     if frame is None:
         return "unknown"
     family = _SIZES.get((frame.camera.width, frame.camera.height), "unknown")

@@ -44,19 +44,6 @@ def lens(
         raise InputError(error.problem, where=where, remedy=error.remedy) from error
 
 
-def first_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Return (width, height) of the first image with a readable header."""
-    error: InputError | None = None
-    for path in files:
-        try:
-            header = read_header(path)
-        except InputError as trouble:
-            error = error or trouble
-            continue
-        return header.width, header.height
-    raise error or InputError("has no images", where="depth", remedy="check the recording")
-
-
 def refuse_replacement(options: ReaderOptions, name: str) -> None:
     """Raise InputError if a camera was given for the format `name`, which stores one per frame."""
     if options.camera is not None:

@@ -11,12 +11,12 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, is_file, is_folder, list_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.phones import first_size
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
@@ -61,9 +61,9 @@ class Kinect2:
             None if options.camera else _camera(path, first_size(files)),
             0.001,
             color=color if any(color) else None,
+            sensor="Kinect v2 (ToF)",
             options=options,
         )
-        source.metadata["sensor"] = "Kinect v2 (ToF)"
         source.warnings.append("no timestamps: frame numbers serve as seconds")
         return source
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
@@ -19,7 +20,6 @@ from tofuse.recordings.phones import (
     POSES_BY,
     PhoneSource,
     arkit_pose,
-    first_size,
     lens,
     refuse_replacement,
 )

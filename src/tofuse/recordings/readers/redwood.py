@@ -11,6 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry.cameras import Pinhole
@@ -20,7 +21,8 @@ from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
-PRIMESENSE = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
+PRIMESENSE = Pinhole(*SIZE, 525.0, 525.0, 319.5, 239.5)
 
 _COLOR_FOLDERS = ("color", "image", "rgb")
 _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
@@ -76,6 +78,8 @@ class Redwood:
             camera,
             0.001,
             color=_color_files(path, files, warnings),
+            # Open3D's recorders write this format with other cameras.
+            sensor=SENSOR if first_size(files) == SIZE else "",
             options=options,
         )
         source.warnings += warnings

@@ -11,6 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
@@ -19,7 +20,6 @@ from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
     arkit_pose,
-    first_size,
     lens,
     refuse_replacement,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -11,6 +12,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
@@ -21,7 +23,8 @@ from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
-DEFAULT_CAMERA = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)
+DEFAULT_CAMERA = Pinhole(*SIZE, 585.0, 585.0, 320.0, 240.0)
 
 _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
@@ -50,10 +53,12 @@ class SevenScenes:
         source = DepthImageSource(
             files,
             numbers / FRAME_RATE_HZ,
-            None if options.camera else _camera(path),
+            None if options.camera else _camera(path, files),
             0.001,
             color=color if complete else None,
             color_registered=False,
+            # Other programs write this format too, with other cameras.
+            sensor=SENSOR if first_size(files) == SIZE else "",
             options=options,
         )
         if color and not complete:
@@ -66,10 +71,7 @@ class SevenScenes:
         poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
         if np.isfinite(poses).any():
             source.reference = poses
-        source.metadata |= {
-            "sensor": "Kinect v1 (structured light)",
-            "frame_rate_hz": FRAME_RATE_HZ,
-        }
+        source.metadata["frame_rate_hz"] = FRAME_RATE_HZ
         return source
 
 
@@ -96,7 +98,7 @@ def _color(file: Path) -> Path | None:
     return None
 
 
-def _camera(folder: Path) -> Pinhole:
+def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
     path = folder / "camera-intrinsics.txt"
     if not is_file(path):
         return DEFAULT_CAMERA
@@ -104,4 +106,4 @@ def _camera(folder: Path) -> Pinhole:
     if K.shape != (3, 3):
         raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, (640, 480), {k: float(v) for k, v in values.items()}, path)
+    return checked_lens(Pinhole, first_size(files), {k: float(v) for k, v in values.items()}, path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_columns, read_numbers
 from tofuse.files.video import Video
@@ -19,7 +20,6 @@ from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
-    first_size,
     lens,
     refuse_replacement,
 )

@@ -21,6 +21,7 @@ from tofuse.recordings.sources import check_timestamps, tum_poses
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
+SENSOR = "Kinect v1 or Xtion (structured light)"  # of the benchmark
 
 # Of the colour cameras: depth is registered to colour (infrared ones nearly double errors).
 CAMERAS = {
@@ -72,11 +73,18 @@ class Tum:
                 warnings.append(
                     f"no depth image has a colour image within {COLOR_LIMIT_S} s: colour is ignored"
                 )
-        source = DepthImageSource(files, times, camera, DEPTH_UNIT_M, color=color, options=options)
+        source = DepthImageSource(
+            files,
+            times,
+            camera,
+            DEPTH_UNIT_M,
+            color=color,
+            sensor="" if camera is None else SENSOR,
+            options=options,
+        )
         source.warnings += warnings
         if is_file(path / "groundtruth.txt"):
             source.reference = tum_poses(source, path / "groundtruth.txt")
-        source.metadata["sensor"] = "Kinect v1 or Xtion (structured light)"
         return source
 
 

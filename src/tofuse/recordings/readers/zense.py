@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tofuse.errors import InputError
+from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, number_in
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.phones import first_size
 from tofuse.recordings.reader import ReaderOptions, Sniff
 
 FRAME_RATE_HZ = 30.0
@@ -55,9 +55,14 @@ class Zense:
         if not 0.01 <= rate <= 1e4:
             rate = FRAME_RATE_HZ
         source = DepthImageSource(
-            files, np.arange(len(files)) / rate, camera, 0.001, options=options
+            files,
+            np.arange(len(files)) / rate,
+            camera,
+            0.001,
+            sensor="Pico Zense (ToF)",
+            options=options,
         )
-        source.metadata |= {"sensor": "Pico Zense (ToF)", "frame_rate_hz": rate}
+        source.metadata["frame_rate_hz"] = rate
         source.warnings.append(f"no timestamps: a frame rate of {rate:g} Hz is assumed")
         return source
 
