@@ -17,8 +17,9 @@ help:                       ## this list
 demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a model and a report in demo/
 	$(BIN)/tofuse demo --out demo --overwrite
 
+# Compiled modules are kept, even where the environment says otherwise: many tests start processes.
 test: .venv/.ready          ## run the tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
 	$(BIN)/ruff format --check .

@@ -35,6 +35,8 @@ def measured() -> Iterator:
         # Workers look up the functions of this module by their names.
         known = [str(Path(__file__).parent), str(HELPERS), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(known))
+        # Not the half minute that a scheduler waits for the connection to a killed worker.
+        patch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
         import batch
 
         yield batch

@@ -21,7 +21,7 @@ from tofuse.batch import client
 from tofuse.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
-JOBS = [f"seed-{k}" for k in range(6)]
+JOBS = [f"seed-{k}" for k in range(3)]
 WORDS = ("--every", "4", "--threads", "1")
 
 
@@ -29,6 +29,8 @@ WORDS = ("--every", "4", "--threads", "1")
 def measured(monkeypatch) -> ModuleType:
     """The benchmark, which starts clusters, kills their workers and compares results."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
+    # Not the half minute for which a connection to a scheduler or worker that is gone is tried.
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
     pytest.importorskip("psutil")
     import batch
 
@@ -37,7 +39,7 @@ def measured(monkeypatch) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table of six jobs."""
+    """A table of three jobs."""
     path = tmp_path_factory.mktemp("listed") / "list.csv"
     rows = [f"{room_recording},{name},{k},4" for k, name in enumerate(JOBS)]
     path.write_text("\n".join(["recording,name,seed,every", *rows]) + "\n")
@@ -126,7 +128,7 @@ def test_killed_jobs_and_a_killed_batch_lose_nothing(
     words = ("--workers", 2, "--retries", 10)
     batch = measured.start_batch(listed, out, *words)
     pids = lambda: measured.children(batch.pid)  # noqa: E731
-    assert measured.kill_often(batch, pids, 10, 0.5, seed=3) == 10
+    assert measured.kill_often(batch, pids, 4, 0.5, seed=3) == 4
     wait_until(pids)
     jobs = pids()
     batch.kill()
@@ -135,7 +137,7 @@ def test_killed_jobs_and_a_killed_batch_lose_nothing(
     wait_until(lambda: not any(Path(f"/proc/{pid}/exe").exists() for pid in jobs), 20)
     measured.finish(measured.start_batch(listed, out, *words))
     assert same(measured, alone, out)
-    assert sum(int(r["starts"]) for r in records(out)) >= 10
+    assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
 def test_an_interrupted_batch_says_what_is_done(
@@ -149,7 +151,7 @@ def test_an_interrupted_batch_says_what_is_done(
     assert batch.returncode == 130
     assert (
         said
-        == "tofuse: interrupted, 0 of 6 recordings are done; run the same command again to resume\n"
+        == "tofuse: interrupted, 0 of 3 recordings are done; run the same command again to resume\n"
     )
 
 
@@ -163,15 +165,15 @@ def begun(measured: ModuleType, kind: str, folder: Path) -> Started:
     return measured.own_processes(2, folder)
 
 
-@pytest.mark.parametrize(("kind", "kills"), [("LocalCluster", 2), ("own processes", 10)])
+@pytest.mark.parametrize("kind", ["LocalCluster", "own processes"])
 def test_workers_of_dask_that_are_killed_lose_nothing(
-    kind: str, kills: int, measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+    kind: str, measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     out = tmp_path / "out"
     with begun(measured, kind, tmp_path / "dask") as (address, pids):
         batch = measured.start_batch(listed, out, "--scheduler", address, "--retries", 10)
-        assert measured.kill_often(batch, pids, kills, 0.5, seed=4) == kills
+        assert measured.kill_often(batch, pids, 2, 0.5, seed=4) == 2
         measured.finish(batch)
     assert same(measured, alone, out)
 

@@ -19,7 +19,7 @@ from tofuse.recordings.open import readers
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs alarms and FIFOs")
 
-SEEDS = 8
+SEEDS = 4
 
 
 @pytest.fixture

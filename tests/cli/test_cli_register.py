@@ -612,7 +612,7 @@ def test_the_page_in_a_browser(room_recording, tmp_path) -> None:
         page.locator("#viewer.live").wait_for(timeout=20_000)
 
         def shown() -> np.ndarray:
-            page.wait_for_timeout(900)
+            seen.rest()
             return seen.pixels("#viewer .stage canvas")
 
         after = shown()

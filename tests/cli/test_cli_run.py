@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from tofuse.errors import TofuseError
 from tofuse.files.images import read_image, write_png
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
+from tofuse.lab import demo as demo_module
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
 from tofuse.parts import name_of
@@ -717,6 +719,8 @@ def test_the_demo_that_fails_says_where(tmp_path, capsys) -> None:
 
 def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
+    # A quarter of the way around.
+    monkeypatch.setattr(demo_module, "simulate_to", partial(demo_module.simulate_to, frames=6))
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)
     made = (FILES | {"recording"}) - {"mesh.ply", "mesh.glb"}
     assert {p.name for p in out.iterdir()} == made
@@ -730,7 +734,7 @@ def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
     assert "--overwrite" in capsys.readouterr().err
 
     def interrupt(_self, name, total=None) -> None:
-        if name == "fusing":
+        if name == "tracking":
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

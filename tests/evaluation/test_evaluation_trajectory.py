@@ -176,7 +176,7 @@ def test_association_is_one_to_one_and_closest_first() -> None:
     assert associate([1.0], [1.021]).shape == (0, 2)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6))
 def test_association_by_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -190,7 +190,7 @@ def test_association_by_brute_force(seed: int) -> None:
     assert associate(a, b).tolist() == sorted(expected, key=lambda pair: a[pair[0]])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6))
 def test_figures_do_not_depend_on_either_world(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -174,7 +174,7 @@ def test_neighbour_share_decides_ties_by_order() -> None:
     assert np.flatnonzero(keep).tolist() == list(range(32))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), n=st.integers(2, 80), k=st.integers(1, 6))
 def test_neighbours_don_t_care_about_order_or_frame(seed: int, n: int, k: int) -> None:
     points = cloud_of(seed, n)
@@ -269,7 +269,7 @@ def every_filter() -> list[Filter]:
     return [box if name == "box" else cls() for name, cls in known.items() if name not in others]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), size=st.tuples(st.integers(2, 12), st.integers(2, 12)))
 def test_no_filter_adds_or_moves_points(seed: int, size: tuple[int, int]) -> None:
     rng = np.random.default_rng(seed)

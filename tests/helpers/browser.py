@@ -25,6 +25,18 @@ FLAGS = [
 ]
 # What a screenshot of WebGL makes the browser say.
 _OWN = "GPU stall due to ReadPixels"
+# When a frame of an animation was last asked for or drawn, or the page scrolled.
+_MOTION = """
+  window.moved = performance.now();
+  const moved = () => { window.moved = performance.now(); };
+  const request = requestAnimationFrame.bind(window);
+  window.requestAnimationFrame = (draw) => {
+    moved();
+    return request((now) => { draw(now); moved(); });
+  };
+  addEventListener("scroll", moved, { capture: true, passive: true });
+"""
+_REST_MS = 350  # longer than the report waits before it draws what rests
 
 
 @contextmanager
@@ -49,6 +61,12 @@ class Watched:
     complaints: list[str] = field(default_factory=list)
     outside: list[str] = field(default_factory=list)
 
+    def rest(self) -> None:
+        """Wait until nothing moves."""
+        left = f"{_REST_MS} - (performance.now() - window.moved)"
+        while (ms := self.page.evaluate(left)) > 0:
+            self.page.wait_for_timeout(ms)
+
     def pixels(self, selector: str) -> np.ndarray:
         """What an element looks like, (H, W, 3)."""
         data = np.frombuffer(self.page.locator(selector).screenshot(), np.uint8)
@@ -64,6 +82,8 @@ class Watched:
 def watched(browser: Any, address: str, *, ours: str, **options: Any) -> Iterator[Watched]:
     """Open a page; requests that do not begin with `ours` are refused and kept."""
     context = browser.new_context(**options)
+    if options.get("java_script_enabled", True):
+        context.add_init_script(_MOTION)
     out = Watched(context.new_page())
 
     def decide(route: Any) -> None:

@@ -29,7 +29,7 @@ def units(r, n):
     return a / np.linalg.norm(a, axis=1)[:, None]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(seed=seeds, flat=st.floats(0, 1), size=st.floats(-6, 6))
 def test_eigenvalues_equal_lapack(seed, flat, size):
     x = np.random.default_rng(seed).normal(size=(9, 3)) * [1, 0.5, flat] * 10.0**size
@@ -176,7 +176,7 @@ def test_symmetric_sums_equal_their_twin():
     np.testing.assert_allclose(g, J.T @ (w * e), atol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=seeds,
     n=st.integers(0, 120),

@@ -54,7 +54,7 @@ def clouds(seed, n, kind):
 KINDS = ["random", "grid", "line", "same", "plane"]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(0, 300),

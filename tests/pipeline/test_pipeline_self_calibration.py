@@ -78,7 +78,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Once round a room, with its true camera."""
     folder = tmp_path_factory.mktemp("calibration") / "room"
     return open_recording(
-        simulate("room", folder, every=12, frames=60, seed=10, effects=Effects(multipath=False))
+        simulate("room", folder, every=16, seed=10, effects=Effects(multipath=False))
     )
 
 

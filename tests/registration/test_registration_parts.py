@@ -83,7 +83,7 @@ def test_random_gives_all_of_a_small_view():
 # Matchers
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=seeds, reach=st.sampled_from([0.05, 0.3, np.inf]))
 def test_closest_point_pairs_each_point_with_its_closest(seed, reach):
     rng = np.random.default_rng(seed)
@@ -120,7 +120,7 @@ def test_unique_keeps_the_shortest_and_of_equals_the_first():
     np.testing.assert_array_equal(left.target, [1, 0, 2])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     pairs_=st.lists(
         st.tuples(st.integers(0, 6), st.sampled_from([0.0, 0.1, 0.2, 0.3])), max_size=40
@@ -141,7 +141,7 @@ def test_unique_equals_its_twin(pairs_):
 # Metrics
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=seeds,
     m=st.integers(3, 40),
@@ -311,7 +311,7 @@ def test_two_loops_end_when_algorithm_1_says(counts, errors, k, iterations):
     assert met == iterations
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     steps=st.lists(st.tuples(st.integers(1, 2), st.integers(1, 2)), min_size=1, max_size=14),
     k=st.integers(1, 3),

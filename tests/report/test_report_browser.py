@@ -43,7 +43,7 @@ CANVAS = "#viewer .stage canvas"
 
 def rested(seen):
     """The picture once nothing moves: with all triangles, and smooth edges."""
-    seen.page.wait_for_timeout(900)
+    seen.rest()
     return seen.pixels(CANVAS)
 
 
@@ -57,7 +57,7 @@ def middle(page):
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-def test_model_turns_and_toggles_switch(browser, report, tmp_path):
+def test_model_turns_and_toggles_switch(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         first = ready(seen)
@@ -86,11 +86,10 @@ def test_model_turns_and_toggles_switch(browser, report, tmp_path):
             blue, red = ink[..., 0], ink[..., 2]
             strong = (red - blue > 100) if orange else (blue - red > 100)
             assert strong.sum() > 50
-        page.screenshot(path=tmp_path / "desk.png", full_page=True)
         seen.check()
 
 
-def test_colours_of_values_are_those_of_the_bar(browser, report, tmp_path):
+def test_colours_of_values_are_those_of_the_bar(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         ready(seen)
@@ -113,11 +112,10 @@ def test_colours_of_values_are_those_of_the_bar(browser, report, tmp_path):
             assert np.mean(off < 14) > (0.5 if by == "views" else 0.9), (
                 by
             )  # counts change from point to point
-        page.screenshot(path=tmp_path / "bar.png")
         seen.check()
 
 
-def test_two_taps_measure_with_an_error(browser, report, tmp_path):
+def test_two_taps_measure_with_an_error(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         ready(seen)
@@ -143,7 +141,6 @@ def test_two_taps_measure_with_an_error(browser, report, tmp_path):
         # Across a room of 6 m.
         assert 0.5 < float(match[1]) * {"m": 1, "mm": 1e-3}[match[2]] < 6
         assert 2 < float(match[3]) < 150
-        page.screenshot(path=tmp_path / "measured.png")
         page.keyboard.press("Escape")
         assert said.is_hidden()
         seen.check()
@@ -179,31 +176,30 @@ def test_screenshot_and_full_screen(browser, report, tmp_path):
         assert shot.shape[:2] == (2 * round(box["height"]), 2 * round(box["width"]))
         assert len(np.unique(shot.reshape(-1, 3), axis=0)) > 50
         page.get_by_role("button", name="Full screen").click()
-        page.wait_for_timeout(500)
+        seen.rest()
         wide = page.locator(CANVAS).bounding_box()
         assert wide["width"] == DESK["width"]
         assert wide["height"] > box["height"]
         page.get_by_role("button", name="Full screen").click()
-        page.wait_for_timeout(500)
+        seen.rest()
         assert page.locator(CANVAS).bounding_box()["width"] == box["width"]
         seen.check()
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_reason_leads_to_its_frames(browser, report, tmp_path, size):
+def test_a_reason_leads_to_its_frames(browser, report, size):
     with opened(browser, report, viewport=size) as seen:
         page = seen.page
         before = ready(seen)
         link = page.locator(".reasons a.where", has_text="frame 15")
         link.click()
-        rested(seen)
+        seen.rest()
         assert page.locator("#viewer .inset").is_visible()
         assert page.locator("#viewer .timeline span").inner_text() == "Frame 15: skipped"
         assert page.locator("#viewer").bounding_box()["y"] >= 0
         assert page.locator("#strip.marks .marked").count() == 1
-        page.screenshot(path=tmp_path / "reason.png")
         page.locator(".reasons a.where", has_text="frames 9–10").click()
-        rested(seen)
+        seen.rest()
         assert page.locator("#viewer figcaption").inner_text().startswith("Frame 9")
         assert page.locator("#strip .marked").count() == 2
         page.locator("#viewer [data-close]").click()
@@ -226,7 +222,6 @@ def test_cameras_and_the_time_line_choose_frames(browser, report):
         outside = rested(seen)
         page.get_by_role("button", name="Look through this camera").click()
         page.locator("#viewer [data-close]").click()
-        page.wait_for_timeout(700)
         through = rested(seen)
         assert changed(outside, through) > 0.2
         ink = through[..., 0] - through[..., 2]  # no camera is in the way
@@ -255,12 +250,12 @@ def test_a_phone_scrolls_past_the_model(browser, report):
         assert page.evaluate("scrollY") == 0
         assert changed(first, rested(seen)) > 0.05  # a finger across turns it
         swipe(0, -160)
-        page.wait_for_timeout(400)
+        seen.rest()
         assert page.evaluate("scrollY") > 80
         seen.check()
 
 
-def test_slider_shows_frames_and_why_one_is_lost(browser, report, tmp_path):
+def test_slider_shows_frames_and_why_one_is_lost(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         shot = "#player img[data-kind=range]"
@@ -269,7 +264,7 @@ def test_slider_shows_frames_and_why_one_is_lost(browser, report, tmp_path):
         page.locator("#frame").focus()
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowRight")
-        page.wait_for_timeout(900)
+        seen.rest()
         assert page.locator("#frame-said").inner_text().startswith("Frame 4: tracked")
         assert changed(first, seen.pixels(shot)) > 0.1
         assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is chosen
@@ -278,13 +273,12 @@ def test_slider_shows_frames_and_why_one_is_lost(browser, report, tmp_path):
         assert said.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
         page.locator("#strip rect[data-frame='0']").click(force=True)
         assert page.locator("#frame-said").inner_text().startswith("Frame 0:")
-        page.locator("#player").screenshot(path=tmp_path / "player.png")
         seen.check()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_looks_follow_the_reader(browser, report, tmp_path, scheme, size):
+def test_looks_follow_the_reader(browser, report, scheme, size):
     with opened(browser, report, viewport=size, color_scheme=scheme) as seen:
         page = seen.page
         brightness = page.evaluate(
@@ -292,7 +286,6 @@ def test_looks_follow_the_reader(browser, report, tmp_path, scheme, size):
         )
         assert (min(brightness) > 200) == (scheme == "light")
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        page.screenshot(path=tmp_path / f"{scheme}.png", full_page=True)
         ready(seen)
         # The model fills the canvas, all but a border on all sides.
         bright = seen.pixels(CANVAS)[8:-8, 8:-8].max(-1) > 60  # its corners are round

@@ -203,7 +203,7 @@ def screen(client, point, box):
 
 
 @needs_viser
-def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
+def test_page_shows_switches_slides_and_measures(folder, browser):
     from playwright.sync_api import TimeoutError as NotYet
 
     from tofuse.viewer.app import ResultView
@@ -241,7 +241,6 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             ramp = viridis(np.linspace(0, 1, 256)).astype(int)
             for name in ("Cameras", "Loop closures"):
                 page.get_by_label(name, exact=True).click()
-            page.screenshot(path=tmp_path / "accuracy.png")
             model = drawn(seen)[200:-40, 60:460, ::-1].reshape(-1, 3)
             for name in ("Cameras", "Loop closures"):
                 page.get_by_label(name, exact=True).click()
@@ -259,7 +258,6 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             page.mouse.up()
             page.get_by_text("Frame 10: lost – too few correspondences").wait_for(timeout=15_000)
             assert shot.get_attribute("src") != was
-            page.screenshot(path=tmp_path / "slid.png")
 
             page.get_by_role("button", name="Pick two points").click()
             page.get_by_text("Click the first point.").wait_for(timeout=15_000)
@@ -280,8 +278,6 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             assert 0.001 < view.error < 0.06
             words = f"{view.distance:.3f} m ± {1000 * view.error:.0f} mm"
             assert page.locator("strong", has_text=words).count() == 1
-            page.wait_for_timeout(500)
-            page.screenshot(path=tmp_path / "measured.png")
             seen.check()
     finally:
         stop(server)
@@ -334,16 +330,13 @@ def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, 
             seen.page.get_by_text("writing").wait_for(timeout=30_000)
             growing = drawn(seen)
             assert len(np.unique(growing.reshape(-1, 3), axis=0)) > 100
-            seen.page.screenshot(path=tmp_path / "growing.png")
             seen.page.get_by_label("Colour by").click()
             seen.page.get_by_role("option", name="accuracy").click()
             seen.page.get_by_text("Go to bright places next").wait_for(timeout=15_000)
             assert changed(growing, drawn(seen)) > 0.01
-            seen.page.screenshot(path=tmp_path / "accuracy.png")
             live.finish(tmp_path / "a")
             seen.page.get_by_text("Pick two points").wait_for(timeout=30_000)
             drawn(seen)
-            seen.page.screenshot(path=tmp_path / "finished.png")
             seen.check()
     finally:
         stop(server)

@@ -190,7 +190,7 @@ def browser():
 
 
 @needs_viser
-def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> None:
+def test_page_loads_tiles_as_somebody_comes_near(folder, browser) -> None:
     from tofuse.viewer.app import ResultView
     from tofuse.viewer.server import address
     from tofuse.viewer.tiled import TiledSurface
@@ -208,7 +208,6 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> N
             settled(surface)
             (client,) = server.get_clients().values()
             first = drawn(seen)
-            page.screenshot(path=tmp_path / "far.png")
             far = sum(tile.faces for tile in surface.shown()[0])
             covered(result.tiles.root, surface.shown()[0])
             client.camera.position = (-0.5, -0.5, 1.5)
@@ -216,7 +215,6 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> N
             page.wait_for_timeout(500)
             settled(surface)
             near = drawn(seen)
-            page.screenshot(path=tmp_path / "near.png")
             assert changed(first, near) > 0.2
             tiles_near = surface.shown()[0]
             assert sum(t.error_m == 0 for t in tiles_near) > 0
@@ -230,7 +228,6 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> N
             page.wait_for_timeout(500)
             settled(view._model["surface"])
             colored = drawn(seen)
-            page.screenshot(path=tmp_path / "height.png")
             assert changed(near, colored) > 0.1
             page.get_by_label("Surface").click()
             hidden = drawn(seen)
