@@ -13,10 +13,11 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
 from tofuse.kernels.threads import threads
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.agreement import Agreement
+from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.confidence import ACCEPTED, Evidence
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_pair import follow, register_pair
@@ -54,6 +55,32 @@ def test_a_pair_far_apart_is_found_and_accepted(far):
     assert 0.2 < far.support <= far.overlap < 1
     assert far.contradiction < 0.05
     assert np.linalg.eigvalsh(far.information).min() > 0
+
+
+def falling(frame: RangeFrame, exponent: float) -> RangeFrame:
+    """With raw amplitude, which falls off towards the corners."""
+    x, y = np.moveaxis(frame.camera.rays(), -1, 0)
+    length2 = 1 + x * x + y * y
+    shade = length2 ** (-exponent / 2) / (length2 * np.maximum(frame.z, 1e-3) ** 2)
+    light = (frame.amplitude_image * shade).astype(np.float32)
+    return replace(frame, amplitude_image=light, amplitude_kind="raw")
+
+
+@pytest.mark.parametrize("exponent", [0.0, 4.0, 8.0])
+def test_the_falloff_of_the_amplitude_is_estimated(pair, far, exponent):
+    """A pattern that is fixed to the camera neither moves the pose nor contradicts it."""
+    views = [surface(falling(frame, exponent)) for frame in pair]
+    said = agreement(*views, TRUE)
+    assert said.falloff == pytest.approx(exponent, abs=0.5)
+    options = SurfaceOptions(radii=(2,), falloff=exponent)
+    known = agreement(*(prepare_view(falling(frame, exponent), options) for frame in pair), TRUE)
+    assert known.falloff == 0
+    assert said.support == pytest.approx(known.support, abs=0.005)
+    assert said.score == pytest.approx(known.score, abs=0.01)
+    found = tofuse.register(*(falling(frame, exponent) for frame in pair))
+    metres, degrees = error(found.T_target_source, far.T_target_source)
+    assert metres < 0.01
+    assert degrees < 0.2
 
 
 def test_the_covariance_tells_how_large_the_error_is(far):

@@ -475,6 +475,7 @@ def measure_agreement(
     floor_fraction: float,
     min_cosine: float,
     differences: Float32,
+    slants: Float32,
     start: int,
     stop: int,
 ) -> Float64:
@@ -501,6 +502,9 @@ def measure_agreement(
         (N,) log albedo of the points and (H, W, 3) of the image (first channel), NaN where unknown.
     differences
         (N,) written: log albedo of the image minus the point's for supporting points, else NaN.
+    slants
+        (N,) written for supporting points: log of the ratio of the cosines to the optical axes, in
+        the points' own view relative to the image.
 
     Returns
     -------
@@ -552,6 +556,8 @@ def measure_agreement(
             out[SUPPORT] += 1
             out[SQUARES_M] += r * r
             differences[k] = albedo[i, j, 0] - light[k]
+            here, there = (px * px + py * py) / (pz * pz), (x * x + y * y) / (z * z)
+            slants[k] = 0.5 * np.log((1 + there) / (1 + here))
     return out
 
 

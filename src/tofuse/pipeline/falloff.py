@@ -150,7 +150,7 @@ def _aligned(
         return T, slope
     T, exponent, slope = guess, initial, None
     for _ in range(_MAX_ROUNDS):
-        compensated = _compensated(source, exponent), _compensated(target, exponent)
+        compensated = source.with_falloff(exponent), target.with_falloff(exponent)
         pose = _constrained_pose(*compensated, T, _PHOTOMETRIC)
         if pose is None:
             return None
@@ -169,15 +169,6 @@ def _constrained_pose(
     if not aligned.converged or aligned.inlier_ratio < _MIN_INLIERS or len(aligned.unobservable):
         return None
     return aligned.T_world_source
-
-
-def _compensated(view: PreparedView, exponent: float) -> PreparedView:
-    """Return a view with an albedo that is compensated for the falloff."""
-    x, y = np.moveaxis(view.rays, -1, 0)
-    length2 = 1 + x * x + y * y
-    more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
-    albedo = np.asarray(view.albedo + exponent * more, np.float32)
-    return replace(view, albedo=albedo)
 
 
 def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | None:

@@ -10,6 +10,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
+from tofuse.kernels.median import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints
@@ -17,6 +18,10 @@ from tofuse.registration.view_points import ViewPoints
 _CHUNK_POINTS = 6000
 _CLASH = 2.0  # times the difference that counts neither way
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
+# Prior standard deviation of an unknown exponent of the falloff (natural vignetting is the fourth
+# power), number of points that share an albedo error, and trimmed least-squares iterations.
+_FALLOFF, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
+_MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,9 @@ class Agreement:
         Mean over the points of 1 - (albedo difference / `albedo`)^2, at least the negative clash
         weight, on the surface, and of the negative violation weight in free space. Albedo
         distinguishes geometrically ambiguous poses. Occluded points and points out of view count 0.
+    falloff
+        Exponent of the cosine to the optical axis by which both views' albedo still falls off, if
+        that was unknown: the one at which they fit best after compensation.
     """
 
     overlap: float
@@ -81,6 +89,7 @@ class Agreement:
     rms_m: float
     points: int
     score: float
+    falloff: float = 0.0
 
     @property
     def contradiction(self) -> float:
@@ -120,6 +129,11 @@ class Comparison:
     ways: tuple[tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]]
     options: AgreementOptions
 
+    @property
+    def unknown_falloff(self) -> bool:
+        """Whether the views' amplitude falls off towards the corners by an unknown exponent."""
+        return any(view.unknown_falloff for _, view, _ in self.ways)
+
     @classmethod
     def of(
         cls, source: PreparedView, target: PreparedView, options: AgreementOptions | None = None
@@ -136,19 +150,25 @@ class Comparison:
         T = np.ascontiguousarray(T_target_source, np.float64)
         total = np.zeros(kernels.AGREEMENT_SIZE)
         count = 0
-        differences = []
-        for (points, by, nearest), pose in zip(self.ways, (T, se3.inverse(T)), strict=True):
+        compared = []
+        # The signs of the differences change with the direction.
+        for (points, by, nearest), pose, sign in zip(
+            self.ways, (T, se3.inverse(T)), (1, -1), strict=True
+        ):
             count += len(points.points)
-            differences.append(np.empty(len(points.points), np.float32))
+            lights = np.empty((2, len(points.points)), np.float32)
             pose = np.ascontiguousarray(pose)
-            total += _one_way(points, by, nearest, pose, options, differences[-1])
+            total += _one_way(points, by, nearest, pose, options, lights)
+            compared.append(sign * lights[:, np.isfinite(lights[0])])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
-        # Exposure is the median difference; its sign changes with the direction.
-        lighter = np.concatenate([differences[0], -differences[1]])
-        lighter = lighter[np.isfinite(lighter)]
-        clash, alike = 0, float(on_surface)
+        lighter, slants = np.hstack(compared)
+        clash, alike, falloff = 0, float(on_surface), 0.0
         if len(lighter):
-            apart = np.abs(lighter - np.median(lighter)) / options.albedo
+            if self.unknown_falloff:
+                falloff = _falloff(lighter, slants, options.albedo)
+                lighter = lighter + np.float32(falloff) * slants
+            # Exposure is the median difference.
+            apart = np.abs(lighter - np.float32(median(lighter))) / np.float32(options.albedo)
             clash = int(np.count_nonzero(apart > _CLASH))
             alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
         share = 1 / max(count, 1)
@@ -160,6 +180,7 @@ class Comparison:
             rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
             points=count,
             score=float(share * (alike - options.violation_weight * violation)),
+            falloff=falloff,
         )
 
 
@@ -172,13 +193,39 @@ def nearest_depth(view: PreparedView) -> Float32:
     return np.where(view.z > 0, least, np.float32(0)).astype(np.float32)
 
 
+def _falloff(lighter: Float32, slants: Float32, albedo: float) -> float:
+    """Return the exponent at which differences in log albedo (n,) have the least spread.
+
+    It is estimated by trimmed least squares, like the exposure at every pose anew: otherwise the
+    falloff, a pattern that is fixed to the camera, contradicts every motion.
+
+    Parameters
+    ----------
+    slants
+        (n,) see `measure_agreement`.
+    albedo
+        Tolerance of the differences.
+    """
+    exponent = 0.0
+    ridge = _CORRELATED_POINTS * (albedo / _FALLOFF) ** 2
+    keep = np.ones(len(lighter), bool)
+    for _ in range(_ITERATIONS):
+        x, y = slants[keep].astype(np.float64), lighter[keep].astype(np.float64)
+        x -= x.mean()
+        exponent = -float(x @ (y - y.mean())) / (float(x @ x) + ridge)
+        off = lighter + np.float32(exponent) * slants
+        off = np.abs(off - np.float32(median(off[keep])))
+        keep = off <= 3 / _MEDIAN_OF_NORMAL * np.float32(median(off[keep]))
+    return exponent
+
+
 def _one_way(
     points: ViewPoints,
     view: PreparedView,
     nearest: Float32,
     T: Float64,
     options: AgreementOptions,
-    differences: Float32,
+    lights: Float32,
 ) -> Float64:
     def work(a: int, b: int) -> Float64:
         return kernels.measure_agreement(
@@ -197,7 +244,8 @@ def _one_way(
             options.floor_m,
             options.floor_fraction,
             float(np.cos(options.max_angle)),
-            differences,
+            lights[0],
+            lights[1],
             a,
             b,
         )

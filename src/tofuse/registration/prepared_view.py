@@ -246,6 +246,8 @@ class PreparedView:
         Whether `albedo` is known anywhere.
     pixel_variance
         (H, W) `plane_variance` with correlated errors counted once; None without such errors.
+    unknown_falloff
+        Whether `albedo` includes an unknown falloff of the amplitude towards the corners.
     """
 
     index: int
@@ -258,6 +260,7 @@ class PreparedView:
     projection: Projection
     has_albedo: bool = field(default=False)
     pixel_variance: Float32 | None = None
+    unknown_falloff: bool = False
     _subsampled: dict[int, PreparedView] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -288,6 +291,15 @@ class PreparedView:
     def without_caches(self) -> PreparedView:
         """Return the view without its cached derived images, which double its memory."""
         return replace(self)
+
+    def with_falloff(self, exponent: float) -> PreparedView:
+        """Return the view with an albedo that is compensated for this falloff (further)."""
+        if exponent == 0 or not self.has_albedo:
+            return self
+        x, y = np.moveaxis(self.rays, -1, 0)
+        length2 = 1 + x * x + y * y
+        more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
+        return replace(self, albedo=np.asarray(self.albedo + exponent * more, np.float32))
 
     def subsampled(self, columns: int) -> PreparedView:
         """Return the view at every n-th pixel, so that it has at most `columns` columns.
@@ -323,6 +335,7 @@ class PreparedView:
             projection,
             self.has_albedo,
             pixel_variance=None if own is None else np.ascontiguousarray(own[kept]),
+            unknown_falloff=self.unknown_falloff,
         )
         return self._subsampled[step]
 
@@ -404,6 +417,9 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         projection,
         has_albedo,
         pixel_variance=own_variance,
+        unknown_falloff=(
+            lit and options.falloff is None and frame.amplitude_kind != "range_compensated"
+        ),
     )
 
 

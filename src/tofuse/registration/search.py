@@ -303,10 +303,11 @@ class Search:
 
     def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
         """Rank candidates after photometric alignment of the best ones."""
-        source, target = self.source, self.target
         distinct = _distinct(found, self.distinct_m)
-        if not (source.has_albedo and target.has_albedo):
+        if not (self.source.has_albedo and self.target.has_albedo):
             return distinct
+        falloff = distinct[0].agreement.falloff
+        source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
         best, rest = distinct[:count], distinct[count:]
         targets = [Target(target, np.eye(4))]

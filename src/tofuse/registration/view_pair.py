@@ -57,12 +57,18 @@ _GIVEN_UP, _TIE = 0.05, 0.025
 # Minimum distance of rival poses relative to the depth, and depth in m below which tolerances are
 # reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
+# Exponent of the natural vignetting of a lens.
+_VIGNETTING = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """A pose T_target_source with its alignment and agreement."""
+    """A pose T_target_source with its alignment and agreement.
 
+    `views` are the source and the target as they were aligned, with compensated falloff.
+    """
+
+    views: tuple[PreparedView, PreparedView]
     T_target_source: Float64
     aligned: Aligned
     options: ProjectiveOptions
@@ -128,7 +134,7 @@ def register_pair(
     if near is not None and near.is_certain and not always_search:
         return pair.registration(near, near.evidence, None)
     prepared = Search.of(
-        source, target, options, agreement=pair.compared, distinct_m=pair.distinct_m
+        pair.source, pair.target, options, agreement=pair.compared, distinct_m=pair.distinct_m
     )
     match = None if prepared is None else prepared.everywhere()
     if prepared is None or match is None:
@@ -185,7 +191,14 @@ class _Pair:
         usual: UsualFit | None,
         uncertainty: UncertaintyOptions | None,
     ) -> _Pair:
-        """Adapt the tolerances to the depth of the views and the usual errors of the camera."""
+        """Adapt the tolerances to the depth of the views and the usual errors of the camera.
+
+        An unknown falloff of the amplitude is taken for that of a lens at first.
+        """
+        source, target = (
+            view.with_falloff(_VIGNETTING) if view.unknown_falloff else view
+            for view in (source, target)
+        )
         usual = usual or UsualFit()
         depth = 0.5 * (source.depth + target.depth)
         compared = self_scaled(usual)
@@ -195,29 +208,40 @@ class _Pair:
 
     def followed(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
-        found = self._fitting(guess, _NEAR)
+        views = self.source, self.target
+        found = self._fitting(views, guess, _NEAR)
         if found is None or not found.is_certain:
-            coarse = self._there(guess, _FAR)
-            found = self._fitting(coarse.T_world_source, _PATIENT) or found
+            coarse = self._aligned(views, guess, _FAR)
+            found = self._fitting(views, coarse.T_world_source, _PATIENT) or found
+        if found is not None and found.agreement.falloff:
+            views = self._compensated(found.agreement.falloff)
+            found = self._fitting(views, found.T_target_source, _PATIENT) or found
         return found
 
-    def _there(self, guess: Float64, options: ProjectiveOptions) -> Aligned:
-        scale = self.usual.noise_scale
-        return align(self.source, _at(self.target), guess, options, usual_scale=scale)
+    def _compensated(self, falloff: float) -> tuple[PreparedView, PreparedView]:
+        return self.source.with_falloff(falloff), self.target.with_falloff(falloff)
 
-    def _fitting(self, guess: Float64, options: ProjectiveOptions) -> _Pose | None:
+    def _aligned(
+        self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
+    ) -> Aligned:
+        source, target = views
+        return align(source, _at(target), guess, options, usual_scale=self.usual.noise_scale)
+
+    def _fitting(
+        self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
+    ) -> _Pose | None:
         """Align forwards and backwards; None if inconsistent, or if the fit is unusual."""
-        there = self._there(guess, options)
+        there = self._aligned(views, guess, options)
         if not there.converged or not self.usual.assess(there).usual:
             return None
-        T, scale = there.T_world_source, self.usual.noise_scale
-        back = align(self.target, _at(self.source), se3.inverse(T), options, usual_scale=scale)
+        T = there.T_world_source
+        back = self._aligned((views[1], views[0]), se3.inverse(T), options)
         far_m = _BOTH_WAYS * self.source.depth
         same = both_ways_agree(T, back.T_world_source, far_m, _BOTH_WAYS)
         if not same or not self.usual.assess(back).usual:
             return None
         said = agreement(self.source, self.target, T, self.compared)
-        return _Pose(T, there, options, said) if said.score > 0 else None
+        return _Pose(views, T, there, options, said) if said.score > 0 else None
 
     def chosen(
         self, near: _Pose | None, match: Match, prepared: Search, guessed: bool
@@ -239,11 +263,12 @@ class _Pair:
         """Align the best pose of a search, unless its agreement decreases significantly."""
         error_m = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
         options = replace(_PATIENT, prior_m=error_m, prior_rad=_AFTER_SEARCH)
-        aligned = self._there(match.T_target_source, options)
+        views = self._compensated(match.agreement.falloff)
+        aligned = self._aligned(views, match.T_target_source, options)
         said = prepared.compared.at(aligned.T_world_source)
         if said.score >= match.score - _GIVEN_UP:
-            return _Pose(aligned.T_world_source, aligned, options, said)
-        return _Pose(match.T_target_source, aligned, options, match.agreement)
+            return _Pose(views, aligned.T_world_source, aligned, options, said)
+        return _Pose(views, match.T_target_source, aligned, options, match.agreement)
 
     def nearer(self, near: _Pose, best: _Pose, prepared: Search) -> _Pose:
         """Select between the pose aligned from the guess and the best one.
@@ -293,7 +318,8 @@ class _Pair:
     def _covariance(self, pose: _Pose) -> Float64:
         # The search result constrains no degenerate direction.
         loose = replace(pose.options, prior_m=_NEAR.prior_m, prior_rad=_NEAR.prior_rad)
-        C = covariance(self.source, _at(self.target), pose.aligned, loose, self.uncertainty)
+        source, target = pose.views
+        C = covariance(source, _at(target), pose.aligned, loose, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
             # Not aligned: add the residual error of the search.
             o = pose.options
