@@ -27,7 +27,6 @@ from tofuse.registration.projective import (
     registration_of,
 )
 from tofuse.registration.search import (
-    DISTINCT_M,
     Candidate,
     Match,
     Search,
@@ -54,8 +53,8 @@ _AFTER_SEARCH = 0.03
 _BOTH_WAYS = 0.03
 # Loss of score by noise when a pose is aligned, and lead that is not significant.
 _GIVEN_UP, _TIE = 0.05, 0.025
-# Minimum distance of rival poses relative to the depth, and depth in m below which tolerances are
-# reduced in proportion.
+# Minimum distance of rival poses relative to the depth (less than the error of a right pose), and
+# depth in m below which tolerances are reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
 # Exponent of the natural vignetting of a lens.
 _VIGNETTING = 4.0
@@ -203,8 +202,7 @@ class _Pair:
         depth = 0.5 * (source.depth + target.depth)
         compared = self_scaled(usual)
         compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))
-        distinct_m = min(DISTINCT_M, _DISTINCT * depth)
-        return cls(source, target, usual, compared, distinct_m, uncertainty)
+        return cls(source, target, usual, compared, _DISTINCT * depth, uncertainty)
 
     def followed(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
