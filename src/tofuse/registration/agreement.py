@@ -131,8 +131,8 @@ class Comparison:
 
     @property
     def unknown_falloff(self) -> bool:
-        """Whether the views' amplitude falls off towards the corners by an unknown exponent."""
-        return any(view.unknown_falloff for _, view, _ in self.ways)
+        """Whether both views' amplitude falls off towards the corners by an unknown exponent."""
+        return all(view.unknown_falloff for _, view, _ in self.ways)
 
     @classmethod
     def of(

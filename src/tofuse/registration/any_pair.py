@@ -124,9 +124,11 @@ def _registered_as_images(
 
 def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
     """Return a view's image and T_view_camera (4, 4); None for clouds without a viewpoint."""
-    options = SurfaceOptions()
     if isinstance(view, RangeFrame):
-        return prepare_view(view, options), np.eye(4)
+        return prepare_view(view, SurfaceOptions()), np.eye(4)
     viewpoint = viewpoint_of(view)
     image = None if viewpoint is None else as_image(view, viewpoint)
-    return None if image is None else (prepare_view(image[0], options), image[1])
+    if image is None:
+        return None
+    # The axis of such an image is not that of a lens.
+    return prepare_view(image[0], SurfaceOptions(falloff=0.0)), image[1]
