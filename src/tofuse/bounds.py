@@ -1,9 +1,10 @@
-"""Bounds of the numbers that parts are configured with; ValueError for others.
+"""Bounds of the numbers that parts are configured with, and choices; ValueError for others.
 
-Bounds are declared with the fields::
+They are declared with the fields::
 
     class Median(Bounded):
         radius: Annotated[int, Bounds(1, 10)] = 1
+        border: Literal["keep", "remove"] = "keep"
 """
 
 from __future__ import annotations
@@ -39,36 +40,44 @@ class Bounds:
         return f"{self.low:.10g} to {self.high:.10g}"
 
 
-class Bounded:
-    """A dataclass that refuses numbers outside of the bounds that its annotations declare.
+class _Choices(tuple[object, ...]):
+    """The values of a `Literal`."""
 
-    A field is declared as ``Annotated[float, Bounds(0, 1)]``; None is within any bounds.
+    def __str__(self) -> str:
+        return f"one of {', '.join(map(str, self))}"
+
+
+class Bounded:
+    """A dataclass that refuses values other than those that its annotations declare.
+
+    A number is declared as ``Annotated[float, Bounds(0, 1)]``, where None is within any bounds, a
+    choice as ``Literal``.
 
     Raises
     ------
     ValueError
-        With the name of the field, its value and the bounds.
+        With the name of the field, its value and the bounds or choices.
     """
 
     def __post_init__(self) -> None:
         kind: type = type(self)
-        for name, whole, bounds in _declared_bounds(kind):
+        for name, whole, allowed in _declared(kind):
             value = getattr(self, name)
-            if value is None:
+            if isinstance(allowed, Bounds) and value is None:
                 continue
             if whole and not isinstance(value, int):
                 raise ValueError(f"{name} must be a whole number, not {value!r}")
-            if value not in bounds:
-                raise ValueError(f"{name} must be {bounds}, not {value!r}")
+            if value not in allowed:
+                raise ValueError(f"{name} must be {allowed}, not {value!r}")
 
 
 @functools.cache
-def _declared_bounds(cls: type) -> list[tuple[str, bool, Bounds]]:
-    """Names of the fields with bounds, whether they are whole numbers, and the bounds."""
-    hints = typing.get_type_hints(cls, include_extras=True)
-    return [
-        (name, hint.__origin__ in (int, int | None), extra)
-        for name, hint in hints.items()
-        for extra in getattr(hint, "__metadata__", ())
-        if isinstance(extra, Bounds)
-    ]
+def _declared(cls: type) -> list[tuple[str, bool, Bounds | _Choices]]:
+    """Names of the fields with bounds or choices, whether they are whole numbers, and these."""
+    found: list[tuple[str, bool, Bounds | _Choices]] = []
+    for name, hint in typing.get_type_hints(cls, include_extras=True).items():
+        if typing.get_origin(hint) is typing.Literal:
+            found.append((name, False, _Choices(typing.get_args(hint))))
+        bounds = [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Bounds)]
+        found += [(name, hint.__origin__ in (int, int | None), each) for each in bounds]
+    return found

@@ -21,13 +21,9 @@ class Shape(Protocol):
 
 @parts.part("test-shape", "round", label="validated")
 @dataclass(frozen=True)
-class Round(Shape):
-    radius: float = 1.0
+class Round(Bounded, Shape):
+    radius: Annotated[float, Bounds(0, exclusive=True)] = 1.0
     kind: Literal["disc", "ball"] = "disc"
-
-    def __post_init__(self) -> None:
-        if not self.radius > 0:
-            raise ValueError(f"radius is {self.radius}, not above 0")
 
 
 @parts.part("test-shape", "square")
@@ -83,8 +79,8 @@ def test_two_parts_of_one_name_are_refused() -> None:
     [
         ({"part": "round", "radius": "a"}, r"my\.toml: radius: is 'a'; .*type float"),
         ({"part": "round", "radius": True}, r"my\.toml: radius: is True; .*type float"),
-        ({"part": "round", "radius": -1}, r"my\.toml: radius is -1\.0, not above 0"),
-        ({"part": "round", "radius": float("nan")}, r"radius is nan"),
+        ({"part": "round", "radius": -1}, r"my\.toml: radius must be above 0, not -1\.0"),
+        ({"part": "round", "radius": float("nan")}, r"radius must be above 0, not nan"),
         ({"part": "round", "radios": 1}, r"my\.toml: unknown option 'radios'; .*'radius', 'kind'"),
         ({"part": "round", "kind": "cube"}, r"my\.toml: kind: is 'cube'; .*'disc', 'ball'"),
         ({"part": "oval"}, r"my\.toml: there is no test-shape called 'oval'; .*'round', 'square'"),
@@ -168,6 +164,7 @@ class _Limits(Bounded):
     fraction: Annotated[float, Bounds(0, 1)] = 0.5
     length_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     probability: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.5
+    kind: Literal["disc", "ball"] = "disc"
 
 
 @pytest.mark.parametrize(
@@ -186,6 +183,12 @@ def test_numbers_outside_of_declared_bounds_are_refused(wrong, message) -> None:
         _Limits(**wrong)
     with pytest.raises(InputError, match=message):
         parts.from_dict(_Limits, wrong, where="test.toml")
+
+
+def test_other_values_than_the_declared_choices_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^kind must be one of disc, ball, not 'cube'$"):
+        _Limits(kind="cube")
+    assert _Limits(kind="ball").kind == "ball"
 
 
 def test_numbers_within_declared_bounds_are_accepted() -> None:

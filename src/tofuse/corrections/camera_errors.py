@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction, Corrector
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
 # Larger values indicate a wrong camera, not an error.
-_MOST_FOCAL, _MOST_OFFSET_M = 0.5, 1.0
 
 
 @part("correction", "camera-errors")
 @dataclass(frozen=True)
-class CameraErrors(Correction):
+class CameraErrors(Bounded, Correction):
     """Correct the focal length and the range offset of a camera.
 
     Attributes
@@ -32,17 +32,9 @@ class CameraErrors(Correction):
         Added to all ranges, m.
     """
 
-    focal: float = 0.0
-    offset_m: float = 0.0
+    focal: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if not abs(self.focal) <= _MOST_FOCAL:
-            raise ValueError(f"focal is {self.focal}, not -{_MOST_FOCAL} to {_MOST_FOCAL}")
-        if not abs(self.offset_m) <= _MOST_OFFSET_M:
-            raise ValueError(
-                f"offset_m is {self.offset_m}, not -{_MOST_OFFSET_M} to {_MOST_OFFSET_M}"
-            )
 
     def start(self) -> Corrector:
         """See `Correction.start`."""

@@ -39,8 +39,6 @@ class Distance(Bounded, Filter):
         super().__post_init__()
         if self.maximum is not None and not self.maximum > self.minimum:
             raise ValueError(f"maximum must be above {self.minimum:g}, not {self.maximum!r}")
-        if self.measure not in ("z", "range"):
-            raise ValueError(f"measure must be 'z' or 'range', not {self.measure!r}")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
@@ -54,7 +52,7 @@ class Distance(Bounded, Filter):
 
 @part("filter", "box")
 @dataclass(frozen=True)
-class Box(Filter):
+class Box(Bounded, Filter):
     """Remove points outside (or inside) a box along the axes of the camera frame (section 2.8).
 
     Attributes
@@ -73,6 +71,7 @@ class Box(Filter):
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, corner in (("lower", self.lower), ("upper", self.upper)):
             if len(corner) != 3:
                 raise ValueError(f"{name} must have 3 numbers, not {len(corner)}")
@@ -81,8 +80,6 @@ class Box(Filter):
                     raise ValueError(f"{name} {axis} must be a finite number, not {value!r}")
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
             raise ValueError("lower must be below upper on every axis")
-        if self.remove not in ("outside", "inside"):
-            raise ValueError(f"remove must be 'outside' or 'inside', not {self.remove!r}")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -186,11 +186,6 @@ class Joining(Bounded):
     min_probability: Annotated[float, Bounds(0, 0.999999)] = 0.0
     main: Literal["largest", "first"] = "largest"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.main not in ("largest", "first"):
-            raise ValueError(f"main must be largest or first, not {self.main!r}")
-
     def join(
         self,
         stretches: Sequence[Stretch],

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
-from tofuse.files.images import read_color, read_header, read_image
+from tofuse.files.images import read_color, read_image
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.frames import RangeFrame

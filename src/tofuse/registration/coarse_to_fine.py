@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
@@ -70,7 +70,7 @@ class InTurn(Registrar):
 
 @part("registration", "coarse-to-fine", label="validated")
 @dataclass(frozen=True)
-class CoarseToFine(Registrar):
+class CoarseToFine(Bounded, Registrar):
     """ICP on a pyramid of both views, from coarse to fine.
 
     A level is a voxel-grid average, whose resolution halves from level to level: coarse levels
@@ -97,22 +97,14 @@ class CoarseToFine(Registrar):
         the scene.
     """
 
-    resolution: float | None = None
-    points: int = 20000
+    resolution: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    points: Annotated[int, Bounds(_SMALLEST_LEVEL)] = 20000
     metric: Metric = field(default_factory=lambda: PlaneToPlane(loss="tukey"))
     reach: float = 3.0
     neighbours: int = 12
     max_iterations: int = 40
-    coarsest: float | None = None
+    coarsest: Annotated[float | None, Bounds(0, exclusive=True)] = None
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if self.resolution is not None and not 0 < self.resolution < math.inf:
-            raise ValueError(f"resolution is {self.resolution}, not a length in metres")
-        if self.coarsest is not None and not self.coarsest > 0:
-            raise ValueError(f"coarsest is {self.coarsest}, not above 0")
-        if self.points < _SMALLEST_LEVEL:
-            raise ValueError(f"points is {self.points}, not {_SMALLEST_LEVEL} or more")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels import cloud_matching as kernels
@@ -51,7 +52,7 @@ _ALIKE = 0.8
 
 @part("registration", "fpfh")
 @dataclass(frozen=True)
-class Fpfh(Registrar):
+class Fpfh(Bounded, Registrar):
     """Fast point feature histograms (Rusu et al. 2009) with robust consensus of the matches.
 
     Both views are averaged to the same resolution. Each point is described by histograms of angles
@@ -77,9 +78,9 @@ class Fpfh(Registrar):
         of the averaged views); else it is that of the matches.
     """
 
-    points: int = 4000
-    reach: float = 5.0
-    neighbours: int = 12
+    points: Annotated[int, Bounds(20, 20_000)] = 4000
+    reach: Annotated[float, Bounds(1, 100)] = 5.0
+    neighbours: Annotated[int, Bounds(4, 1000)] = 12
     signed: bool = False
     way: Way = "compatible"
     inliers: int = 6
@@ -88,12 +89,7 @@ class Fpfh(Registrar):
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        if not 20 <= self.points <= 20_000:
-            raise ValueError(f"points is {self.points}, not 20 to 20000")
-        if not 1 <= self.reach <= 100:
-            raise ValueError(f"reach is {self.reach}, not 1 to 100")
-        if not 4 <= self.neighbours <= 1000:
-            raise ValueError(f"neighbours is {self.neighbours}, not 4 to 1000")
+        super().__post_init__()
         self._consensus(1.0)
 
     def _consensus(self, size: float) -> ConsensusOptions:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -37,7 +39,7 @@ _FEWEST_POINTS = 3
 
 @part("registration", "icp", label="validated")
 @dataclass(frozen=True)
-class Icp(Registrar):
+class Icp(Bounded, Registrar):
     """ICP: match, reject, move, until the stopping rule is met.
 
     Attributes
@@ -60,20 +62,14 @@ class Icp(Registrar):
         view doesn't have.
     """
 
-    resolution: float = 0.01
+    resolution: Annotated[float, Bounds(0, 1e9, exclusive=True)] = 0.01
     source: Selector = field(default_factory=Random)
     target: Selector = field(default_factory=Random)
     matcher: Matcher = field(default_factory=ClosestPoint)
     rejectors: tuple[Rejector, ...] = (MaxDistance(), Unique())
     metric: Metric = field(default_factory=PointToPoint)
     stopping: Stopping = field(default_factory=TwoLoops)
-    neighbours: int = NEIGHBOURS
-
-    def __post_init__(self) -> None:
-        if self.neighbours < 3:
-            raise ValueError(f"neighbours is {self.neighbours}, not 3 or more")
-        if not 0 < self.resolution < 1e9:
-            raise ValueError(f"resolution is {self.resolution}, not a length in metres")
+    neighbours: Annotated[int, Bounds(3)] = NEIGHBOURS
 
     @property
     def takes(self) -> frozenset[str]:

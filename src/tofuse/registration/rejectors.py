@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from tofuse.bounds import Bounded, Bounds
 from tofuse.kernels.icp import shortest_of_each_target
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Rejector
@@ -11,7 +13,7 @@ from tofuse.registration.interfaces import Alignment, Matches, Rejector
 
 @part("rejector", "max-distance", label="validated")
 @dataclass(frozen=True)
-class MaxDistance(Rejector):
+class MaxDistance(Bounded, Rejector):
     """Drops pairs further apart than ``tau = factor * res`` (section 3.2: 2 res).
 
     Attributes
@@ -20,11 +22,7 @@ class MaxDistance(Rejector):
         In resolutions.
     """
 
-    factor: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not self.factor > 0:
-            raise ValueError(f"factor is {self.factor}, not more than 0")
+    factor: Annotated[float, Bounds(0, exclusive=True)] = 2.0
 
     def reach(self, resolution: float) -> float:
         """See `Rejector.reach`."""

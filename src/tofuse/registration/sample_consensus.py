@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from tofuse.arrays import Bool, Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.registration.base import Registration
@@ -46,7 +47,7 @@ _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 
 
 @dataclass(frozen=True)
-class ConsensusOptions:
+class ConsensusOptions(Bounded):
     """Options of the consensus search.
 
     Attributes
@@ -68,27 +69,13 @@ class ConsensusOptions:
     """
 
     way: Way = "samples"
-    sigmas: float = 3.0
-    inliers: int = 6
-    confidence: float = 0.999
-    most_samples: int = 5000
-    leaders: int = 100
-    distinct_m: float = 0.1
-    distinct_rad: float = 0.0873
-
-    def __post_init__(self) -> None:
-        if self.way not in get_args(Way):
-            raise ValueError(f"way is {self.way!r}, not one of {', '.join(get_args(Way))}")
-        if not 3 <= self.inliers <= 1_000_000:
-            raise ValueError(f"inliers is {self.inliers}, not 3 or more")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"confidence is {self.confidence}, not between 0 and 1")
-        for name in ("most_samples", "leaders"):
-            if not 1 <= getattr(self, name) <= 1_000_000:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-        for name in ("sigmas", "distinct_m", "distinct_rad"):
-            if not 0 < getattr(self, name) <= 1e3:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+    sigmas: Annotated[float, Bounds(0, 1000, exclusive=True)] = 3.0
+    inliers: Annotated[int, Bounds(3, 1_000_000)] = 6
+    confidence: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.999
+    most_samples: Annotated[int, Bounds(1, 1_000_000)] = 5000
+    leaders: Annotated[int, Bounds(1, 1_000_000)] = 100
+    distinct_m: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.1
+    distinct_rad: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.0873
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -105,11 +105,6 @@ class SearchOptions(Bounded):
     planar_candidates: Annotated[int, Bounds(1, 1_000_000)] = 20
     full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 60
     photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.mode not in get_args(Mode):
-            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, not {self.mode!r}")
 
 
 def differ(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.interfaces import Selector
@@ -24,7 +26,7 @@ class All(Selector):
 
 @part("selector", "random", label="validated")
 @dataclass(frozen=True)
-class Random(Selector):
+class Random(Bounded, Selector):
     """A random subset, each point as likely as any other (section 3.3).
 
     Attributes
@@ -33,11 +35,7 @@ class Random(Selector):
         Number of points; all points of a view with fewer.
     """
 
-    points: int = 1000
-
-    def __post_init__(self) -> None:
-        if self.points < 1:
-            raise ValueError(f"points is {self.points}, not 1 or more")
+    points: Annotated[int, Bounds(1)] = 1000
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`."""
@@ -55,7 +53,7 @@ def at_most(points: int | None) -> Selector:
 
 @part("selector", "uniform", label="validated")
 @dataclass(frozen=True)
-class Uniform(Selector):
+class Uniform(Bounded, Selector):
     """Every k-th point (Turk and Levoy 1994): evenly spread over the pixels of a range image.
 
     Attributes
@@ -64,11 +62,7 @@ class Uniform(Selector):
         k is the largest whole number that leaves this many points, or 1.
     """
 
-    points: int = 1000
-
-    def __post_init__(self) -> None:
-        if self.points < 1:
-            raise ValueError(f"points is {self.points}, not 1 or more")
+    points: Annotated[int, Bounds(1)] = 1000
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`; draws nothing."""

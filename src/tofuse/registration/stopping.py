@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from tofuse.bounds import Bounded, Bounds
 from tofuse.parts import part
 from tofuse.registration.interfaces import History, Stopping
 
@@ -12,7 +14,7 @@ _REPEATED = 1e-6
 
 @part("stopping", "two-loops", label="validated")
 @dataclass(frozen=True)
-class TwoLoops(Stopping):
+class TwoLoops(Bounded, Stopping):
     """The two loops of Algorithm 1.
 
     The first (lines 1 to 15) runs until the number of corresponding points is the same in two
@@ -30,17 +32,9 @@ class TwoLoops(Stopping):
         Maximum number of iterations of both loops together.
     """
 
-    epsilon: float = 1e-4
-    k: int = 3
-    max_iterations: int = 100
-
-    def __post_init__(self) -> None:
-        if not self.epsilon > 0:
-            raise ValueError(f"epsilon is {self.epsilon}, not more than 0")
-        if self.k < 1:
-            raise ValueError(f"k is {self.k}, not 1 or more")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
+    epsilon: Annotated[float, Bounds(0, exclusive=True)] = 1e-4
+    k: Annotated[int, Bounds(1)] = 3
+    max_iterations: Annotated[int, Bounds(1)] = 100
 
     def met(self, history: History) -> bool:
         """See `Stopping.met`."""
@@ -57,7 +51,7 @@ class TwoLoops(Stopping):
 
 @part("stopping", "small-step", label="validated")
 @dataclass(frozen=True)
-class SmallStep(Stopping):
+class SmallStep(Bounded, Stopping):
     """Ends when the displacement of the points is below a fraction of the resolution.
 
     It also ends when the iterations oscillate between two sets of matches.
@@ -70,14 +64,8 @@ class SmallStep(Stopping):
         Maximum number of iterations.
     """
 
-    epsilon: float = 1e-3
-    max_iterations: int = 50
-
-    def __post_init__(self) -> None:
-        if not self.epsilon > 0:
-            raise ValueError(f"epsilon is {self.epsilon}, not more than 0")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
+    epsilon: Annotated[float, Bounds(0, exclusive=True)] = 1e-3
+    max_iterations: Annotated[int, Bounds(1)] = 50
 
     def met(self, history: History) -> bool:
         """See `Stopping.met`."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.kernels.cloud_sums import (
     matrix_sums,
     plane_sums,
@@ -116,7 +117,7 @@ class PointToPlane(TangentPlanes):
 
 @part("metric", "gicp", label="validated")
 @dataclass(frozen=True)
-class PlaneToPlane(SurfaceMetric):
+class PlaneToPlane(Bounded, SurfaceMetric):
     """Generalised ICP (Segal, Haehnel and Thrun 2009), plane to plane.
 
     ``sum r_i^T (C_qi + R C_pi R^T)^-1 r_i``, r_i = T p_i - q_i: each point stands for a disc of
@@ -131,12 +132,8 @@ class PlaneToPlane(SurfaceMetric):
         "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
     """
 
-    epsilon: float = 1e-3
+    epsilon: Annotated[float, Bounds(1e-9, 1)] = 1e-3
     loss: Loss = "square"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.epsilon <= 1:
-            raise ValueError(f"epsilon is {self.epsilon}, not above 0 and at most 1")
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""

@@ -18,11 +18,12 @@ import json
 import math
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
@@ -70,7 +71,7 @@ class NoisyImage(Protocol):
 
 
 @dataclass(frozen=True)
-class AmplitudeLaw:
+class AmplitudeLaw(Bounded):
     """``sigma^2 = floor^2 + shot^2 / A + dark^2 / A^2`` over the raw amplitude A in counts.
 
     Attributes
@@ -85,21 +86,19 @@ class AmplitudeLaw:
         Exponent of the cosine to the optical axis by which range-compensated amplitude was divided.
     """
 
-    shot: float
-    dark: float
-    floor: float = 0.0
-    falloff: float = 0.0
+    shot: Annotated[float, Bounds(0)]
+    dark: Annotated[float, Bounds(0)]
+    floor: Annotated[float, Bounds(0, _LARGEST_M)] = 0.0
+    falloff: Annotated[float, Bounds(0)] = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("shot", "dark", "falloff"):
-            _check(name, getattr(self, name), 0, math.inf)
-        _check("floor", self.floor, 0, _LARGEST_M, "give metres")
+        super().__post_init__()
         if self.shot == 0 and self.dark == 0:
             raise ValueError("shot and dark are both 0: give at least one")
 
 
 @dataclass(frozen=True)
-class ConfidenceLaw:
+class ConfidenceLaw(Bounded):
     """``sigma = sigma_m[level] * r^power``, with a table over the levels of confidence.
 
     Attributes
@@ -111,34 +110,34 @@ class ConfidenceLaw:
     """
 
     sigma_m: tuple[float, ...]
-    power: float = 0.0
+    power: Annotated[float, Bounds(0, 4)] = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.sigma_m:
             raise ValueError("sigma_m is empty: give one number for each level of confidence")
         for value in self.sigma_m:
-            _check("sigma_m", value, 0, _LARGEST_M, "give metres")
-        _check("power", self.power, 0, 4)
+            if value not in Bounds(0, _LARGEST_M):
+                raise ValueError(f"sigma_m must be {Bounds(0, _LARGEST_M)}, not {value!r}")
         if any(b > a for a, b in zip(self.sigma_m, self.sigma_m[1:], strict=False)):
             raise ValueError("sigma_m grows with confidence: higher levels must be better")
 
 
 @dataclass(frozen=True)
-class RangeLaw:
+class RangeLaw(Bounded):
     """``sigma = a + b r^2`` over the radial range r; `a` in m, `b` in 1/m."""
 
-    a: float
-    b: float
+    a: Annotated[float, Bounds(0, _LARGEST_M)]
+    b: Annotated[float, Bounds(0, 1)]
 
     def __post_init__(self) -> None:
-        _check("a", self.a, 0, _LARGEST_M, "give metres")
-        _check("b", self.b, 0, 1, "give metres of noise at 1 m")
+        super().__post_init__()
         if self.a == 0 and self.b == 0:
             raise ValueError("a and b are both 0: give at least one")
 
 
 @dataclass(frozen=True)
-class NoiseModel:
+class NoiseModel(Bounded):
     """Standard deviation of the radial range of one camera, in m.
 
     A frame with a sigma stated by the camera keeps it. Otherwise the first law applies that the
@@ -164,14 +163,8 @@ class NoiseModel:
     range: RangeLaw
     amplitude: AmplitudeLaw | None = None
     confidence: ConfidenceLaw | None = None
-    ceiling_m: float = 1.0
-    footprint: float = 0.29
-
-    def __post_init__(self) -> None:
-        _check("ceiling_m", self.ceiling_m, 0, 100, "give metres")
-        _check("footprint", self.footprint, 0, 1)
-        if self.ceiling_m == 0:
-            raise ValueError("ceiling_m is 0")
+    ceiling_m: Annotated[float, Bounds(0, 100, exclusive=True)] = 1.0
+    footprint: Annotated[float, Bounds(0, 1)] = 0.29
 
     def law(self, frame: NoisyImage) -> Law:
         """Return the law that applies to a frame; "camera" if it states its own sigma."""
@@ -296,11 +289,6 @@ def incidence_cosine(frame: NoisyImage) -> Float32 | None:
     rays = frame.camera.rays()
     dot = normals[..., 0] * rays[..., 0] + normals[..., 1] * rays[..., 1] + normals[..., 2]
     return (np.abs(dot) / ray_lengths(frame.camera)).astype(np.float32)
-
-
-def _check(name: str, value: float, low: float, high: float, remedy: str = "") -> None:
-    if not (low <= value <= high) or not math.isfinite(value):
-        raise ValueError(f"{name} is {value}; " + (remedy or f"give {low:g} to {high:g}"))
 
 
 def _check_finite(model: Any, where: str) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from tofuse.bounds import Bounded, Bounds
 from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Rejector
@@ -14,7 +16,7 @@ from tofuse.registration.interfaces import Alignment, Matches, Rejector
 
 @part("rejector", "normal", label="validated")
 @dataclass(frozen=True)
-class NormalCompatibility(Rejector):
+class NormalCompatibility(Bounded, Rejector):
     """Drops pairs whose normals differ in direction (Zhang 1994; Pulli 1999).
 
     Pairs without a normal are dropped as well.
@@ -25,11 +27,7 @@ class NormalCompatibility(Rejector):
         Largest angle between the normals, rad; Pulli: 45 degrees.
     """
 
-    max_angle_rad: float = math.pi / 4
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_angle_rad <= math.pi:
-            raise ValueError(f"max_angle_rad is {self.max_angle_rad}, not 0 to pi")
+    max_angle_rad: Annotated[float, Bounds(0, math.pi, exclusive=True)] = math.pi / 4
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
@@ -42,7 +40,7 @@ class NormalCompatibility(Rejector):
 
 @part("rejector", "curvature", label="validated")
 @dataclass(frozen=True)
-class CurvatureCompatibility(Rejector):
+class CurvatureCompatibility(Bounded, Rejector):
     """Drops pairs of different curvature (section 2.9.4).
 
     Attributes
@@ -51,11 +49,7 @@ class CurvatureCompatibility(Rejector):
         Largest difference of the mean curvatures, times the resolution.
     """
 
-    tolerance: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
+    tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.2
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
@@ -66,7 +60,7 @@ class CurvatureCompatibility(Rejector):
 
 @part("rejector", "amplitude", label="validated")
 @dataclass(frozen=True)
-class AmplitudeCompatibility(Rejector):
+class AmplitudeCompatibility(Bounded, Rejector):
     """Drops pairs of different amplitude (Godin et al. 1994); needs amplitude in both views.
 
     Attributes
@@ -75,11 +69,7 @@ class AmplitudeCompatibility(Rejector):
         Largest ratio of the amplitudes, more than 1.
     """
 
-    ratio: float = 1.5
-
-    def __post_init__(self) -> None:
-        if not self.ratio > 1:
-            raise ValueError(f"ratio is {self.ratio}, not more than 1")
+    ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.5
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
@@ -90,7 +80,7 @@ class AmplitudeCompatibility(Rejector):
 
 @part("rejector", "color", label="validated")
 @dataclass(frozen=True)
-class ColorCompatibility(Rejector):
+class ColorCompatibility(Bounded, Rejector):
     """Drops pairs of different colour (Pulli 1999); needs colour in both views.
 
     Attributes
@@ -99,11 +89,7 @@ class ColorCompatibility(Rejector):
         Largest RGB distance; black and white differ by sqrt(3).
     """
 
-    tolerance: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
+    tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.2
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
@@ -127,7 +113,7 @@ class Boundary(Rejector):
 
 @part("rejector", "trimmed", label="validated")
 @dataclass(frozen=True)
-class Trimmed(Rejector):
+class Trimmed(Bounded, Rejector):
     """Keeps the shortest pairs, as many as the source has points in the overlap (TrICP).
 
     Chetverikov, Stepanov and Krsek (2005). Of equally short pairs the first are kept.
@@ -138,11 +124,7 @@ class Trimmed(Rejector):
         Fraction of the selected points of the source that lie in the overlap.
     """
 
-    overlap: float = 0.8
-
-    def __post_init__(self) -> None:
-        if not 0 < self.overlap <= 1:
-            raise ValueError(f"overlap is {self.overlap}, not more than 0 and at most 1")
+    overlap: Annotated[float, Bounds(0.01, 1)] = 0.8
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.kernels.cloud_matching import grid_search
 from tofuse.kernels.icp import transform_points
@@ -25,7 +26,7 @@ _GRAZING = 0.1
 
 @part("matcher", "normal-shooting", label="validated")
 @dataclass(frozen=True)
-class NormalShooting(Matcher):
+class NormalShooting(Bounded, Matcher):
     """Intersection of a source point's normal with the target's surface (Chen and Medioni 1992).
 
     The surface is sampled, so the intersection is iterated as in the paper: the line is intersected
@@ -38,12 +39,8 @@ class NormalShooting(Matcher):
         Number of iterations.
     """
 
-    steps: int = 3
+    steps: Annotated[int, Bounds(1)] = 3
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps is {self.steps}, not 1 or more")
 
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""
@@ -95,7 +92,7 @@ class Projection(Matcher):
 
 @part("matcher", "projection-search", label="validated")
 @dataclass(frozen=True)
-class ProjectionSearch(Matcher):
+class ProjectionSearch(Bounded, Matcher):
     """The closest point around the pixel to which a source point projects (section 2.9.3).
 
     The search continues around the closest point within `radius` until none is closer. Needs a
@@ -107,12 +104,8 @@ class ProjectionSearch(Matcher):
         Pixels.
     """
 
-    radius: int = 2
+    radius: Annotated[int, Bounds(1)] = 2
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        if self.radius < 1:
-            raise ValueError(f"radius is {self.radius}, not 1 or more")
 
     def prepare(self, target: Points) -> Search:
         """Index the target's points by pixel."""
@@ -151,7 +144,7 @@ class _GridSearch:
 
 @part("matcher", "closest-compatible", label="validated")
 @dataclass(frozen=True)
-class ClosestCompatible(Matcher):
+class ClosestCompatible(Bounded, Matcher):
     """The closest target point of similar amplitude (ICCP: Godin, Rioux and Baribeau 1994).
 
     Points are compatible if their amplitudes differ by less than a factor. The search skips
@@ -163,12 +156,8 @@ class ClosestCompatible(Matcher):
         Largest ratio of two compatible amplitudes, more than 1.
     """
 
-    ratio: float = 1.2
+    ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.2
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if not self.ratio > 1:
-            raise ValueError(f"ratio is {self.ratio}, not more than 1")
 
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""
@@ -201,7 +190,7 @@ def _log_amplitude(points: Points) -> Float64:
 
 @part("matcher", "closest-invariant", label="validated")
 @dataclass(frozen=True)
-class ClosestInvariant(Matcher):
+class ClosestInvariant(Bounded, Matcher):
     """The target point closest in space and in invariant features (ICPIF: Sharp et al. 2002).
 
     Minimises ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features are pose-invariant: mean
@@ -220,15 +209,14 @@ class ClosestInvariant(Matcher):
     """
 
     features: tuple[Invariant, ...] = ("moments",)
-    weight: float = 20.0
-    radius: float = 6.0
+    weight: Annotated[float, Bounds(0, exclusive=True)] = 20.0
+    radius: Annotated[float, Bounds(0, exclusive=True)] = 6.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.features:
             raise ValueError("features is empty")
-        if not (self.weight > 0 and self.radius > 0):
-            raise ValueError("weight or radius is not more than 0")
 
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -67,12 +67,6 @@ class Features(Bounded, Registrar):
     verify: bool = True
     consensus: ConsensusOptions = ConsensusOptions()  # noqa: RUF009 - immutable
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, choices in (("detector", Detector), ("light", Light)):
-            if getattr(self, name) not in get_args(choices):
-                raise ValueError(f"{name} is {getattr(self, name)!r}, not one of {choices}")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

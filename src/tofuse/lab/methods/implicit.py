@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.kernels.cloud_sums import plane_sums
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 from tofuse.parts import part
@@ -20,7 +22,7 @@ _FAR = 3.0
 
 @part("metric", "imls", label="validated")
 @dataclass(frozen=True)
-class Implicit(SurfaceMetric):
+class Implicit(Bounded, SurfaceMetric):
     """Distances to the IMLS surface of the target's points (eq 1 of the paper).
 
     ``I(x) = sum W_i(x) (x - p_i) . n_i / sum W_i(x)`` with ``W_i(x) = exp(-|x - p_i|^2 / h^2)`` is
@@ -34,11 +36,7 @@ class Implicit(SurfaceMetric):
         h, in resolutions (the paper: 0.06 m with points some 0.05 m apart, rounded up here).
     """
 
-    width: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not self.width > 0:
-            raise ValueError(f"width is {self.width}, not above 0")
+    width: Annotated[float, Bounds(0, exclusive=True)] = 2.0
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""

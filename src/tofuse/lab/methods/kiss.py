@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -70,7 +71,7 @@ class AdaptiveThreshold:
 
 @part("odometry", "kiss-icp", label="validated")
 @dataclass(frozen=True)
-class Kiss(Odometry):
+class Kiss(Bounded, Odometry):
     """Point-to-point ICP of each frame to the map of the previous ones; constant velocity model.
 
     The frame is downsampled to one point per voxel of half the map's voxel size, and these to one
@@ -89,16 +90,10 @@ class Kiss(Odometry):
         Minimum number of valid points of a frame.
     """
 
-    voxel: float | None = None
+    voxel: Annotated[float | None, Bounds(0, exclusive=True)] = None
     max_iterations: int = 500
-    minimum_points: int = 10
+    minimum_points: Annotated[int, Bounds(3)] = 10
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if self.voxel is not None and not self.voxel > 0:
-            raise ValueError(f"voxel is {self.voxel}, not above 0")
-        if self.minimum_points < 3:
-            raise ValueError(f"minimum_points is {self.minimum_points}, not 3 or more")
 
     def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`; deterministic."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.methods.neighbourhoods import neighbourhood
@@ -55,7 +55,7 @@ class _Feet:
 
 @part("registration", "ls3d", label="validated")
 @dataclass(frozen=True)
-class LeastSquaresMatching(Registrar):
+class LeastSquaresMatching(Bounded, Registrar):
     """Generalised Gauss-Markov model of the distances between two surfaces.
 
     The target is a surface of planar triangles (fans of each point's neighbours). Each point of the
@@ -88,24 +88,14 @@ class LeastSquaresMatching(Registrar):
         Maximum number of iterations.
     """
 
-    resolution: float = 0.01
+    resolution: Annotated[float, Bounds(0, exclusive=True)] = 0.01
     points: int | None = 1000
-    reach: float = 5.0
-    outlier: float = 4.0
-    scale_sigma: float = 0.0
-    light: float = 0.0
-    max_iterations: int = 50
+    reach: Annotated[float, Bounds(0, exclusive=True)] = 5.0
+    outlier: Annotated[float, Bounds(0, exclusive=True)] = 4.0
+    scale_sigma: Annotated[float, Bounds(0)] = 0.0
+    light: Annotated[float, Bounds(0)] = 0.0
+    max_iterations: Annotated[int, Bounds(1)] = 50
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
-        for name in ("resolution", "reach", "outlier"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("scale_sigma", "light"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

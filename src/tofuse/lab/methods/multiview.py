@@ -9,11 +9,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
@@ -84,7 +85,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Relaxing(Refining):
+class Relaxing(Bounded, Refining):
     """A joint refinement of all views by corresponding points.
 
     Attributes
@@ -99,15 +100,10 @@ class Relaxing(Refining):
         Maximum number of views, spaced by the camera's motion; the others follow them.
     """
 
-    points: int = 2000
-    reach: float = 5.0
-    rounds: int = 60
-    views: int = 60
-
-    def __post_init__(self) -> None:
-        for name in ("points", "reach", "rounds", "views"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+    points: Annotated[int, Bounds(1)] = 2000
+    reach: Annotated[float, Bounds(0, exclusive=True)] = 5.0
+    rounds: Annotated[int, Bounds(1)] = 60
+    views: Annotated[int, Bounds(1)] = 60
 
     @abstractmethod
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -46,7 +47,7 @@ class _Cells:
 
 @part("registration", "ndt", label="validated")
 @dataclass(frozen=True)
-class Ndt(Registrar):
+class Ndt(Bounded, Registrar):
     """Coarse-to-fine alignment of the source's points to normal distributions of the target's.
 
     The target is divided into cells, each with the mean and covariance of its points. The score ::
@@ -72,14 +73,15 @@ class Ndt(Registrar):
 
     resolution: float = 0.01
     points: int | None = 1000
-    coarsest: float = 40.0
-    finest: float = 5.0
+    coarsest: Annotated[float, Bounds(0, exclusive=True)] = 40.0
+    finest: Annotated[float, Bounds(0, exclusive=True)] = 5.0
     max_iterations: int = 30
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        if not 0 < self.finest <= self.coarsest:
-            raise ValueError(f"finest is {self.finest}, not above 0 and at most coarsest")
+        super().__post_init__()
+        if self.finest > self.coarsest:
+            raise ValueError(f"finest must be at most {self.coarsest:g}, not {self.finest!r}")
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

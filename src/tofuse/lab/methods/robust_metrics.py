@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Metric
@@ -24,7 +26,7 @@ _CUT = 10.0
 
 @part("metric", "gnc", label="validated")
 @dataclass(frozen=True)
-class Graduated(Metric):
+class Graduated(Bounded, Metric):
     """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas, Carlone 2020).
 
     Pairs with a distance above c contribute c^2. As that sum has many minima, a convex surrogate is
@@ -43,11 +45,7 @@ class Graduated(Metric):
         c: largest distance of an inlier, in resolutions.
     """
 
-    inlier: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not self.inlier > 0:
-            raise ValueError(f"inlier is {self.inlier}, not above 0")
+    inlier: Annotated[float, Bounds(0, exclusive=True)] = 2.0
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""

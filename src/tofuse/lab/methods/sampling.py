@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -32,7 +33,7 @@ class RandomEachIteration(Random):
 
 @part("selector", "voxel", label="validated")
 @dataclass(frozen=True)
-class Voxel(Selector):
+class Voxel(Bounded, Selector):
     """The point closest to the centre of each voxel: uniform density on surfaces.
 
     Attributes
@@ -41,11 +42,7 @@ class Voxel(Selector):
         Voxel size in m.
     """
 
-    size: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not self.size > 0:
-            raise ValueError(f"size is {self.size}, not more than 0")
+    size: Annotated[float, Bounds(0, exclusive=True)] = 0.05
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`; draws nothing."""
@@ -61,7 +58,7 @@ class Voxel(Selector):
 
 @part("selector", "normal-space", label="validated")
 @dataclass(frozen=True)
-class NormalSpace(Selector):
+class NormalSpace(Bounded, Selector):
     """Normal-space sampling (Rusinkiewicz and Levoy 2001).
 
     Points are binned by normal direction and drawn at random from the bins in turn, so that small
@@ -78,15 +75,9 @@ class NormalSpace(Selector):
         Points per plane fit, if the view has no normals.
     """
 
-    points: int = 1000
-    buckets: int = 8
-    neighbours: int = NEIGHBOURS
-
-    def __post_init__(self) -> None:
-        if self.points < 1 or self.buckets < 1:
-            raise ValueError("points or buckets is not 1 or more")
-        if self.neighbours < 3:
-            raise ValueError(f"neighbours is {self.neighbours}, not 3 or more")
+    points: Annotated[int, Bounds(1)] = 1000
+    buckets: Annotated[int, Bounds(1)] = 8
+    neighbours: Annotated[int, Bounds(3)] = NEIGHBOURS
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`."""
@@ -121,7 +112,7 @@ def _bucket(normals: Float64, side: int) -> Int64:
 
 @part("selector", "intensity-gradient", label="validated")
 @dataclass(frozen=True)
-class IntensityGradient(Selector):
+class IntensityGradient(Bounded, Selector):
     """The points of largest amplitude gradient (Weik 1997).
 
     The gradient of the logarithmic amplitude is taken between a pixel's neighbours, all of which
@@ -133,11 +124,7 @@ class IntensityGradient(Selector):
         How many.
     """
 
-    points: int = 1000
-
-    def __post_init__(self) -> None:
-        if self.points < 1:
-            raise ValueError(f"points is {self.points}, not 1 or more")
+    points: Annotated[int, Bounds(1)] = 1000
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`; draws nothing.

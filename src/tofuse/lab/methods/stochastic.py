@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.castellani import free_vertices
@@ -16,7 +18,7 @@ from tofuse.posegraph.levenberg import check_graph
 
 @part("optimiser", "stochastic", label="validated")
 @dataclass(frozen=True)
-class Stochastic(Optimiser):
+class Stochastic(Bounded, Optimiser):
     """Satisfy edges sequentially with decreasing rate, by all poses between their ends.
 
     A pose is the sum of the steps before it (incremental poses), so that the error of an edge is
@@ -34,11 +36,7 @@ class Stochastic(Optimiser):
         Rounds over all edges.
     """
 
-    rounds: int = 100
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"rounds is {self.rounds}, not 1 or more")
+    rounds: Annotated[int, Bounds(1)] = 100
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`; the best poses of all rounds. InputError as `lu-milios`."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.lab.methods.compatibility import Trimmed
 from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
 from tofuse.lab.methods.symmetric import Symmetric
@@ -138,7 +139,7 @@ class GeneralizedIcp(Variant):
 
 @part("registration", "tricp", label="validated")
 @dataclass(frozen=True)
-class Tricp(Registrar):
+class Tricp(Bounded, Registrar):
     """Trimmed ICP (Chetverikov, Stepanov and Krsek 2005).
 
     Each iteration keeps the fraction xi of shortest pairs, at any distance. An unknown overlap xi
@@ -165,19 +166,11 @@ class Tricp(Registrar):
 
     resolution: float = 0.01
     points: int | None = 1000
-    overlap: float | None = None
-    smallest: float = 0.4
+    overlap: Annotated[float | None, Bounds(0.01, 1)] = None
+    smallest: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.4
     preference: float = 2.0
-    tolerance: float = 0.02
+    tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.02
     max_iterations: int = 100
-
-    def __post_init__(self) -> None:
-        if self.overlap is not None and not 0 < self.overlap <= 1:
-            raise ValueError(f"overlap is {self.overlap}, not more than 0 and at most 1")
-        if not 0 < self.smallest < 1:
-            raise ValueError(f"smallest is {self.smallest}, not between 0 and 1")
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
 
     @property
     def takes(self) -> frozenset[str]:
