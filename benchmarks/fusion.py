@@ -223,7 +223,7 @@ def within(path: Path, count: int, memory_mb: int) -> None:
             views.add(RangeView.of(frame, prepare_view(frame, SurfaceOptions())))
             poses.append(T)
         T_world = np.array(poses)
-        layout = Layout.of(views, T_world, fitting_voxel(views), options)
+        layout = Layout.of(views, T_world, fitting_voxel(views))
         regions = len(layout.regions(memory_mb * 1_000_000 // layout.block_bytes))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         started = time.process_time()

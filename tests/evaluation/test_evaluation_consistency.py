@@ -19,7 +19,7 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import (
     Consistency,
     SurfaceImage,
-    consistency_of_frames,
+    consistency_of_images,
     map_consistency,
     poses_of_frames,
 )
@@ -152,6 +152,12 @@ def twin(frames: list[RangeFrame], poses: Float64) -> tuple[float, float, int]:
 
 def ray_table() -> RayTable:
     return RayTable(BrownConrady(40, 30, 36.0, 36.0, 19.0, 15.0, k1=-0.15, k2=0.03).rays())
+
+
+def consistency_of_frames(frames, poses) -> Consistency:
+    T = np.asarray(poses, float)
+    posed = np.flatnonzero(np.isfinite(T).all((1, 2)))
+    return consistency_of_images([SurfaceImage.of(frames[k]) for k in posed], T[posed])
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_regions_make_the_same_surface_to_the_byte(room, memory_mb, least) -> No
     options = Fusion(voxel_m=0.03, island=60)
     whole = fuse_surface(views, poses, options)
     small = replace(options, memory_mb=memory_mb)
-    layout = Layout.of(views, poses, 0.03, small)
+    layout = Layout.of(views, poses, 0.03)
     assert len(layout.regions(memory_mb * 1_000_000 // layout.block_bytes)) >= least
     same(fuse_surface(views, poses, small), whole)
     with threads(1):
@@ -76,18 +76,17 @@ def test_turns_colours_and_views_of_two_cameras_make_no_seam() -> None:
 
 def test_voxels_don_t_grow_where_memory_is_short(room) -> None:
     views, poses = room
-    small = Layout.of(views, poses, 0.03, Fusion(memory_mb=1))
-    assert small.voxel_m == 0.03
-    most = 1_000_000 // small.block_bytes
-    for region in small.regions(most):
-        volume = Volume.of(small, region)
+    layout = Layout.of(views, poses, 0.03)
+    assert layout.voxel_m == 0.03
+    for region in layout.regions(1_000_000 // layout.block_bytes):
+        volume = Volume.of(layout, region)
         arrays = (volume.distance, volume.weight, volume.seen, volume.color, volume.free)
         assert sum(a.nbytes for a in arrays) <= 1e6
 
 
 def test_each_block_is_of_one_region_and_has_its_neighbours_around(room) -> None:
     views, poses = room
-    layout = Layout.of(views, poses, 0.03, Fusion())
+    layout = Layout.of(views, poses, 0.03)
     place = {block_of(int(key)): k for k, key in enumerate(layout.keys)}
     regions = layout.regions(300)
     owned = np.concatenate([region.rows[: region.own] for region in regions])
@@ -123,7 +122,7 @@ def test_views_that_are_passed_over_would_have_told_nothing(room, which) -> None
         floor = [plane_range(T, np.array([0, 1.0, 0]), 0.4) for T in poses]
         near = [np.where(f < 6, f, np.inf) for f in floor]
         views = [RangeView.of(frame_of(f, k, sigma=0.03)) for k, f in enumerate(near)]
-    layout = Layout.of(views, poses, 0.01 if which == "ball" else 0.03, Fusion())
+    layout = Layout.of(views, poses, 0.01 if which == "ball" else 0.03)
     frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
     passed = 0
     for region in layout.regions(40):
@@ -171,7 +170,7 @@ def test_an_island_is_told_by_all_its_parts() -> None:
     ranges[:34] = np.inf
     ranges[40:] = np.inf
     view = RangeView.of(frame_of(ranges))
-    layout = Layout.of([view], EYE[None], 0.01, Fusion())
+    layout = Layout.of([view], EYE[None], 0.01)
     pieces: Spill[Piece] = Spill(0)
     largest = 0
     for region in layout.regions(30):

@@ -191,10 +191,15 @@ def _mesh(vertices, faces):
     return Mesh.of(vertices, faces)
 
 
+def surface(scene, name):
+    """The id of the first surface with this name."""
+    return [material.name for material in scene.materials].index(name)
+
+
 def test_box_is_300_by_300_by_400_mm_with_its_top_in_view(built):
     scene, sequence = built["box"]
     vertices, faces = scene.truth_mesh()
-    box = scene.surface_named("box")
+    box = surface(scene, "box")
     hits = look(scene, sequence, 0.0, sr4000_rays(1))
     top = (hits.surface == box) & (hits.normal[:, 2] > 0.999)
     assert top.sum() > 300
@@ -210,7 +215,7 @@ def test_box_is_300_by_300_by_400_mm_with_its_top_in_view(built):
         assert not (hits.surface[edge] == box).any()
         on = hits.surface == box
         assert hits.distance[on].max() < scene.max_depth_m
-        steel = hits.surface == scene.surface_named("stand")
+        steel = hits.surface == surface(scene, "stand")
         beyond = (hits.distance * rays[:, 2])[~on & ~steel]
         assert beyond.min() > scene.max_depth_m
 
@@ -218,7 +223,7 @@ def test_box_is_300_by_300_by_400_mm_with_its_top_in_view(built):
 def test_torso_turns_in_view_nearer_than_the_cut(built):
     scene, sequence = built["torso"]
     rays = sr4000_rays(4)
-    person = [scene.surface_named(n) for n in ("shirt", "skin", "hair", "trousers", "seat")]
+    person = [surface(scene, n) for n in ("shirt", "skin", "hair", "trousers", "seat")]
     for t in np.linspace(0, 7, 6):
         hits = look(scene, sequence, t, rays)
         on = np.isin(hits.surface, person)

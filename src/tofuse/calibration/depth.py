@@ -125,7 +125,7 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     knots = np.linspace(low, high, count)
     shape = camera.height, camera.width
     thinned = [_subsampled(view, shape) for view in views]
-    state = _solve(thinned, knots, shape)
+    state = _solve(thinned, knots)
     if not state.shape_sigma < _MAX_SHAPE_M:
         raise InputError(
             f"shows {len(views)} planes, which determine the curve only to "
@@ -142,7 +142,7 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     curve = state.curve + mean
     after = [r - offsets.ravel()[v.pixels] - mean for r, v in zip(residuals, views, strict=True)]
     flat = np.zeros_like(curve)
-    before = _residuals(views, knots, _fit_planes(thinned, knots, flat, shape))
+    before = _residuals(views, knots, _fit_planes(thinned, knots, flat))
     constant, scale = state.sigma
     return DepthFit(
         DepthCorrection(knots, curve, offsets.astype(np.float32)),
@@ -201,20 +201,17 @@ def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
     )
 
 
-def _fit_planes(
-    views: Sequence[PlaneView], knots: Float64, curve: Float64, shape: tuple[int, int]
-) -> _State:
+def _fit_planes(views: Sequence[PlaneView], knots: Float64, curve: Float64) -> _State:
     """Fit the planes to the measurements, with the curve fixed."""
-    return _solve(views, knots, shape, held=curve)
+    return _solve(views, knots, curve)
 
 
 def _solve(
     views: Sequence[PlaneView],
     knots: Float64,
-    shape: tuple[int, int],
-    held: Float64 | None = None,
+    fixed: Float64 | None = None,
 ) -> _State:
-    """Run Gauss-Newton over curve and planes, or over planes only if the curve `held` is given."""
+    """Run Gauss-Newton over planes and curve, unless the curve is `fixed`."""
     many = len(knots)
     counts = [len(view.pixels) for view in views]
     measured = np.concatenate([view.measured_m for view in views])
@@ -223,7 +220,7 @@ def _solve(
     which = np.repeat(np.arange(len(views)), counts)
     pixels, pixel = np.unique(np.concatenate([view.pixels for view in views]), return_inverse=True)
     start = np.stack([view.plane for view in views])
-    planes, curve = start.copy(), np.zeros(many) if held is None else held.copy()
+    planes, curve = start.copy(), np.zeros(many) if fixed is None else fixed.copy()
     offsets = np.zeros(len(pixels))
     prior = _prior(knots, posed=_has_known_pose(views))
     believed = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
@@ -251,7 +248,7 @@ def _solve(
         right = AtW @ target
         by_pixel = csr_array((weight, (pixel, np.arange(n))), (len(pixels), n))
         total = by_pixel.sum(1) + 1 / believed**2
-        if held is None:
+        if fixed is None:
             coupled = by_pixel @ A
             normal -= (coupled.T @ (diags_array(1 / total) @ coupled)).toarray()
             alone = (by_pixel @ target) / total
@@ -267,7 +264,7 @@ def _solve(
             own = slice(many + 3 * k, many + 3 * k + 3)
             normal[own, own] += view.information
             right[own] += view.information @ (start[k] - planes[k])
-        free = slice(0, None) if held is None else slice(many, None)
+        free = slice(0, None) if fixed is None else slice(many, None)
         step = np.zeros(size)
         # Scale the columns, as those of planes and curve have different units.
         unit = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-12))
@@ -275,7 +272,7 @@ def _solve(
         step[free] = unit * np.linalg.solve(scaled + 1e-10 * np.eye(len(unit)), unit * right[free])
         curve = curve + step[:many]
         planes = planes + step[many:].reshape(-1, 3)
-        if held is None:
+        if fixed is None:
             alone = (by_pixel @ (target - A @ step)) / total
             offsets = alone - held_mean * alone.sum() / total
             inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))

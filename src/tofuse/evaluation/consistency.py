@@ -324,18 +324,6 @@ def map_consistency(
     return consistency_of_images(images, T[used])
 
 
-def consistency_of_frames(
-    frames: Sequence[RangeFrame], poses: ArrayLike, limit: int = 60
-) -> Consistency:
-    """Map consistency of frames in memory under their poses (N, 4, 4) T_world_camera.
-
-    Uses at most `limit` of them, evenly spaced. Frames without a pose (NaN) are left out.
-    """
-    T = np.asarray(poses, float)
-    chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), limit)
-    return consistency_of_images([SurfaceImage.of(frames[k]) for k in chosen], T[chosen])
-
-
 def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:
     """Assign each pose to the frame nearest in time, if that is within 0.02 s.
 

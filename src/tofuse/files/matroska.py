@@ -48,7 +48,6 @@ class Track:
 
     number: int
     name: str = ""
-    codec: str = ""
     private: bytes = b""
     width: int = 0
     height: int = 0
@@ -208,7 +207,6 @@ class Matroska:
         track = Track(
             numbers.get(0xD7, 0),
             _text(values.get(0x536E, b"")),
-            _text(values.get(0x86, b"")),
             values.get(0x63A2, b""),
             duration_ns=numbers.get(0x23E383, 0),
         )

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.arrays import Float64, Int32, Int64
-from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.view_store import Views, summaries
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, enter
@@ -79,7 +78,7 @@ class Layout:
     free_space_stride: int
 
     @classmethod
-    def of(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Layout:
+    def of(cls, views: Views, poses: Float64, voxel_m: float) -> Layout:
         """Lay out the blocks near the surfaces of views at their poses (N, 4, 4)."""
         known = summaries(views)
         noise = [each.sigma_m for each in known if each.sigma_m > 0]

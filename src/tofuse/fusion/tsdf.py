@@ -87,7 +87,7 @@ class Volume:
     @classmethod
     def around(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Volume:
         """Return the empty volume of all blocks near the surfaces of views at poses (N, 4, 4)."""
-        layout = Layout.of(views, poses, voxel_m, options)
+        layout = Layout.of(views, poses, voxel_m)
         return cls.of(layout, layout.whole())
 
     @classmethod
@@ -417,7 +417,7 @@ def fuse_surface(
     memory of the options, it is made region by region, with the same result.
     """
     options = options or Fusion()
-    layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views), options)
+    layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views))
     regions = layout.regions(options.memory_mb * 1_000_000 // layout.block_bytes)
     if len(regions) == 1:
         volume = Volume.of(layout, regions[0])

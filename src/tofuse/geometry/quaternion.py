@@ -83,15 +83,3 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Float64:
         ],
         -1,
     )
-
-
-def conjugate(q: ArrayLike) -> Float64:
-    """Inverse of a unit quaternion: the three vector components negated."""
-    return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Float64:
-    """Quaternion of a rotation by `angle` (rad) about the unit vector `axis` (section 2.4)."""
-    axis = np.asarray(axis, float)
-    half = np.asarray(angle, float)[..., None] / 2
-    return np.concatenate([axis * np.sin(half), np.cos(half)], -1)

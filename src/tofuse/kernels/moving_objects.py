@@ -25,6 +25,8 @@ IN_FRONT = 2  # in free space of the other view
 BEHIND = 3  # occluded in the other view
 UNCLEAR = 4  # at a depth edge of either view, within the registration error
 
+Rows = tuple[float, ...]
+
 _MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
 _EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
@@ -54,16 +56,22 @@ def _along(w: float, on_ray: float) -> float:
 
 
 @kernel
-def moved_point(
-    r00: float, r01: float, r02: float, t0: float,
-    r10: float, r11: float, r12: float, t1: float,
-    r20: float, r21: float, r22: float, t2: float,
-    x: float, y: float, depth: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return (x/z, y/z, z) of the point at `depth` on the ray (x, y), transformed by (r, t).
+def rows_of(T: Float64) -> Rows:
+    """Return the first three rows of T (4, 4), one behind the other."""
+    return (
+        T[0, 0], T[0, 1], T[0, 2], T[0, 3],
+        T[1, 0], T[1, 1], T[1, 2], T[1, 3],
+        T[2, 0], T[2, 1], T[2, 2], T[2, 3],
+    )  # fmt: skip
+
+
+@kernel
+def moved_point(motion: Rows, x: float, y: float, depth: float) -> tuple[float, float, float]:
+    """Return (x/z, y/z, z) of the point at `depth` on the ray (x, y), transformed by `rows_of`.
 
     All are 0 if it is too near to the camera.
     """
+    r00, r01, r02, t0, r10, r11, r12, t1, r20, r21, r22, t2 = motion
     px, py = x * depth, y * depth
     z = r20 * px + r21 * py + r22 * depth + t2
     if not z > _MIN_DEPTH:
@@ -110,9 +118,7 @@ def residual_ratios(
 
     The other parameters are those of `compare`.
     """
-    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    motion = rows_of(T)
     rows, columns = moving.shape
     out = np.empty(((rows + every - 1) // every) * ((columns + every - 1) // every), np.float32)
     n = 0
@@ -130,21 +136,7 @@ def residual_ratios(
             if not depth > 0:
                 continue
             x, y, here = moved_point(
-                r00,
-                r01,
-                r02,
-                t0,
-                r10,
-                r11,
-                r12,
-                t1,
-                r20,
-                r21,
-                r22,
-                t2,
-                np.float64(rays[i, j, 0]),
-                np.float64(rays[i, j, 1]),
-                depth,
+                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
             )
             if here == 0:
                 continue
@@ -229,9 +221,7 @@ def compare(
     start, stop
         Rows of cells.
     """
-    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    motion = rows_of(T)
     rows, columns = other_z.shape
     model2, scale2 = model_error * model_error, scale * scale
     window = (2 * radius + 1) * (2 * radius + 1)
@@ -248,21 +238,7 @@ def compare(
             if not depth > 0:
                 continue
             x, y, here = moved_point(
-                r00,
-                r01,
-                r02,
-                t0,
-                r10,
-                r11,
-                r12,
-                t1,
-                r20,
-                r21,
-                r22,
-                t2,
-                np.float64(rays[i, j, 0]),
-                np.float64(rays[i, j, 1]),
-                depth,
+                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
             )
             if here == 0:
                 continue
@@ -361,9 +337,7 @@ def propagate(
     start, stop
         Rows of cells.
     """
-    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    motion = rows_of(T)
     for a in range(start, stop):
         for b in range(odds.shape[1]):
             i, j = a * stride, b * stride
@@ -378,21 +352,7 @@ def propagate(
             if not depth > 0:
                 continue
             x, y, here = moved_point(
-                r00,
-                r01,
-                r02,
-                t0,
-                r10,
-                r11,
-                r12,
-                t1,
-                r20,
-                r21,
-                r22,
-                t2,
-                np.float64(rays[i, j, 0]),
-                np.float64(rays[i, j, 1]),
-                depth,
+                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
             )
             if here == 0:
                 continue
@@ -445,9 +405,7 @@ def predict(
 
     The other parameters are those of `propagate`.
     """
-    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    motion = rows_of(T)
     for a in range(moving.shape[0]):
         for b in range(moving.shape[1]):
             i, j = a * stride, b * stride
@@ -456,21 +414,7 @@ def predict(
             if not depth > 0:
                 continue
             x, y, here = moved_point(
-                r00,
-                r01,
-                r02,
-                t0,
-                r10,
-                r11,
-                r12,
-                t1,
-                r20,
-                r21,
-                r22,
-                t2,
-                np.float64(rays[i, j, 0]),
-                np.float64(rays[i, j, 1]),
-                depth,
+                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
             )
             if here == 0:
                 continue

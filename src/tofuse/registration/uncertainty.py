@@ -207,7 +207,7 @@ def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float6
         x, y = found.places.T
         apart = np.hypot(x[:, None] - x, y[:, None] - y)
         alike = np.exp(-apart / options.reach)
-        seen = _seen_variance(found, bread, alike, options)
+        seen = _seen_variance(found, bread, alike)
         hidden = (options.hidden * found.depth * found.change) ** 2
         shared = np.exp(-0.5 * apart / options.reach) + options.offset**2
         B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
@@ -274,9 +274,7 @@ def no_worse_than(C: Float64, prior: Float64) -> Float64:
     return 0.5 * (cut + cut.T)
 
 
-def _seen_variance(
-    found: Patches, bread: Float64, alike: Float64, options: UncertaintyOptions
-) -> float:
+def _seen_variance(found: Patches, bread: Float64, alike: Float64) -> float:
     """Estimate the variance in m^2 of the correlated errors of patches from the residuals.
 
     Method of moments, corrected for the degrees of freedom of the fit: residuals are (1 - P) times

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.pipeline.adaptation import with_recording_defaults
@@ -114,10 +112,3 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"camera {k}" for k in range(len(paths))]
-
-
-def overlap_of_times(cameras: Sequence[Camera]) -> float:
-    """Return the common duration of all recordings by their clocks, s; negative without one."""
-    begin = max(float(c.recording.timestamps[0]) for c in cameras)
-    end = min(float(c.recording.timestamps[-1]) for c in cameras)
-    return float(np.subtract(end, begin))

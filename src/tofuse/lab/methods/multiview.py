@@ -190,16 +190,6 @@ def paired(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list[Pairs]
     return out
 
 
-def squared_error(poses: Float64, pairs: Sequence[Pairs]) -> float:
-    """E of eq 2.8: the sum of the squared distances of all paired points, m^2."""
-    return sum(
-        float(
-            ((transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)) ** 2).sum()
-        )
-        for p in pairs
-    )
-
-
 def rotation_to(H: Float64) -> Float64:
     """The rotation R (3, 3) that maximises the trace of R H (Arun 1987; Umeyama 1991)."""
     U, _, Vt = np.linalg.svd(H)

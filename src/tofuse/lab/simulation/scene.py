@@ -176,10 +176,6 @@ class Scene:
         """Number of triangles, of all bodies together."""
         return sum(len(body.mesh.faces) for body in (self._room, *self._moving))
 
-    def surface_named(self, name: str) -> int:
-        """Return the id of the first surface with this name; ValueError if there is none."""
-        return [material.name for material in self.materials].index(name)
-
     def cast(
         self,
         origins: ArrayLike,

@@ -226,9 +226,3 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
         return T @ paths.rotation([0, 0, 0.012 * np.sin(rate * t / 2)])
 
     return path
-
-
-def room_of(position: Float64) -> int:
-    """Return the room of a position (3,) in the flat's frame."""
-    x, y = position[:2]
-    return {(False, False): 0, (True, False): 1, (True, True): 2, (False, True): 3}[x > 0, y > 0]
