@@ -177,6 +177,19 @@ def test_residuals_near_the_limit_do_not_make_a_direction_unknown():
     assert (unbounded / steep).max() > 10
 
 
+@pytest.mark.parametrize("information", [-0.1, 0.0, 0.001, 0.1])
+def test_less_information_never_means_a_smaller_sigma(information):
+    """Also where the cross information is negative, because noise dominates the normals."""
+    diagonal = np.array([100.0, 100.0, information, 100.0, 100.0, 100.0, 1.0])
+    H = np.diag(np.maximum(diagonal, 0.0))
+    nothing = np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 7))
+    found = Patches(H, np.zeros((7, 7)), np.diag(diagonal), np.diag(diagonal), *nothing, 0, 2.0, 2)
+    options = UncertaintyOptions(noise_pixels=1.0)
+    sigma = _sigmas(covariance_of_patches(found, options))
+    assert 0.9 * options.loosest < sigma[2] < 1.1 * options.loosest
+    np.testing.assert_allclose(sigma[[0, 1, 3, 4, 5]], 0.1, rtol=1e-3)
+
+
 def test_prior_takes_only_the_unobservable_directions():
     C = np.diag([1e-6] * 3 + [1e-7] * 3)
     directions = np.eye(6)[[0]]

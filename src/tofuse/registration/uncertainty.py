@@ -39,6 +39,8 @@ _MIN_PIXELS = 10
 _MIN_TILES = 6
 # Minimum sigma, in units of 1 cm and 1 degree: keeps the covariance of a still camera invertible.
 _MIN_SIGMA = 1e-3
+# Information of an unconstrained direction, as a fraction of that of the weak prior.
+_NO_INFORMATION = 1e-3
 # Approximate number of pixels used: the noise of denser ones is correlated.
 _PIXELS = 6336
 
@@ -199,15 +201,16 @@ def _places(rows: int, columns: int, across: int, down: int) -> Float64:
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
     """Return the covariance (6, 6) of the right perturbation in m and rad, without a prior."""
-    bread = _bounded_inverse(_slope(found, options), options.loosest)
+    slope, prior = _with_weak_prior(_slope(found, options), options.loosest)
+    bread = np.asarray(np.linalg.inv(slope), np.float64)
     per_pixel = found.stride**2
-    B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
+    B = max(1.0, options.noise_pixels / per_pixel) * found.geometry + prior
     B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
     if len(found.weights) >= _MIN_TILES:
         x, y = found.places.T
         apart = np.hypot(x[:, None] - x, y[:, None] - y)
         alike = np.exp(-apart / options.reach)
-        seen = _seen_variance(found, bread, alike)
+        seen = _seen_variance(found, bread, alike, options)
         hidden = (options.hidden * found.depth * found.change) ** 2
         shared = np.exp(-0.5 * apart / options.reach) + options.offset**2
         B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
@@ -274,7 +277,9 @@ def no_worse_than(C: Float64, prior: Float64) -> Float64:
     return 0.5 * (cut + cut.T)
 
 
-def _seen_variance(found: Patches, bread: Float64, alike: Float64) -> float:
+def _seen_variance(
+    found: Patches, bread: Float64, alike: Float64, options: UncertaintyOptions
+) -> float:
     """Estimate the variance in m^2 of the correlated errors of patches from the residuals.
 
     Method of moments, corrected for the degrees of freedom of the fit: residuals are (1 - P) times
@@ -297,22 +302,28 @@ def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
     a difference of large numbers and may even be negative.
     """
     values, vectors = np.linalg.eigh(found.weighed)
-    root = vectors / np.sqrt(np.maximum(values, options.loosest**-2))
+    root = vectors / np.sqrt(np.maximum(values, _NO_INFORMATION * options.loosest**-2))
     values, turned = np.linalg.eigh(root.T @ found.cross @ root)
     back = np.linalg.inv(root).T @ turned
     X: Float64 = (back * np.maximum(values, options.steepness)) @ back.T
     return X
 
 
-def _bounded_inverse(X: Float64, loosest: float) -> Float64:
-    """Return the inverse of X (7, 7) with eigenvalues bounded by the square of `loosest`."""
+def _with_weak_prior(X: Float64, loosest: float) -> tuple[Float64, Float64]:
+    """Raise the eigenvalues of X (7, 7) to ``loosest**-2``; return it, and the prior's B (7, 7).
+
+    What is added to X is the information of a prior, which counts in B as well: without it, the
+    less a direction is constrained, the smaller would be its variance ``B / X**2``.
+    """
     X = X.copy()
     if X[6, 6] <= 0:
         X[6, :] = X[:, 6] = 0.0
         X[6, 6] = 1.0
     values, vectors = np.linalg.eigh(X)
-    inverse: Float64 = (vectors / np.maximum(values, loosest**-2)) @ vectors.T
-    return inverse
+    missing = np.maximum(loosest**-2 - values, 0.0)
+    raised: Float64 = X + (vectors * missing) @ vectors.T
+    prior: Float64 = (vectors * np.minimum(missing, loosest**-2)) @ vectors.T
+    return raised, prior
 
 
 def _matrix(upper: Float64) -> Float64:
