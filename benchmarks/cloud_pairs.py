@@ -45,7 +45,7 @@ from tofuse.registration.confidence import CLOUDS, Evidence
 from tofuse.registration.viewpoint import viewpoint_of
 
 POINTS = 20_000
-RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.1, 0.05, 4.0
+RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0
 # What moves by itself stands before a background that does not.
 OBJECT_M = 1.6
 
@@ -61,7 +61,7 @@ class Pair:
     @property
     def allowed_m(self) -> float:
         """Error up to which a pose is right."""
-        return min(RIGHT_M, RIGHT_SHARE * self.extent)
+        return min(RIGHT_M, RIGHT_FRACTION * self.extent)
 
     @property
     def extent(self) -> float:

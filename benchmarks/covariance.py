@@ -133,10 +133,10 @@ def row(name: str, errors: Float64) -> str:
     errors = errors[np.isfinite(errors)]
     if not len(errors):
         return f"  {name:<12}      0"
-    shares = [100 * float(np.mean(errors < limit)) for limit in LIMITS]
+    fractions = [100 * float(np.mean(errors < limit)) for limit in LIMITS]
     marks = " ".join(
-        f"{share:5.0f}{' ' if low <= share <= high else '*'}"
-        for share, (low, high) in zip(shares, WANTED, strict=True)
+        f"{fraction:5.0f}{' ' if low <= fraction <= high else '*'}"
+        for fraction, (low, high) in zip(fractions, WANTED, strict=True)
     )
     return f"  {name:<12} {len(errors):6} {marks}   {np.median(errors) / LIMITS[0]:5.2f}"
 

@@ -126,8 +126,8 @@ def true_information(
 
 def sigma_along(information: Float64, direction: Float64) -> float:
     """Sigma along a unit direction, the others known, in units of 1 cm and 1 degree."""
-    held = direction @ (information * np.outer(UNITS, UNITS)) @ direction
-    return float(1 / np.sqrt(max(held, 1e-6)))
+    along = direction @ (information * np.outer(UNITS, UNITS)) @ direction
+    return float(1 / np.sqrt(max(along, 1e-6)))
 
 
 def comes_back(

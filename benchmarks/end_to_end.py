@@ -140,9 +140,9 @@ def table(rows: Sequence[tuple[str, Sequence[Spent]]]) -> Iterator[str]:
         rest = middle.wall_s - sum(middle.stages.values())
         for part, s in {**middle.stages, "start, writing": max(0.0, rest)}.items():
             if s >= 0.05:
-                share = s / max(middle.wall_s, 1e-9)
+                fraction = s / max(middle.wall_s, 1e-9)
                 each = 1e3 * s / max(1, middle.frames)
-                yield f"  {part:<26}{s:>8.1f}{each:>12.1f}{share:>8.0%}"
+                yield f"  {part:<26}{s:>8.1f}{each:>12.1f}{fraction:>8.0%}"
     if len(rows) > 1:
         ours, theirs = (statistics.median(r.ms_a_frame for r in runs) for _, runs in rows[:2])
         yield f"{rows[1][0]} takes {theirs / ours:.1f} times as long"

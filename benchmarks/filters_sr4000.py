@@ -46,7 +46,7 @@ CASES: dict[str, list[Filter]] = {
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the pixels kept in all frames: median and rms deviation in m, and their share."""
+    """Noise of the pixels kept in all frames: median and rms deviation in m, and their fraction."""
 
     median_m: float
     rms_m: float

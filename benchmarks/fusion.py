@@ -3,7 +3,7 @@
 The simulated room is taken by the SR4000, by default with noise, mixed pixels, phase wraps and
 saturation only (`--all`: with all errors of the camera). The surface is made at the true
 poses, and (`--estimated`) at those of the default method; errors are the distances to the true
-surface. Completeness is the share of the truth within 1 cm of the model: of what was seen by a
+surface. Completeness is the fraction of the truth within 1 cm of the model: of what was seen by a
 pixel that is valid (this camera gives noise where there is too little light), and of what the
 filters keep. Where Open3D is installed, its own fusion gets the same frames, filtered, at the same
 poses, with voxels of the same size; it is shown with all surfaces and with those of three views.
@@ -60,7 +60,7 @@ from tofuse.recordings.native import corrected_depth
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
-_NOISE_SHARE = 0.01  # of the range
+_NOISE_FRACTION = 0.01  # of the range
 _ELSEWHERE = np.repeat([0.05, 0.03], 3)  # m and radians off the path
 _CELL_M = 0.01  # of the points that were seen, one is taken in each
 
@@ -153,7 +153,7 @@ def around_the_room(
         time_s = made.raw[step * k % len(made.raw)] / made.sequence.frame_rate_hz
         T = made.sequence.T_room_camera(time_s) @ se3.exp(rng.normal(0, _ELSEWHERE))
         ranges = made.scene.cast(T[:3, 3], rays @ T[:3, :3].T).distance.reshape(shape)
-        noisy = ranges * (1 + _NOISE_SHARE * rng.standard_normal(shape))
+        noisy = ranges * (1 + _NOISE_FRACTION * rng.standard_normal(shape))
         depth = np.where(np.isfinite(ranges), noisy, 0).astype(np.float32)
         yield RangeFrame(k, k / made.sequence.frame_rate_hz, camera, depth, "range"), T
 
@@ -162,7 +162,7 @@ def long_run(count: int) -> None:
     """Print what views of one room cost while there are more and more of them."""
     builder = ModelBuilder(Fusion())
     poses: dict[int, Float64] = {}
-    marks = {round(count * share) for share in (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
+    marks = {round(count * fraction) for fraction in (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
     kept_s: list[float] = []
     print(
         f"{'frames':>7} {'views':>6} {'views MB':>9} {'keep ms a view':>16} "

@@ -6,9 +6,9 @@ corrected and filtered by the default method; with `--estimated` they are recons
 well, and the result is aligned with the truth by its trajectory. Printed of each are
 
 - the rms error of the poses after that: it displaces what is no ghost;
-- the shares of the mesh's vertices (the points of the cloud are the same) that are farther than 5,
-  10 and 20 cm from the nearest true surface;
-- completeness: the share of the true surface that was measured that the mesh has within 5 cm, by
+- the fractions of the mesh's vertices (the points of the cloud are the same) that are farther than
+  5, 10 and 20 cm from the nearest true surface;
+- completeness: the fraction of the true surface that was measured that the mesh has within 5 cm, by
   places of 2 cm: of all, of floors, and of what is dark (albedo below 0.3). A place was measured if
   at least 3 valid pixels hit it, and at least half of them are right to 5 cm.
 

@@ -116,8 +116,8 @@ def rendered_fault(fault: str) -> Callable[[str, int], Frames]:
             return frames
         if fault == "static":
             return film("room", camera, k, start + n, still=True)
-        share = {"fast": 0.3, "overlap": 0.75}[fault]
-        return film("room", camera, k, start + round(share * wide / STEP_DEG) * n)
+        fraction = {"fast": 0.3, "overlap": 0.75}[fault]
+        return film("room", camera, k, start + round(fraction * wide / STEP_DEG) * n)
 
     return make
 
@@ -209,7 +209,7 @@ def mirrored(frames: Frames, k: int) -> Frames:
 
 
 def colored(frames: Frames, k: int, shift: float = 0.0) -> Frames:
-    """Colour made of the light that came back, at other pixels by a share of the width."""
+    """Colour made of the light that came back, at other pixels by a fraction of the width."""
     out = []
     for f in frames:
         light = np.log1p(np.minimum(f.amplitude_image, 60000))

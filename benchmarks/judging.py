@@ -92,8 +92,8 @@ def late(poses: Float64, times: Float64, rng: np.random.Generator, size: float) 
     """Poses of somewhat later."""
     then = times + size * LATE_S
     at = np.clip(np.searchsorted(times, then, side="right") - 1, 0, len(poses) - 2)
-    share = np.clip((then - times[at]) / np.diff(times)[at], 0, 1)
-    return se3.interpolate(poses[at], poses[at + 1], share)
+    fraction = np.clip((then - times[at]) / np.diff(times)[at], 0, 1)
+    return se3.interpolate(poses[at], poses[at + 1], fraction)
 
 
 def smoothed(poses: Float64, times: Float64, rng: np.random.Generator, size: float) -> Float64:

@@ -45,10 +45,10 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
     found = evaluate_trajectory(
         np.asarray(times), poses, recording.timestamps[known], recording.reference[known]
     )
-    share = len(times) / max(1, len(recording))
+    fraction = len(times) / max(1, len(recording))
     return (
         f"ATE {1e3 * found.ate_rms_m:.1f} mm, {np.degrees(found.rotation_rms_rad):.2f} deg, "
-        f"{share:.0%} posed"
+        f"{fraction:.0%} posed"
     )
 
 

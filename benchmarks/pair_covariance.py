@@ -115,8 +115,8 @@ def _of_rooms(seed: int) -> Iterator[Case]:
         source, target = (_thinned(view.points, rng) for view in (b, a))
         yield _cloud("camera clouds", name, seed, source, target, true)
         yield _moved("moved clouds", name, seed, source, target, true, rng)
-        share = float(np.exp(rng.uniform(np.log(0.1), np.log(0.5))))
-        fewer = _thinned(source, rng, int(share * len(source)))
+        fraction = float(np.exp(rng.uniform(np.log(0.1), np.log(0.5))))
+        fewer = _thinned(source, rng, int(fraction * len(source)))
         make = _moved if rng.random() < 0.5 else _cloud
         yield make("thinned clouds", name, seed, fewer, target, true, rng)
 

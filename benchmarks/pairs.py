@@ -48,7 +48,7 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.confidence import ACCEPTED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
+from tofuse.registration.confidence import ACCEPTED, RIGHT_FRACTION, RIGHT_RAD, Evidence, logistic
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -418,7 +418,7 @@ def _add(
         if true is None or agreement(source, target, true).overlap < _APART:
             return False
         metres, degrees = off(found.T_target_source, true)
-        near = metres < RIGHT_SHARE * 0.5 * (source.depth + target.depth)
+        near = metres < RIGHT_FRACTION * 0.5 * (source.depth + target.depth)
         return near and np.radians(degrees) < RIGHT_RAD
 
     try:

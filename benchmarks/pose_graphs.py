@@ -35,7 +35,7 @@ from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
 from tofuse.posegraph.robust import Settings
 
-SHARE = 0.3  # of all loops that are false
+FALSE = 0.3  # of all loops that are false
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad
 LOOPS = np.array([0.010] * 3 + [np.radians(0.4)] * 3)
 
@@ -53,9 +53,9 @@ def path(scene: str) -> Float64:
 
 
 def make_graph(
-    scene: str, seed: int, share: float, noise: float = 1.0
+    scene: str, seed: int, fraction: float, noise: float = 1.0
 ) -> tuple[PoseGraph, Float64]:
-    """Measure a path, with some share of the loops false; the same true ones whatever the share."""
+    """Measure a path, with a `fraction` of the loops false; the true ones do not depend on it."""
     rng = np.random.default_rng([seed, scene == "walk"])
     T = path(scene)
     n = len(T)
@@ -68,7 +68,7 @@ def make_graph(
         se3.inverse(T[i]) @ T[j] @ se3.exp(noise * rng.normal(size=(n - 1, 6)) * ODOMETRY),
         T_a_b[true] @ se3.exp(noise * rng.normal(size=(40, 6)) * LOOPS),
     ]
-    false = rng.choice(len(a), round(40 * share / (1 - share)), replace=False)
+    false = rng.choice(len(a), round(40 * fraction / (1 - fraction)), replace=False)
     k = len(false)
     wrong = np.concatenate([rng.uniform(-3, 3, (k, 3)), rng.normal(size=(k, 3))], axis=1)
     measured.append(se3.exp(wrong))
@@ -157,8 +157,8 @@ def with_false_loops(seeds: int) -> None:
         for scene in ("room", "walk"):
             errors = np.empty((seeds, 2))
             for seed in range(seeds):
-                for k, share in enumerate((0.0, SHARE)):
-                    graph, truth = make_graph(scene, seed, share)
+                for k, fraction in enumerate((0.0, FALSE)):
+                    graph, truth = make_graph(scene, seed, fraction)
                     done = graph if optimiser is None else optimiser.optimise(graph).graph
                     errors[seed, k] = 1000 * ate(done, truth)
             ratio = (errors[:, 1] / errors[:, 0]).max()

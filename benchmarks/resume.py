@@ -3,7 +3,7 @@
 Each time the same command is started, killed without warning at a random moment, and started once
 more. Before that, the output folder must hold a whole result or none; after it, the same files, to
 the byte, as those of a run that nobody killed. Also printed: how long the second start took, as a
-share of a whole run, beside the moment of the kill.
+fraction of a whole run, beside the moment of the kill.
 
     python benchmarks/resume.py RECORDING --kills 20
 """
@@ -63,16 +63,16 @@ def main() -> None:
     print(f"a whole run takes {seconds:.1f} s")
     rng = np.random.default_rng(arguments.seed)
     good = 0
-    for k, share in enumerate(np.sort(rng.random(arguments.kills))):
+    for k, fraction in enumerate(np.sort(rng.random(arguments.kills))):
         name = f"{k:02d}"
         job = start(name)
-        sleep(share * seconds)
+        sleep(fraction * seconds)
         job.kill()
         job.communicate()
         left = {p.name for p in (out / name).glob("*") if not p.name.startswith(".tofuse-")}
         halves = bool(left) and left != names
         if left == names:
-            print(f"{share:5.0%}  had finished")
+            print(f"{fraction:5.0%}  had finished")
             good += [(out / name / n).read_bytes() for n in SAME] == wanted
             continue
         again, said = finish(name)
@@ -81,8 +81,9 @@ def main() -> None:
         good += same and clean
         notes = [line for line in said.splitlines() if "stopped" in line]
         print(
-            f"{share:5.0%}  {'the same' if same and clean else 'DIFFERS'}, in {again / seconds:.0%}"
-            f" of the time{' (moves cut off)' if halves else ''}; {'; '.join(notes)}",
+            f"{fraction:5.0%}  {'the same' if same and clean else 'DIFFERS'}, "
+            f"in {again / seconds:.0%} of the time{' (moves cut off)' if halves else ''}; "
+            f"{'; '.join(notes)}",
             flush=True,
         )
         shutil.rmtree(out / name)

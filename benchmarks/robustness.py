@@ -151,7 +151,7 @@ def peer(
 
 
 def agreement(recording: Recording, poses: Float64) -> tuple[float, float]:
-    """Map consistency, rms in m and share of inliers; NaN and 0 where no two views overlap."""
+    """Map consistency, rms in m and fraction of inliers; NaN and 0 where no two views overlap."""
     try:
         found = map_consistency(recording, poses)
     except InputError:
@@ -234,10 +234,10 @@ REAL_HEAD = (
 def stress_line(row: Row) -> str:
     """Return a row of the stress part."""
     s = row.score
-    share = f"{s.covered / s.overlapping:.0%}" if s.overlapping else "-"
+    fraction = f"{s.covered / s.overlapping:.0%}" if s.overlapping else "-"
     return (
         f"{row.group:10} {row.name:31} {row.method:15} {s.frames:6} {s.main / s.frames:5.0%}"
-        f" {share:>8} {row.components:6} {s.wrong:6} {s.unmarked:8} {s.unmarked_strict:6}"
+        f" {fraction:>8} {row.components:6} {s.wrong:6} {s.unmarked:8} {s.unmarked_strict:6}"
         f" {s.by_reason:17} {s.joins:12}  {1000 * s.ate_m:6.0f}  {row.verdict:8} {row.seconds:6.1f}"
         f"  {row.problem}"
     ).rstrip()

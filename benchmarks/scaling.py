@@ -170,11 +170,11 @@ def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[
     for count in sorted(counts):
         seconds, posed = timed(at_work, (next(source) for _ in range(count - done)))
         ms = 1e3 * seconds[1:]
-        share = posed / max(1, len(seconds))
+        fraction = posed / max(1, len(seconds))
         done = count
         yield (
             f"{count:>8}{np.median(ms):>12.1f}{np.percentile(ms, 95):>8.1f}"
-            f"{share:>7.0%}{resident_bytes() / 1e6:>12.0f}"
+            f"{fraction:>7.0%}{resident_bytes() / 1e6:>12.0f}"
         )
 
 
@@ -266,7 +266,7 @@ def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
         arrays = [a for a in _flat(arguments) if isinstance(a, np.ndarray)]
         # All iterations of a level are one call, which says last how many they were.
         passes = result[-1] if function.__name__ == "iterate_level" else 1
-        found.bytes += passes * _share(arguments, arrays) * sum(a.nbytes for a in arrays)
+        found.bytes += passes * _fraction(arguments, arrays) * sum(a.nbytes for a in arrays)
         return result
 
     return called
@@ -277,7 +277,7 @@ def _flat(arguments: Sequence[Any]) -> Iterator[Any]:
         yield from argument if isinstance(argument, tuple) else (argument,)
 
 
-def _share(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:
+def _fraction(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:
     """The part of the rows that a call works on: kernels end with (start, stop)."""
     ends = arguments[-2:]
     if len(ends) < 2 or not all(isinstance(e, int) for e in ends) or not arrays:

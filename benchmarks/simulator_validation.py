@@ -177,18 +177,18 @@ def print_edges(cases: dict[str, Positions]) -> dict[str, np.ndarray]:
     print("depth steps of 0.3 to 2 m: pixels between the two sides (0.1 to 0.9 of the step)")
     print(
         f"  {'':26s} {'steps':>6s} {'per step':>9s} {'outside':>8s}"
-        "   share of those between, by place"
+        "   fraction of those between, by place"
     )
     print(f"  {'':52s}   0.1-0.3 0.3-0.5 0.5-0.7 0.7-0.9")
     out = {}
     for name, positions in cases.items():
         place, count = edge_profiles(positions)
-        share = np.histogram(place, BINS)[0] / max(count, 1)
-        between = share[2:6]
+        fraction = np.histogram(place, BINS)[0] / max(count, 1)
+        between = fraction[2:6]
         parts = " ".join(f"{p:7.2f}" for p in between / max(between.sum(), 1e-9))
-        outside = share[0] + share[-1]
+        outside = fraction[0] + fraction[-1]
         print(f"  {name:26s} {count:6d} {between.sum():9.2f} {outside:8.2f}   {parts}")
-        out[name] = share
+        out[name] = fraction
     return out
 
 
@@ -277,8 +277,8 @@ def draw(noise: dict[str, tuple], profiles: dict[str, np.ndarray]) -> None:
     figure.tight_layout()
     figure.savefig(OUT / "simulator_noise.png", dpi=100)
     figure, axis = plt.subplots(figsize=(7, 4))
-    for name, share in profiles.items():
-        axis.plot([0.2, 0.4, 0.6, 0.8], share[2:6], "o-", label=name)
+    for name, fraction in profiles.items():
+        axis.plot([0.2, 0.4, 0.6, 0.8], fraction[2:6], "o-", label=name)
     axis.set(xlabel="place between near (0) and far (1) side", ylabel="pixels per step")
     axis.legend()
     figure.tight_layout()

@@ -36,7 +36,7 @@ OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 OVERLAP, NEAR_M = 0.35, 0.10
 APART_M = 100.0  # between places that have nothing in common
 DURATIONS_S = (0.3, 1.0, 3.0)
-SHARES = (0.10, 0.25, 0.40)
+FRACTIONS = (0.10, 0.25, 0.40)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def take(
     count = frames or scene.frames
     key = [name, scene.camera, str(first), str(count), str(seed), motion.replace(" ", "-")]
     if passing is not None:
-        key += [passing.kind, f"{passing.share:.2f}"]
+        key += [passing.kind, f"{passing.fraction:.2f}"]
     folder = OUT / "_".join(part for part in key if part)
     hidden = ("multipath",) if motion == "quick turns" else ("multipath", "smear")
     made = plan(
@@ -202,9 +202,9 @@ def close_up(path: paths.Path, leave: float, T_room_wall: Float64) -> paths.Path
             return path(t)
         if u >= 3 * STRETCH_S:
             return path(t - 3 * STRETCH_S)
-        share = paths.smooth_step(u / STRETCH_S) - paths.smooth_step(u / STRETCH_S - 2)
-        slid = np.array([0.04 * np.sin(2 * np.pi * u / STRETCH_S), 0, 0, 0, 0, 0]) * share
-        return T @ se3.exp(share * way) @ se3.exp(slid)
+        fraction = paths.smooth_step(u / STRETCH_S) - paths.smooth_step(u / STRETCH_S - 2)
+        slid = np.array([0.04 * np.sin(2 * np.pi * u / STRETCH_S), 0, 0, 0, 0, 0]) * fraction
+        return T @ se3.exp(fraction * way) @ se3.exp(slid)
 
     return there
 
@@ -242,7 +242,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
         good = (flat > 0) & np.isfinite(xy).all(1)
         clouds.append(np.column_stack([xy[good], np.ones(good.sum())]) * flat[good, None])
         images.append(z)
-    share = np.zeros((n, n))
+    fraction = np.zeros((n, n))
     seeing = [k for k in range(n) if k not in set(blind) and len(clouds[k]) > 20]
     for i in seeing:
         T = se3.inverse(poses[i]) @ poses
@@ -261,8 +261,8 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
             inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
             z = images[i][v[inside], u[inside]]
             near = np.abs(z - points[inside, 2]) < NEAR_M
-            share[i, j] = near.sum() / len(clouds[j])
-    tied = np.minimum(share, share.T) >= OVERLAP
+            fraction[i, j] = near.sum() / len(clouds[j])
+    tied = np.minimum(fraction, fraction.T) >= OVERLAP
     _, label = connected_components(tied, directed=False)
     sizes = np.bincount(label, minlength=n)
     out = np.full(n, -1, np.intp)
@@ -416,7 +416,7 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
         Make only those whose name contains this.
     """
     durations = DURATIONS_S[1:2] if quick else DURATIONS_S
-    shares = SHARES[1:2] if quick else SHARES
+    fractions = FRACTIONS[1:2] if quick else FRACTIONS
     made: dict[str, Callable[[np.random.Generator], Case]] = {}
     cache: list[Take] = []
 
@@ -453,15 +453,15 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
             add(f"lens covered by a {how}, {seconds:g} s", hide)
     kinds: tuple[Kind, ...] = ("box", "person")
     for kind in kinds:
-        for share in shares:
+        for fraction in fractions:
 
             def passes(
-                rng: np.random.Generator, name: str, kind: Kind = kind, share: float = share
+                rng: np.random.Generator, name: str, kind: Kind = kind, fraction: float = fraction
             ) -> Case:
-                took = take(scene, seed, passing=Passing(kind, share))
+                took = take(scene, seed, passing=Passing(kind, fraction))
                 return as_case(scene.name, name, took, seen=base())
 
-            add(f"{kind} passes over {share:.0%}", passes)
+            add(f"{kind} passes over {fraction:.0%}", passes)
     for every in (4,) if quick else (2, 4):
         add(
             f"every {every}th frame" if every > 3 else "every 2nd frame",

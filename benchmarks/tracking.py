@@ -82,7 +82,7 @@ class TofuseSession:
         views = replace(options.views, photometric=photometric)
         self._tracker = replace(options, views=views).start(0)
         self.statuses: list[str] = []
-        self.unheld: list[int] = []
+        self.unconstrained: list[int] = []
         self.reasons: list[str] = []
         # Of components that are connected with the first one; and of frames, where they are.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
@@ -96,7 +96,7 @@ class TofuseSession:
         step = self._tracker.push(prepared)
         self.statuses.append(step.status)
         self.reasons.append(step.reason)
-        self.unheld.append(len(step.registration.unobservable) if step.registration else 0)
+        self.unconstrained.append(len(step.registration.unobservable) if step.registration else 0)
         T = step.T_component_camera
         for link in step.links:
             if link.certain and T is not None and link.i in self._T_world_camera:
@@ -139,7 +139,7 @@ def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
     if isinstance(session, TofuseSession):
         details = {
             "statuses": session.statuses,
-            "unheld": session.unheld,
+            "unconstrained": session.unconstrained,
             "reasons": session.reasons,
         }
     return Run(poses, seconds, cpu, details)

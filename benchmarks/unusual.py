@@ -85,8 +85,8 @@ def jerks(rng: np.random.Generator, degrees: float, seconds: float = 0.15) -> Pa
 
     def path(t: float) -> Float64:
         k, u = divmod(t, 1.0)
-        share = paths.smooth_step((u - 0.2) / seconds) - paths.smooth_step((u - 0.7) / seconds)
-        return paths.rotation(np.radians(degrees) * share * axes[int(k) % 100])
+        fraction = paths.smooth_step((u - 0.2) / seconds) - paths.smooth_step((u - 0.7) / seconds)
+        return paths.rotation(np.radians(degrees) * fraction * axes[int(k) % 100])
 
     return path
 

@@ -1,4 +1,4 @@
-"""Phase unwrapping: shares of pixels restored and harmed in a room larger than the camera's period.
+"""Phase unwrapping: pixels restored and harmed in a room larger than the camera's period.
 
     python benchmarks/unwrapping.py [--seeds 5] [--every 15]
 
@@ -6,10 +6,10 @@ A simulated SR4000 (period 5 m) turns around in the scene `hall`, 8 x 8 m, with 
 in the scene `room`, most of which lies within the period; both also without indirect light. Then
 the room again, as if the period were shorter, so that up to a third of it is beyond. The correction
 `unwrap` learns the camera's light from the frames and moves pixels by whole periods.
-Printed for each seed: which share of the wrapped pixels is moved back to where it belongs (target
-99 %), and which share of the others is moved by mistake (at most 0.1 %). Pixels count whose
-measurement is that of one surface: within half a metre of the truth but for whole periods, and with
-a confidence of 1 or more.
+Printed for each seed: which fraction of the wrapped pixels is moved back to where it belongs
+(target 99 %), and which fraction of the others is moved by mistake (at most 0.1 %). Pixels count
+whose measurement is that of one surface: within half a metre of the truth but for whole periods,
+and with a confidence of 1 or more.
 """
 
 from __future__ import annotations

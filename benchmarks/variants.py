@@ -45,7 +45,7 @@ from tofuse.recordings.recording import ArraySource, Recording
 
 SEED = 7
 MOST_FRAMES = 100
-PLACED_SHARE = 0.9
+PLACED_FRACTION = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,18 +157,18 @@ def quantised(frame: RangeFrame, metres: float) -> RangeFrame:
     return replace(frame, depth=(np.round(frame.depth / metres) * metres).astype(np.float32))
 
 
-def noisier(frame: RangeFrame, share: float) -> RangeFrame:
-    """Add independent noise to each pixel, as a share of its depth."""
+def noisier(frame: RangeFrame, fraction: float) -> RangeFrame:
+    """Add independent noise to each pixel, as a fraction of its depth."""
     rng = np.random.default_rng([SEED, frame.index])
-    factor = 1 + share * rng.standard_normal(frame.depth.shape)
+    factor = 1 + fraction * rng.standard_normal(frame.depth.shape)
     return replace(frame, depth=(frame.depth * factor).astype(np.float32))
 
 
-def holed(frame: RangeFrame, share: float, size: int = 1) -> RangeFrame:
-    """Drop a share of the pixels, in square blocks."""
+def holed(frame: RangeFrame, fraction: float, size: int = 1) -> RangeFrame:
+    """Drop a fraction of the pixels, in square blocks."""
     rng = np.random.default_rng([SEED, frame.index])
     height, width = frame.depth.shape
-    kept = rng.random((-(-height // size), -(-width // size))) >= share
+    kept = rng.random((-(-height // size), -(-width // size))) >= fraction
     return frame.keep(np.kron(kept, np.ones((size, size), bool))[:height, :width])
 
 
@@ -194,9 +194,9 @@ def depth_only(frame: RangeFrame) -> RangeFrame:
 # ---- Variants ------------------------------------------------------------------------------------
 
 
-def dropped(take: Take, share: float) -> Take:
-    """Drop a random share of the frames."""
-    kept = np.random.default_rng(SEED).random(len(take.frames)) >= share
+def dropped(take: Take, fraction: float) -> Take:
+    """Drop a random fraction of the frames."""
+    kept = np.random.default_rng(SEED).random(len(take.frames)) >= fraction
     return take.at(np.flatnonzero(kept))
 
 
@@ -326,7 +326,7 @@ def line(name: str, take: Take, outcome: Outcome, bound_m: float) -> str:
     mark = ""
     if outcome.verdict == "CRASHED":
         mark = "CRASHED"
-    elif placed[known].sum() < PLACED_SHARE * known.sum():
+    elif placed[known].sum() < PLACED_FRACTION * known.sum():
         mark = "LOST"
     elif ate > np.hypot(outcome.bound_m, bound_m):
         mark = "WRONG" if outcome.verdict == "good" else "off"

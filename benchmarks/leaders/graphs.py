@@ -45,9 +45,9 @@ class Graphs(Board):
     def run(self, method: str, case: str, data: Path) -> Score | None:
         """See `Board`."""
         group, scene, seed = case.split("/")
-        share = float(group[5:]) if group.startswith("false") else 0.0
+        fraction = float(group[5:]) if group.startswith("false") else 0.0
         noise = float(group[5:]) if group.startswith("noise") else 1.0
-        graph, truth = pose_graphs.make_graph(scene, 1000 + int(seed), share, noise)
+        graph, truth = pose_graphs.make_graph(scene, 1000 + int(seed), fraction, noise)
         began = time.process_time()
         if method == _GTSAM:
             done, seconds = _gtsam(graph)

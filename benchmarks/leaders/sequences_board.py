@@ -52,21 +52,21 @@ class Sequences(Board):
         try:
             result = reconstruct(recording, config)
         except TofuseError:
-            return {"ate": np.inf, "share": 0.0, "seconds": time.process_time() - began}
+            return {"ate": np.inf, "posed": 0.0, "seconds": time.process_time() - began}
         seconds = time.process_time() - began
         truth = recording.reference
         assert truth is not None
         known = result.has_pose & np.isfinite(truth).all((1, 2))
         if known.sum() < 3:
-            return {"ate": np.inf, "share": 0.0, "seconds": seconds}
+            return {"ate": np.inf, "posed": 0.0, "seconds": seconds}
         gaps = distances_between(result.trajectory[known], truth[known])
         ate = float(np.sqrt((gaps**2).mean()))
-        return {"ate": ate, "share": float(known.mean()), "seconds": seconds}
+        return {"ate": ate, "posed": float(known.mean()), "seconds": seconds}
 
     def cell(self, scores: Sequence[Score]) -> str:
-        """See `Board`: error in mm, and the share of the frames that have a pose."""
+        """See `Board`: error in mm, and the fraction of the frames that have a pose."""
         return f"{1000 * scores[0]['ate']:.1f} mm, {100 * scores[0]['share']:.0f} %"
 
     def merit(self, scores: Sequence[Score]) -> float:
         """See `Board`: lost frames first, then the error."""
-        return float(np.mean([10 * round(s["share"], 1) - min(s["ate"], 9.0) for s in scores]))
+        return float(np.mean([10 * round(s["posed"], 1) - min(s["ate"], 9.0) for s in scores]))

@@ -35,7 +35,7 @@ OUTLIERS = (0.1, 0.3)
 APART = (2, 4)
 SCENES = ("room", "flat", "rail", "torso", "kitchen")
 # What is right: of the median depth, and degrees.
-RIGHT_SHARE, RIGHT_DEG = 0.02, 1.5
+RIGHT_FRACTION, RIGHT_DEG = 0.02, 1.5
 POINTS = 1000
 _SEED = 7  # of nothing else
 
@@ -106,7 +106,7 @@ class TwoViews(Board):
         off = np.linalg.norm(se3.transform(T, middle) - se3.transform(true, middle))
         angle = np.degrees(se3.angle((se3.inverse(true) @ T)[:3, :3])) if np.isfinite(off) else 180
         depth = float(np.median(np.linalg.norm(source.points, axis=1)))
-        right = bool(off < RIGHT_SHARE * depth and angle < RIGHT_DEG)
+        right = bool(off < RIGHT_FRACTION * depth and angle < RIGHT_DEG)
         return {
             "right": float(right),
             "off": float(np.nan_to_num(off, nan=1e3)),
@@ -117,8 +117,8 @@ class TwoViews(Board):
     def cell(self, scores: Sequence[Score]) -> str:
         """See `Board`: share that is right, and the median error of those."""
         right = [s for s in scores if s["right"]]
-        share = f"{100 * len(right) / len(scores):.0f} %"
-        return f"{share} {1000 * np.median([s['off'] for s in right]):.1f}" if right else share
+        text = f"{100 * len(right) / len(scores):.0f} %"
+        return f"{text} {1000 * np.median([s['off'] for s in right]):.1f}" if right else text
 
     def merit(self, scores: Sequence[Score]) -> float:
         """See `Board`."""
@@ -218,11 +218,11 @@ def _noisy(view: RangeFrame, sigma: float, rng: np.random.Generator) -> RangeFra
     return replace(view, depth=np.where(view.depth > 0, np.maximum(depth, 0.01), 0))
 
 
-def _spoilt(view: RangeFrame, share: float, rng: np.random.Generator) -> RangeFrame:
+def _spoilt(view: RangeFrame, fraction: float, rng: np.random.Generator) -> RangeFrame:
     """So many pixels with any depth between the nearest and the farthest."""
     good = view.depth > 0
     low, high = np.percentile(view.depth[good], [1, 99])
-    wrong = good & (rng.uniform(size=good.shape) < share)
+    wrong = good & (rng.uniform(size=good.shape) < fraction)
     depth = np.where(wrong, rng.uniform(low, high, good.shape), view.depth)
     return replace(view, depth=depth.astype(np.float32))
 

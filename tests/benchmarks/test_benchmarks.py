@@ -80,8 +80,8 @@ def test_whole_run_as_a_process(scripts, small_room):
     assert f"{spent.ms_a_frame:.1f}" in lines[1]
     slow = dataclasses.replace(spent, stages={"tracking": 1.3, "loops": 0.01})
     stages = [line.split() for line in list(end_to_end.table([("tofuse run", [slow])]))[2:]]
-    share = f"{1.3 / slow.wall_s:.0%}"
-    assert stages[0] == ["tracking", "1.3", "325.0", share]  # ms of each of 4 frames
+    fraction = f"{1.3 / slow.wall_s:.0%}"
+    assert stages[0] == ["tracking", "1.3", "325.0", fraction]  # ms of each of 4 frames
     assert "loops" not in [line[0] for line in stages]  # hardly any time
     with pytest.raises(RuntimeError, match=r"nothing: doesn.t exist"):
         end_to_end.tofuse_run(room / "nothing", [], 1)

@@ -350,7 +350,7 @@ def test_large_images_are_kept_at_half_their_size() -> None:
     view = RangeView.of(RangeFrame(0, 0.0, camera, depth, color_image=color))
     assert view.z.shape == (240, 320)
     assert view.nbytes <= 10 * 240 * 320
-    assert view.light[100, 100].tolist() == [90, 90, 90]
+    assert view.intensity[100, 100].tolist() == [90, 90, 90]
     assert (view.z[100:, 150:] == 0).all()
     mesh = fuse_surface([view], EYE[None])
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002

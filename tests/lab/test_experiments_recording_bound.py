@@ -50,10 +50,10 @@ def test_normals_and_slopes_are_of_what_is_seen():
 
 def test_albedo_and_light_make_the_bound_lower():
     made = plan("room", effects=NOISE, frames=4)
-    distances, both = trajectory_bounds(made, share=4)
+    distances, both = trajectory_bounds(made, every=4)
     assert 0 < both.mean < distances.mean
     assert both.low < both.mean < both.high
     brighter = replace(
         made, model=replace(made.model, signal_electrons=4 * made.model.signal_electrons)
     )
-    assert trajectory_bounds(brighter, share=4)[0].mean < 0.55 * distances.mean
+    assert trajectory_bounds(brighter, every=4)[0].mean < 0.55 * distances.mean

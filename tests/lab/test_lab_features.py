@@ -12,7 +12,7 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.methods.features import Features
-from tofuse.lab.methods.keypoints import keypoints, light_image
+from tofuse.lab.methods.keypoints import channel_image, keypoints
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.sample_consensus import (
@@ -209,27 +209,27 @@ def test_colour_serves_as_well(images):
         level = np.clip(frame.amplitude_image * r2 / 4000 * 110, 0, 255).astype(np.uint8)
         image = np.dstack([level] * 3)
         colored.append(replace(frame, amplitude_image=None, color_image=image, index=k))
-    found = tofuse.register(*colored, method=Features(light="color"))
+    found = tofuse.register(*colored, method=Features(channel="color"))
     assert off(found.T_target_source)[0] < 0.05
     np.testing.assert_array_equal(
         found.T_target_source, tofuse.register(*colored, method=Features()).T_target_source
     )
     with pytest.raises(RegistrationError, match="has no amplitude"):
-        tofuse.register(*colored, method=Features(light="albedo"))
+        tofuse.register(*colored, method=Features(channel="albedo"))
 
 
 def test_the_light_does_not_fall_with_the_distance():
     """One wall, oblique: raw amplitude falls along it, what is looked at does not."""
     frame = poster(FIRST, seed=1, plain=True)
     assert np.corrcoef(frame.amplitude_image.ravel(), frame.depth.ravel())[0, 1] < -0.8
-    image = light_image(frame, "albedo").astype(float)
+    image = channel_image(frame, "albedo").astype(float)
     assert abs(np.corrcoef(image.ravel(), frame.depth.ravel())[0, 1]) < 0.2
 
 
 def test_points_lie_where_the_pixels_see_them(images):
     frame = images[1]
     surface = prepare_view(frame, SurfaceOptions())
-    found = keypoints(frame, surface, detector="sift", light="auto", count=300, blur_px=0.7)
+    found = keypoints(frame, surface, detector="sift", channel="auto", count=300, blur_px=0.7)
     assert len(found) > 50
     np.testing.assert_allclose(CAMERA.project(found.points), found.pixels, atol=0.05)
     clean = poster(FIRST, noise=0.0)
@@ -266,7 +266,7 @@ def test_clouds_have_no_image(images):
     ("kind", "options"),
     [
         (Features, {"detector": "surf"}),
-        (Features, {"light": "infrared"}),
+        (Features, {"channel": "infrared"}),
         (Features, {"ratio": 0.0}),
         (Features, {"count": 2}),
         (ConsensusOptions, {"way": "chance"}),

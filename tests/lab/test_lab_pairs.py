@@ -156,10 +156,10 @@ def test_ls3d_with_intensity_does_not_slide_along_a_wall():
     T = np.eye(4)
     T[:3, 3] = [0.03, -0.02, 0.01]
     plain, lit = (
-        LeastSquaresMatching(0.02, light=light).register(
+        LeastSquaresMatching(0.02, intensity=intensity).register(
             wall(1, T), wall(0, np.eye(4)), np.eye(4), rng()
         )
-        for light in (0.0, 0.1)
+        for intensity in (0.0, 0.1)
     )
     assert error(plain, T)[0] > 0.03
     assert error(lit, T)[0] < 0.003

@@ -32,7 +32,7 @@ def test_planes_of_a_view_are_those_of_the_scene():
     view = prepare_view(seen(A, seed=1), SurfaceOptions())
     found = detect_planes(view, np.random.default_rng(0))
     assert len(found) >= 3
-    assert [p.share for p in found[:3]] == sorted((p.share for p in found[:3]), reverse=True)
+    assert [p.fraction for p in found[:3]] == sorted((p.fraction for p in found[:3]), reverse=True)
     planes = np.array([[*p.normal, p.offset] for p in found])
     for *normal, offset in in_view(A)[:2]:  # of the other wall hardly anything is seen
         angle = np.degrees(np.arccos(np.clip(planes[:, :3] @ normal, -1, 1)))

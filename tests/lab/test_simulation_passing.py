@@ -84,7 +84,7 @@ def test_beside_a_turning_object_the_object_stays_the_world() -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"kind": "dog"}, "dog"), ({"share": 0.0}, "share"), ({"seconds": 5.0}, "end before")],
+    [({"kind": "dog"}, "dog"), ({"fraction": 0.0}, "fraction"), ({"seconds": 5.0}, "end before")],
 )
 def test_bad_requests_say_what_to_do(options, words) -> None:
     with pytest.raises(InputError, match=words):

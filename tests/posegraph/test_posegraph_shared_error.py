@@ -129,7 +129,7 @@ def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
         sums, row = sums_of(source, target, T)
         alike = shared_error.alike(target.surface)
         found = shared_error.disagreement(sums[None], row[None], alike)
-        seen.append((found.seen - found.noise) / found.share)
+        seen.append((found.seen - found.noise) / found.expected)
     sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
     # Two views err, and along their rays, which surfaces meet at an angle.
     assert sigma < 0.002 if size == 0 else 0.5 * size < sigma < 2 * size

@@ -80,7 +80,7 @@ def test_layers_are_where_the_poses_put_them() -> None:
         ("after", "target", others),
     ):
         np.testing.assert_allclose(decoded(data, mode, which), truth, atol=1e-4)
-    assert scene.share > 0.8
+    assert scene.fraction > 0.8
     assert scene.median_m < 0.01
     assert scene.cap_m * 1000 in (1, 2, 5, 10, 20)
     # All is framed by what is to be seen; the same, so that nothing jumps.

@@ -60,10 +60,12 @@ def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
     # Whole cells next to the image, so that nothing is left out beside it.
     beside = np.isclose(right[:, 0], low[0], atol=1e-6)
     inside = (around.rays[:, 1] > low[1]) & (around.rays[:, 1] < high[1])
-    assert around.share[beside & inside].sum() * around.pitch[1] == pytest.approx(high[1] - low[1])
+    assert around.fraction[beside & inside].sum() * around.pitch[1] == pytest.approx(
+        high[1] - low[1]
+    )
     corner = np.arctan(np.hypot(*np.maximum(np.abs(low), np.abs(high))))
     lit = np.pi * np.tan(1.3 * corner) ** 2 - (high - low).prod()
-    assert around.share.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
+    assert around.fraction.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
 
 
 def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:

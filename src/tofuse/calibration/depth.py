@@ -230,8 +230,8 @@ def _solve(
     scale = 1.0
     for _ in range(_ROUNDS):
         true = 1 / np.einsum("nc,nc->n", planes[which], rays)
-        left, share = _interval(_measured_of_true(true, knots, curve), knots)
-        bias = curve[left] * (1 - share) + curve[left + 1] * share
+        left, fraction = _interval(_measured_of_true(true, knots, curve), knots)
+        bias = curve[left] * (1 - fraction) + curve[left + 1] * fraction
         residual = measured - true - bias - offsets[pixel]
         scale = max(_robust_rms(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
@@ -239,7 +239,7 @@ def _solve(
         # Columns: two knots, three parameters of the plane. d(true) = -true^2 ray . d(plane).
         slope = -(true**2)[:, None] * rays
         columns = np.stack([left, left + 1, *(many + 3 * which + a for a in range(3))], 1)
-        values = np.concatenate([np.stack([1 - share, share], 1), slope], 1)
+        values = np.concatenate([np.stack([1 - fraction, fraction], 1), slope], 1)
         A = csr_array((values.ravel(), columns.ravel(), np.arange(0, 5 * n + 1, 5)), (n, size))
         AtW = (diags_array(weight) @ A).T.tocsr()
         normal = (AtW @ A).toarray()
@@ -254,10 +254,10 @@ def _solve(
             alone = (by_pixel @ target) / total
             right -= coupled.T @ alone
             # Their mean is part of the curve and fixed to 0, by the Sherman-Morrison formula.
-            held_mean = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
+            mean_weight = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
             together = coupled.T @ (1 / total)
-            normal += held_mean * np.outer(together, together)
-            right += held_mean * together * alone.sum()
+            normal += mean_weight * np.outer(together, together)
+            right += mean_weight * together * alone.sum()
             normal[:many, :many] += prior
             right[:many] -= prior @ curve
         for k, view in enumerate(views):
@@ -274,7 +274,7 @@ def _solve(
         planes = planes + step[many:].reshape(-1, 3)
         if fixed is None:
             alone = (by_pixel @ (target - A @ step)) / total
-            offsets = alone - held_mean * alone.sum() / total
+            offsets = alone - mean_weight * alone.sum() / total
             inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
             covariance = (inverse * unit[:, None] * unit)[:many, :many]
     weights = (np.bincount(left, minlength=many) + 1e-9).astype(np.float64)
@@ -375,10 +375,10 @@ def _offsets(
     limit = 3 * max(_robust_rms(apart), 1e-6)
     typical = np.abs(apart) < limit
     variance = float(np.mean(apart[typical] ** 2 - 1 / weights[seen][typical]))
-    own_share = np.zeros(shape)
+    own_weight = np.zeros(shape)
     if variance > 0:
-        own_share[seen] = variance / (variance + 1 / weights[seen])
-    return np.asarray(smooth + own_share * (mean - smooth))
+        own_weight[seen] = variance / (variance + 1 / weights[seen])
+    return np.asarray(smooth + own_weight * (mean - smooth))
 
 
 def _blur_and_fill(sums: Float64, weights: Float64, width: float) -> Float64:

@@ -340,8 +340,8 @@ def _fit_amplitude(
     bins = _select(bins, bins.variance < (_LINEAR * ceiling) ** 2)
     if len(bins.centre) < 3:
         return None
-    light = bins.centre
-    columns = np.stack([np.ones_like(light), 1 / light, 1 / light**2], 1)
+    amplitude = bins.centre
+    columns = np.stack([np.ones_like(amplitude), 1 / amplitude, 1 / amplitude**2], 1)
     floor2, shot2, dark2 = _nonnegative(columns, bins.variance, bins.pixels)
     if shot2 == 0 and dark2 == 0:
         return None
@@ -441,16 +441,16 @@ def _fit(
 
     amplitude = None
     for falloff in _falloffs(recording, prior):
-        light = _fit_amplitude(samples, falloff, ceiling)
-        if light is None:
+        fitted = _fit_amplitude(samples, falloff, ceiling)
+        if fitted is None:
             continue
         counts = samples.counts * samples.slant**-falloff
         seen = np.isfinite(counts) & (counts > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            score = _misfit(samples, _signal_part(light[0], counts), seen)
+            score = _misfit(samples, _signal_part(fitted[0], counts), seen)
         if score <= (_WORSE if amplitude is None else 0.99) * least:
-            least, law, bins = min(least, score), "amplitude", light[1]
-            amplitude = light[0]
+            least, law, bins = min(least, score), "amplitude", fitted[1]
+            amplitude = fitted[0]
             predicted = _signal_part(amplitude, bins.centre)
 
     model = NoiseModel(

@@ -60,8 +60,8 @@ class CameraErrors(Bounded, Correction):
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""
         if isinstance(stated, Pinhole):
-            share = 1 + self.focal
-            return replace(stated, fx=stated.fx / share, fy=stated.fy / share)
+            factor = 1 + self.focal
+            return replace(stated, fx=stated.fx / factor, fy=stated.fy / factor)
         return RayTable(np.asarray(stated.rays() * np.float32(1 + self.focal)))
 
 

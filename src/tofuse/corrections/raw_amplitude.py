@@ -27,12 +27,12 @@ def tof_image(frame: RangeFrame, period_m: float | None = None) -> ToFImage | No
     amplitude = frame.amplitude_image
     fine = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
     fine &= amplitude < SATURATED_AMPLITUDE
-    light = np.where(fine, amplitude, np.float32(0))
+    raw = np.where(fine, amplitude, np.float32(0))
     if frame.amplitude_kind == "range_compensated":
         square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
         # The squared range is z^2 times the squared length of the ray.
-        light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
-    return ToFImage(z, rays, light.astype(np.float32, copy=False), period_m)
+        raw = raw / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
+    return ToFImage(z, rays, raw.astype(np.float32, copy=False), period_m)
 
 
 def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
@@ -57,9 +57,9 @@ def phasor(image: ToFImage) -> Complex128:
     x, y = image.rays[..., 0], image.rays[..., 1]
     r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
     phase = np.float32(2 * np.pi / image.period_m) * r
-    light = np.where(seen, image.amplitude, np.float32(0))
+    amplitude = np.where(seen, image.amplitude, np.float32(0))
     out = np.empty(r.shape, np.complex128)
-    out.real, out.imag = light * np.cos(phase), light * np.sin(phase)
+    out.real, out.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)
     return out
 
 
@@ -79,8 +79,8 @@ def range_and_amplitude(
     cosine2 = 1 / (1 + (rays * rays).sum(-1))
     radial = np.where(frame.valid, frame.radial_range, np.float32(0))
     with np.errstate(invalid="ignore"):
-        light = np.nan_to_num(image.amplitude / cosine2 ** (FALLOFF / 2))
-    return radial, light.astype(np.float32), image.period_m
+        amplitude = np.nan_to_num(image.amplitude / cosine2 ** (FALLOFF / 2))
+    return radial, amplitude.astype(np.float32), image.period_m
 
 
 def pixel_pitch(frame: Frame) -> float:

@@ -76,11 +76,11 @@ class LensScattering(Bounded, Correction):
         """See `Correction.fit`; 0 if nothing moves in front of a static background."""
         fractions = np.zeros(len(self.widths))
         images = [frame for frame in frames if isinstance(frame, RangeFrame)]
-        light = [x for image in images if (x := frame_phasor(image, self.period_m)) is not None]
-        if images and len(light) == len(images):
+        phasors = [x for image in images if (x := frame_phasor(image, self.period_m)) is not None]
+        if images and len(phasors) == len(images):
             with suppress(InputError):
                 moves, still = _moves_and_still(images)
-                fractions = estimate_fractions(np.stack(light), moves, still, self.widths)
+                fractions = estimate_fractions(np.stack(phasors), moves, still, self.widths)
         return replace(self, fractions=tuple(float(fraction) for fraction in fractions))
 
     def start(self) -> ScatteringCorrector:

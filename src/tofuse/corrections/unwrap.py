@@ -70,10 +70,12 @@ class Unwrap(Bounded, Correction):
         known = range_and_amplitude(frame, self.period_m)
         if known is None:
             return 0.0
-        radial, light, period = known
+        radial, amplitude, period = known
         pitch = pixel_pitch(frame)
-        periods = count_periods(radial, light, period, white, pitch, self.options)
-        return white_amplitude(light, (radial + periods * period).astype(np.float32), radial > 0)
+        periods = count_periods(radial, amplitude, period, white, pitch, self.options)
+        return white_amplitude(
+            amplitude, (radial + periods * period).astype(np.float32), radial > 0
+        )
 
 
 class UnwrapCorrector(Corrector):
@@ -91,9 +93,9 @@ class UnwrapCorrector(Corrector):
         known = range_and_amplitude(frame, self.part.period_m)
         if known is None or not isinstance(frame, RangeFrame):
             return frame
-        radial, light, period = known
-        white = self.part.white or 0.0
-        periods = count_periods(radial, light, period, white, pixel_pitch(frame), self.part.options)
+        radial, measured, period = known
+        white, pitch = self.part.white or 0.0, pixel_pitch(frame)
+        periods = count_periods(radial, measured, period, white, pitch, self.part.options)
         if not periods.any():
             return frame
         factor = np.where(periods > 0, 1 + periods * period / np.where(radial > 0, radial, 1), 1)

@@ -60,15 +60,15 @@ def otsu(values: Float32) -> tuple[float, float]:
     if len(values) == 0 or values.min() == values.max():
         return np.inf, 0.0
     counts, edges = np.histogram(values.astype(float), _BINS)
-    share = counts / counts.sum()
+    fraction = counts / counts.sum()
     centre = (edges[:-1] + edges[1:]) / 2
-    mean = (share * centre).sum()
-    below = np.cumsum(share)[:-1]
-    moment = np.cumsum(share * centre)[:-1]
+    mean = (fraction * centre).sum()
+    below = np.cumsum(fraction)[:-1]
+    moment = np.cumsum(fraction * centre)[:-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         between = np.nan_to_num((mean * below - moment) ** 2 / (below * (1 - below)))
     # Between two clusters all thresholds are equivalent; the central one has the largest margin.
     best = np.flatnonzero(between >= between.max() * (1 - 1e-9))
     first, last = int(best[0]), int(best[-1])
-    total = (share * (centre - mean) ** 2).sum()
+    total = (fraction * (centre - mean) ** 2).sum()
     return float((edges[first + 1] + edges[last + 1]) / 2), float(between.max() / total)

@@ -53,13 +53,13 @@ class Wrapped(Bounded, Filter):
         known = range_and_amplitude(frame, None)
         if known is None or not isinstance(frame, RangeFrame):
             return keep
-        radial, light, period = known
+        radial, amplitude, period = known
         step = max(1, round(np.sqrt(radial.size / _ASKED)))
-        some, lit = radial[::step, ::step], light[::step, ::step]
-        white = white_amplitude(lit, some, some > 0)
-        seen = (some > 0) & (lit > 0)
-        dark = seen & (lit * np.square(some) < self.min_albedo * white)
+        some, some_amplitude = radial[::step, ::step], amplitude[::step, ::step]
+        white = white_amplitude(some_amplitude, some, some > 0)
+        seen = (some > 0) & (some_amplitude > 0)
+        dark = seen & (some_amplitude * np.square(some) < self.min_albedo * white)
         if dark.sum() <= _MIN_DARK * seen.sum():
             return keep
-        periods = count_periods(radial, light, period, white, pixel_pitch(frame), _OPTIONS)
-        return (periods == 0) & (light * np.square(radial) >= self.min_albedo * white)
+        periods = count_periods(radial, amplitude, period, white, pixel_pitch(frame), _OPTIONS)
+        return (periods == 0) & (amplitude * np.square(radial) >= self.min_albedo * white)

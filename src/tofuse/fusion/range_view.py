@@ -56,7 +56,7 @@ class RangeView:
         (H, W, 3) int8, 127 times the unit normals away from the camera.
     strength
         (H, W) uint8 code of the weight, see `DECODED`; 0 for pixels that are not integrated.
-    light
+    intensity
         (H, W) float16, root of the albedo in the recording's counts times m^2; or (H, W, 3) uint8
         RGB; None if neither is known.
     sigma_m
@@ -70,7 +70,7 @@ class RangeView:
     unit: float
     normals: Int8
     strength: UInt8
-    light: NDArray[np.float16] | UInt8 | None
+    intensity: NDArray[np.float16] | UInt8 | None
     sigma_m: float
 
     @classmethod
@@ -109,9 +109,9 @@ class RangeView:
             smoothed, variance, measured,
         )  # fmt: skip
         mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
-        share = _reduced(frame.valid.astype(np.float32), shape)
+        density = _reduced(frame.valid.astype(np.float32), shape)
         # Half of the pixels of a block; of a sparse image, half of what a block usually has.
-        valid = share >= 0.5 * (median(share[share > 0]) if share.any() else 1.0)
+        valid = density >= 0.5 * (median(density[density > 0]) if density.any() else 1.0)
         valid |= measured & _dilated(valid.view(np.uint8), 1) & (jump == 0)
         z = np.where(valid, smoothed, np.float32(0))
         good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
@@ -139,15 +139,15 @@ class RangeView:
             unit,
             normals,
             _weight_codes(weight),
-            _image_light(frame, shape),
+            _intensity(frame, shape),
             _typical_sigma(variance, good),
         )
 
     @property
     def nbytes(self) -> int:
         """Size of the view's own images."""
-        light = 0 if self.light is None else self.light.nbytes
-        return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + light
+        intensity = 0 if self.intensity is None else self.intensity.nbytes
+        return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + intensity
 
     @property
     def depth(self) -> float:
@@ -167,9 +167,9 @@ class RangeView:
     @property
     def channels(self) -> int:
         """3 for colour, 1 for albedo, else 0."""
-        if self.light is None:
+        if self.intensity is None:
             return 0
-        return 3 if self.light.ndim == 3 else 1
+        return 3 if self.intensity.ndim == 3 else 1
 
     def as_cloud(self, pixels: int | None = None) -> CloudFrame:
         """Return the valid pixels as a cloud, with amplitude that is not range-compensated.
@@ -187,11 +187,11 @@ class RangeView:
         points = np.concatenate([rays * z[:, None], z[:, None]], 1)
         color = amplitude = None
         if self.channels == 3:
-            assert self.light is not None
-            color = self.light[valid].astype(np.uint8)
-        elif self.light is not None:
+            assert self.intensity is not None
+            color = self.intensity[valid].astype(np.uint8)
+        elif self.intensity is not None:
             square = np.einsum("ni,ni->n", points, points)
-            amplitude = self.light[valid].astype(np.float32) ** 2 / np.maximum(square, 1e-6)
+            amplitude = self.intensity[valid].astype(np.float32) ** 2 / np.maximum(square, 1e-6)
         return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
 
 
@@ -238,7 +238,7 @@ def _weight_codes(weight: Float32) -> UInt8:
     return np.where(known, np.clip(code, 1, 255), 0).astype(np.uint8)
 
 
-def _image_light(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
+def _intensity(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
     if frame.color_image is not None:
         return np.round(_reduced(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
     if frame.amplitude_image is None:
@@ -247,8 +247,8 @@ def _image_light(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float1
     if frame.amplitude_kind != "range_compensated":
         # Compensated for the falloff with the squared range: proportional to the albedo.
         amplitude = amplitude * np.square(frame.z * ray_lengths(frame.camera))
-    light = np.sqrt(np.maximum(_reduced(np.nan_to_num(amplitude), shape), 0))
-    return np.minimum(light, 65000).astype(np.float16)
+    intensity = np.sqrt(np.maximum(_reduced(np.nan_to_num(amplitude), shape), 0))
+    return np.minimum(intensity, 65000).astype(np.float16)
 
 
 def _reduced(image: Float32, shape: tuple[int, ...]) -> Float32:

@@ -72,14 +72,14 @@ class TextureView:
     ----------
     z
         (H, W) m, 0 where unknown.
-    light
+    intensity
         (H, W, 3) RGB, or (H, W, 1) albedo in counts times m^2; negative where unknown.
     projection
         Projection of points into the image.
     """
 
     z: Float32
-    light: Float32
+    intensity: Float32
     projection: Projection
 
     @classmethod
@@ -88,17 +88,17 @@ class TextureView:
         z = np.asarray(frame.z, np.float32)
         projection = Projection.of(frame.camera, 1)
         if frame.color_image is not None:
-            light = frame.color_image.astype(np.float32)
-            light[~frame.color_image.any(-1)] = -1  # the colour camera didn't see it
-            return cls(z, np.ascontiguousarray(light), projection)
+            intensity = frame.color_image.astype(np.float32)
+            intensity[~frame.color_image.any(-1)] = -1  # the colour camera didn't see it
+            return cls(z, np.ascontiguousarray(intensity), projection)
         if frame.amplitude_image is None:
             return None
         amplitude = frame.amplitude_image
         unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
         if frame.amplitude_kind != "range_compensated":
             amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
-        light = np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
-        return cls(z, np.ascontiguousarray(light[..., None]), projection)
+        intensity = np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
+        return cls(z, np.ascontiguousarray(intensity[..., None]), projection)
 
 
 def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int) -> Textured:
@@ -121,17 +121,17 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
     sheet = _Sheet.of(mesh, size)
     points, normals = sheet.points, sheet.normals
     gains = exposures(mesh, views, poses)
-    channels = views[0].light.shape[2]
+    channels = views[0].intensity.shape[2]
     sums = np.zeros((len(points), channels), np.float32)
     weights = np.zeros(len(points), np.float32)
     for view, T, gain in zip(views, poses, gains, strict=True):
         _accumulate(view, T, points, normals, sums, weights, gain)
     seen = weights > 0
-    light = sums[seen] / weights[seen, None]
+    intensity = sums[seen] / weights[seen, None]
     if channels == 3:
-        rgb = np.round(light.clip(0, 255)).astype(np.uint8)
+        rgb = np.round(intensity.clip(0, 255)).astype(np.uint8)
     else:
-        rgb = grey_of(light[:, 0].astype(float))
+        rgb = grey_of(intensity[:, 0].astype(float))
     colors = np.empty((len(points), 3), np.uint8)
     colors[seen] = rgb
     colors[~seen] = UNSEEN
@@ -194,7 +194,7 @@ class _Sheet:
     atlas: Atlas
     painted: Bool
     corners: Int32
-    shares: Float32
+    barycentric: Float32
     points: Float32
     normals: Float32
 
@@ -206,17 +206,17 @@ class _Sheet:
         draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
         painted = owner != UNOWNED
         corners = atlas.vertices[atlas.faces[owner[painted]]]
-        shares = places[painted]
-        points = _interpolated(mesh.vertices, corners, shares)
-        normals = _interpolated(mesh.normals, corners, shares)
+        barycentric = places[painted]
+        points = _interpolated(mesh.vertices, corners, barycentric)
+        normals = _interpolated(mesh.normals, corners, barycentric)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        return cls(atlas, painted, corners, shares, points, normals)
+        return cls(atlas, painted, corners, barycentric, points, normals)
 
     def at_texels(self, values: NDArray[np.generic], where: Bool | None = None) -> Float32:
         """Interpolate values of the vertices (N, C) at the texels (K, C), or at some of them."""
         if where is None:
-            return _interpolated(values, self.corners, self.shares)
-        return _interpolated(values, self.corners[where], self.shares[where])
+            return _interpolated(values, self.corners, self.barycentric)
+        return _interpolated(values, self.corners[where], self.barycentric[where])
 
     def filled(self, colors: UInt8) -> UInt8:
         """Return the image (size, size, 3) of the colours (K, 3), without empty texels."""
@@ -225,12 +225,12 @@ class _Sheet:
         return _dilate_colors(image, self.painted)
 
 
-def _interpolated(values: NDArray[np.generic], corners: Int32, shares: Float32) -> Float32:
+def _interpolated(values: NDArray[np.generic], corners: Int32, barycentric: Float32) -> Float32:
     out = np.empty((len(corners), values.shape[1]), np.float32)
     # In chunks, as allocating large temporaries takes longer than the sums.
     for start in range(0, len(out), _TEXELS_AT_ONCE):
         rows = slice(start, start + _TEXELS_AT_ONCE)
-        b, c = shares[rows].T[:, :, None]
+        b, c = barycentric[rows].T[:, :, None]
         of = values[corners[rows]].astype(np.float32)
         out[rows] = of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
     return out
@@ -245,10 +245,10 @@ def exposures(mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> Float
     step = max(1, len(mesh) // _SAMPLED)
     points = np.ascontiguousarray(mesh.vertices[::step])
     normals = np.ascontiguousarray(mesh.normals[::step])
-    count, channels = len(views), views[0].light.shape[2]
+    count, channels = len(views), views[0].intensity.shape[2]
     logs = np.zeros((count, len(points), channels))
     weights = np.zeros((count, len(points)))
-    top = max(float(np.percentile(view.light, 99)) for view in views)
+    top = max(float(np.percentile(view.intensity, 99)) for view in views)
     for k, (view, T) in enumerate(zip(views, poses, strict=True)):
         sums, weight = (
             np.zeros((len(points), channels), np.float32),
@@ -256,12 +256,12 @@ def exposures(mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> Float
         )
         _accumulate(view, T, points, normals, sums, weight, np.ones(channels))
         seen = weight > 0
-        light = sums[seen] / weight[seen, None]
+        intensity = sums[seen] / weight[seen, None]
         # Nearly black or saturated intensities are not compared.
-        usable = (light > _MIN_INTENSITY * top).all(1) & (
-            (light < 250).all(1) if channels == 3 else True
+        usable = (intensity > _MIN_INTENSITY * top).all(1) & (
+            (intensity < 250).all(1) if channels == 3 else True
         )
-        logs[k, seen] = np.log(np.maximum(light, _MIN_INTENSITY * top))
+        logs[k, seen] = np.log(np.maximum(intensity, _MIN_INTENSITY * top))
         weights[k, seen] = usable
     return np.stack([_gains(logs[..., c], weights) for c in range(channels)], -1)
 
@@ -294,14 +294,16 @@ def _accumulate(
     weights: Float32,
     gain: Float64,
 ) -> None:
-    light = np.where(view.light < 0, view.light, view.light * gain.astype(np.float32))
+    intensity = np.where(
+        view.intensity < 0, view.intensity, view.intensity * gain.astype(np.float32)
+    )
     T = se3.inverse(T_world_camera)
     border = max(2.0, _BORDER * view.z.shape[0])
     projection = view.projection
     run_chunks(
         lambda a, b: add_view(
-            points, normals, T, view.z, light, projection.lookup, projection.frame, _TOLERANCE_M,
-            _TOLERANCE_FRACTION, border, _POWER, sums, weights, a, b,
+            points, normals, T, view.z, intensity, projection.lookup, projection.frame,
+            _TOLERANCE_M, _TOLERANCE_FRACTION, border, _POWER, sums, weights, a, b,
         ),
         len(points),
         _CHUNKS,

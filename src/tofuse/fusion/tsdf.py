@@ -157,7 +157,7 @@ class Volume:
         coarse = np.empty((count, *-(-grid // 4), 3), np.float32)
         channels = self.color.shape[2]
         free_space_limits = _free_space_limits(self.reach_m)
-        light = np.zeros((count, rows * columns, channels), np.float32)
+        intensity = np.zeros((count, rows * columns, channels), np.float32)
 
         def open_views(a: int, b: int) -> None:
             for s in range(a, b):
@@ -182,8 +182,8 @@ class Volume:
                     cubes = cubes_near(view, poses[s], edge, self.reach_m, CUBE_SPACING, number, 2)
                     mark_eighths(cubes, *self.index, close[s])
                 # Albedo is ignored if other views have colour.
-                if view.light is not None and channels == view.channels:
-                    light[s] = view.light.reshape(-1, channels)
+                if view.intensity is not None and channels == view.channels:
+                    intensity[s] = view.intensity.reshape(-1, channels)
 
         close = np.zeros((count, len(self.keys)), np.uint8)
         edge = 0.5 * EDGE * self.voxel_m
@@ -203,7 +203,7 @@ class Volume:
                 free_space_limits,
                 close,
                 self.free_space_stride,
-                light,
+                intensity,
                 (rows, columns),
                 projection.lookup,
                 projection.frame,

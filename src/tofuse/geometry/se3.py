@@ -203,11 +203,11 @@ def point_jacobian(points: ArrayLike) -> Float64:
     return np.concatenate([np.broadcast_to(np.eye(3), (*p.shape, 3)), -hat(p)], axis=-1)
 
 
-def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Float64:
-    """Motion from T_a (share 0) to T_b (share 1) at constant body velocity (a screw)."""
+def interpolate(T_a: ArrayLike, T_b: ArrayLike, fraction: ArrayLike) -> Float64:
+    """Motion from T_a (fraction 0) to T_b (fraction 1) at constant body velocity (a screw)."""
     T_a = np.asarray(T_a, float)
-    share = np.asarray(share, float)
-    return T_a @ exp(share[..., None] * log(inverse(T_a) @ np.asarray(T_b, float)))
+    fraction = np.asarray(fraction, float)
+    return T_a @ exp(fraction[..., None] * log(inverse(T_a) @ np.asarray(T_b, float)))
 
 
 def orthonormalise(T: ArrayLike) -> Float64:

@@ -426,18 +426,18 @@ def gather(
 
 @kernel
 def put_point(
-    point: Float32, ray: Float32, plane: Float32, variance: np.float32, light: Float32
+    point: Float32, ray: Float32, plane: Float32, variance: np.float32, albedo: Float32
 ) -> None:
     """Write the source point (POINT_SIZE,) of a pixel that has a plane."""
     v = plane[3]
     x, y = ray[0], ray[1]
     a, b, c = plane[0], plane[1], plane[2]
     length = np.sqrt(a * a + b * b + c * c)
-    gx, gy = light[1], light[2]
+    gx, gy = albedo[1], albedo[2]
     point[POINT], point[POINT + 1], point[POINT + 2] = x / v, y / v, 1 / v
     point[NORMAL], point[NORMAL + 1], point[NORMAL + 2] = a / length, b / length, c / length
     point[SIGMA] = np.sqrt(variance) / v
-    point[POINT_ALBEDO] = light[0]
+    point[POINT_ALBEDO] = albedo[0]
     point[POINT_ALBEDO_SLOPE], point[POINT_ALBEDO_SLOPE + 1] = gx * v, gy * v
     point[POINT_ALBEDO_SLOPE + 2] = -(gx * x + gy * y) * v
 
@@ -491,8 +491,8 @@ def exposure_differences(
         pixel = target[int(v + 0.5), int(u + 0.5)]
         if pixel[DISTANCE] == 0:
             continue
-        light = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]
-        difference = light - points[k, POINT_ALBEDO]
+        expected = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]
+        difference = expected - points[k, POINT_ALBEDO]
         if not np.isnan(difference):
             out[n] = difference
             n += 1

@@ -19,12 +19,12 @@ def kdtree_nearest_featured(
     queries: Float64,
     query_features: Float64,
     tolerance: float,
-    share: float,
+    weight: float,
     limit: float,
     index: Int64,
     cost: Float64,
 ) -> None:
-    """Find the point with the least ``|x - q|^2 + share |f - g|^2`` for each query q (m, 3).
+    """Find the point with the least ``|x - q|^2 + weight |f - g|^2`` for each query q (m, 3).
 
     The first five are the arrays of a `KdTree`; `features` f (n, k), in the order of the points as
     they were given, and `query_features` g (m, k) come ready weighted, in m. Only points closer in
@@ -83,7 +83,7 @@ def kdtree_nearest_featured(
                     if not abs(gap) <= tolerance:
                         alike = False
                         break
-                    total += share * gap * gap
+                    total += weight * gap * gap
                 if alike and (total < best or (total == best and order[i] < found)):
                     best = total
                     found = order[i]

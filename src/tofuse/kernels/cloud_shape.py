@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
 
-# A neighbourhood thinner than this share of its length is a line and has no normal.
+# A neighbourhood thinner than this fraction of its length is a line and has no normal.
 _LINE = 1e-8
 
 

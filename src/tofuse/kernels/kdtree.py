@@ -323,11 +323,11 @@ class KdTree:
         query_features: Float64,
         tolerance: float = np.inf,
         max_distance: float = np.inf,
-        share: float = 1.0,
+        weight: float = 1.0,
     ) -> tuple[Int64, Float64]:
         """Find the point least far away in space and features together, for each query (M, 3).
 
-        Least is the squared distance in space plus `share` times that of the features, `features`
+        Least is the squared distance in space plus `weight` times that of the features, `features`
         (N, K) of the points and `query_features` (M, K), weighted so that they are in m. Points
         further away in space than `max_distance` m, or off by more than `tolerance` in a feature,
         don't count, nor do NaN features. Returns index (M,), -1 where there is none, and the
@@ -347,7 +347,7 @@ class KdTree:
                 array[a:b],
                 asked[a:b],
                 tolerance,
-                share,
+                weight,
                 limit,
                 index[a:b],
                 distance2[a:b],

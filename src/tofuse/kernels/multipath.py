@@ -46,13 +46,13 @@ def ray_bounds(rays: Float32) -> Float64:
 
 @kernel
 def block_means(
-    z: Float32, rays: Float32, light: Float32, step: int, jump: float, nodes: Float64
+    z: Float32, rays: Float32, amplitude: Float32, step: int, jump: float, nodes: Float64
 ) -> None:
     """Average blocks of step x step pixels over the pixels of the block's dominant surface.
 
     Parameters
     ----------
-    z, rays, light
+    z, rays, amplitude
         (H, W) depth in m, (H, W, 2) x/z and y/z, and (H, W) raw amplitude; 0 where unknown.
     jump
         Pixels within this fraction of the block's median depth are averaged.
@@ -93,9 +93,9 @@ def block_means(
                         x += rays[i, j, 0]
                         y += rays[i, j, 1]
                         w += 1.0 / z[i, j]
-                        if light[i, j] > 0:
+                        if amplitude[i, j] > 0:
                             lit += 1
-                            amount += light[i, j]
+                            amount += amplitude[i, j]
                         i2 = i + 1 if i + 1 < rows else i - 1
                         j2 = j + 1 if j + 1 < columns else j - 1
                         ux = rays[i, j2, 0] - rays[i, j, 0]

@@ -67,17 +67,17 @@ def range_sigma(
             length2 = 1 + x * x + y * y
             distance2 = measured * measured if is_range else measured * measured * length2
             if law == BY_AMPLITUDE:
-                light = float(channel[i, j])
-                if not light < SATURATED:
-                    light = 0.0
+                amplitude = float(channel[i, j])
+                if not amplitude < SATURATED:
+                    amplitude = 0.0
                 elif compensated:
-                    light /= distance2
+                    amplitude /= distance2
                     if falloff == 4:
-                        light /= length2 * length2
+                        amplitude /= length2 * length2
                     elif falloff > 0:
-                        light *= length2 ** (-0.5 * falloff)
-                if light > 0:
-                    dimness = 1 / light
+                        amplitude *= length2 ** (-0.5 * falloff)
+                if amplitude > 0:
+                    dimness = 1 / amplitude
                     variance = floor * floor + (shot * shot + dark * dark * dimness) * dimness
                 else:
                     variance = ceiling * ceiling

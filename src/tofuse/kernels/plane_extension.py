@@ -45,7 +45,7 @@ def extend_planes(
     """
     rows, columns = w.shape
     limit = np.float32(sigmas * sigmas)
-    share = np.float32(jump)
+    tolerance = np.float32(jump)
     for i in range(rows):
         for j in range(columns):
             if not wanted[i, j]:
@@ -60,7 +60,7 @@ def extend_planes(
                 if p < 0 or q < 0 or p >= rows or q >= columns or not planes[p, q, 3] > 0:
                     continue
                 value = planes[p, q, 0] * x + planes[p, q, 1] * y + planes[p, q, 2]
-                if not abs(value - planes[p, q, 3]) <= share * value:
+                if not abs(value - planes[p, q, 3]) <= tolerance * value:
                     continue
                 off = here - value
                 grown = growth[k] * variance[p, q]

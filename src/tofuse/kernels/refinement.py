@@ -431,5 +431,5 @@ def overlaps(
             )
             if cosine >= min_cosine:
                 seen += 1
-        share = seen / max(stop - start, 1)
-        out[s] = share if share >= min_overlap else 0.0
+        fraction = seen / max(stop - start, 1)
+        out[s] = fraction if fraction >= min_overlap else 0.0

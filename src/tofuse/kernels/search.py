@@ -43,7 +43,7 @@ _ROWS = 24
 def _score_points(
     points: Float32,
     normals: Float32,
-    light: Float32,
+    log_albedo: Float32,
     grid: Float32,
     frame: Float64,
     reach: float,
@@ -56,7 +56,7 @@ def _score_points(
 
     Parameters
     ----------
-    points, normals, light
+    points, normals, log_albedo
         (N, 3) m, (N, 3) unit, and (N,) log albedo.
     grid, frame
         The other image.
@@ -107,7 +107,7 @@ def _score_points(
             block[(_PIXEL + 3) * _LANES + b] = planes[at + 3] if node[b] >= 0 else none
             block[(_PIXEL + 4) * _LANES + b] = planes[at + 4]
         nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
-        level = light[k]
+        level = log_albedo[k]
         for b in range(_LANES):
             m0, m1 = block[_PIXEL * _LANES + b], block[(_PIXEL + 1) * _LANES + b]
             m2, d = block[(_PIXEL + 2) * _LANES + b], block[(_PIXEL + 3) * _LANES + b]
@@ -137,13 +137,13 @@ def _score_points(
             fits = (d > none) & (r >= -reach32) & (r < reach32) & (c > none)
             w = c * (one - r * r * per2) if fits else none
             block[_TOTAL * _LANES + b] += w - (two if through else none)
-            lighter = block[(_PIXEL + 4) * _LANES + b] - level
-            known = lighter == lighter
+            albedo_ratio = block[(_PIXEL + 4) * _LANES + b] - level
+            known = albedo_ratio == albedo_ratio
             w = w if known else none
-            lighter = lighter if known else none
+            albedo_ratio = albedo_ratio if known else none
             block[_ALBEDO * _LANES + b] += w
-            block[(_ALBEDO + 1) * _LANES + b] += w * lighter
-            block[(_ALBEDO + 2) * _LANES + b] += w * lighter * lighter
+            block[(_ALBEDO + 1) * _LANES + b] += w * albedo_ratio
+            block[(_ALBEDO + 2) * _LANES + b] += w * albedo_ratio * albedo_ratio
 
 
 @kernel
@@ -188,10 +188,10 @@ def select_distinct(
 def score_grid(
     source_points: Float32,
     source_normals: Float32,
-    source_light: Float32,
+    source_log_albedo: Float32,
     target_points: Float32,
     target_normals: Float32,
-    target_light: Float32,
+    target_log_albedo: Float32,
     source_grid: Float32,
     source_frame: Float64,
     target_grid: Float32,
@@ -210,7 +210,7 @@ def score_grid(
     ----------
     source_points, source_normals, target_points, target_normals
         (N, 3) and (M, 3), each in the frame of its own camera.
-    source_light, target_light
+    source_log_albedo, target_log_albedo
         (N,) and (M,) log albedo at the points, NaN where unknown.
     source_grid, source_frame, target_grid, target_frame
         The images, as described above.
@@ -226,7 +226,7 @@ def score_grid(
         (A, B), written: support minus twice the violations minus the albedo penalty, divided by
         the number of points.
     """
-    share = 1.0 / max(len(source_points) + len(target_points), 1)
+    per_point = 1.0 / max(len(source_points) + len(target_points), 1)
     per2 = 1.0 / (albedo * albedo)
     many = translations.shape[1]
     there, back = np.zeros(_ROWS * _LANES, np.float32), np.zeros(_ROWS * _LANES, np.float32)
@@ -247,12 +247,12 @@ def score_grid(
         there[_TOTAL * _LANES :] = np.float32(0)
         back[_TOTAL * _LANES :] = np.float32(0)
         _score_points(
-            source_points, source_normals, source_light, target_grid, target_frame, reach, there,
-            node,
+            source_points, source_normals, source_log_albedo, target_grid, target_frame, reach,
+            there, node,
         )  # fmt: skip
         _score_points(
-            target_points, target_normals, target_light, source_grid, source_frame, reach, back,
-            node,
+            target_points, target_normals, target_log_albedo, source_grid, source_frame, reach,
+            back, node,
         )  # fmt: skip
         for b in range(count):
             total = np.float64(there[_TOTAL * _LANES + b]) + back[_TOTAL * _LANES + b]
@@ -268,7 +268,7 @@ def score_grid(
                 )
                 total -= min((square - mean * mean / weight) * per2, _MAX_ALBEDO_PENALTY * weight)
             a, c = divmod(first + b, many)
-            scores[a, c] = total * share
+            scores[a, c] = total * per_point
 
 
 @kernel
@@ -462,7 +462,7 @@ def measure_agreement(
     points: Float32,
     normals: Float32,
     sigma: Float32,
-    light: Float32,
+    log_albedo: Float32,
     planes: Float32,
     plane_variance: Float32,
     albedo: Float32,
@@ -498,7 +498,7 @@ def measure_agreement(
         the surface by twice that.
     min_cosine
         Smallest cosine between the normals of a supporting point and the plane.
-    light, albedo
+    log_albedo, albedo
         (N,) log albedo of the points and (H, W, 3) of the image (first channel), NaN where unknown.
     differences
         (N,) written: log albedo of the image minus the point's for supporting points, else NaN.
@@ -555,7 +555,7 @@ def measure_agreement(
         ):
             out[SUPPORT] += 1
             out[SQUARES_M] += r * r
-            differences[k] = albedo[i, j, 0] - light[k]
+            differences[k] = albedo[i, j, 0] - log_albedo[k]
             here, there = (px * px + py * py) / (pz * pz), (x * x + y * y) / (z * z)
             slants[k] = 0.5 * np.log((1 + there) / (1 + here))
     return out

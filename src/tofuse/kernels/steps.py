@@ -80,7 +80,7 @@ def iterate_level(
     """
     total = np.zeros(sums.SIZE)
     weak = np.zeros((0, 6))
-    doubt = np.zeros((6, 6))
+    spurious = np.zeros((6, 6))
     size = np.inf
     done = 0
     while done < iterations and size >= tolerance:
@@ -100,7 +100,7 @@ def iterate_level(
                 min_cosine,
             )
         if remap and done == 0:
-            doubt = total[sums.INLIERS] * spurious_information(
+            spurious = total[sums.INLIERS] * spurious_information(
                 points,
                 max(1, len(points) // SOME_POINTS),
                 estimates[SCALE_G],
@@ -109,10 +109,10 @@ def iterate_level(
                 tilt,
                 slope,
             )
-        finite = np.isfinite(total.sum() + doubt.sum())
+        finite = np.isfinite(total.sum() + spurious.sum())
         if finite:
             if remap:
-                weak = degenerate_directions(cross_information(total) - doubt, units, max_sigma)
+                weak = degenerate_directions(cross_information(total) - spurious, units, max_sigma)
             onward, step = solve_step(total, T, T_predicted, weak, prior, units)
             finite = np.isfinite(step.sum())
         if not finite:  # fits to noise alone can make planes without bounds
@@ -125,7 +125,7 @@ def iterate_level(
         if estimates[SCALE_P] > 0:
             estimates[EXPOSURE] += step[6]
         _rescale(total, estimates, max_scale, albedo_inflation)
-    return total, doubt, weak, size, done
+    return total, spurious, weak, size, done
 
 
 @kernel
@@ -225,15 +225,15 @@ def solve_step(
         trace = 0.0
         for p in range(6):
             trace += A[p, p]
-        firm = 1e3 * max(trace, 1.0)
+        stiffness = 1e3 * max(trace, 1.0)
         for k in range(weak.shape[0]):
             along = 0.0
             for p in range(6):
                 along += weak[k, p] * away[p]
             for p in range(6):
-                g[p] += firm * along * weak[k, p]
+                g[p] += stiffness * along * weak[k, p]
                 for o in range(6):
-                    A[p, o] += firm * weak[k, p] * weak[k, o]
+                    A[p, o] += stiffness * weak[k, p] * weak[k, o]
     _solve(A, g)
     for p in range(7):
         g[p] *= -units[p] if p < 6 else -1.0

@@ -284,7 +284,7 @@ def _add_row(w: Float32, rays: Float32, weight: Float32, above: Float64, below: 
 def albedo_image(
     planes: Float32,
     rays: Float32,
-    light: Float32,
+    amplitude: Float32,
     falls: bool,
     own_lamp: bool,
     falloff: float,
@@ -294,7 +294,7 @@ def albedo_image(
 
     Parameters
     ----------
-    planes, rays, light
+    planes, rays, amplitude
         (H, W, 4) of `fit_planes`, (H, W, 2), and (H, W) amplitude.
     falls
         Whether the amplitude falls with the squared range; it does not if it is range-compensated.
@@ -306,13 +306,13 @@ def albedo_image(
     out
         (H, W) written; NaN without plane or amplitude, and at grazing incidence.
     """
-    rows, columns = light.shape
+    rows, columns = amplitude.shape
     one = np.float32(1)
     for i in range(rows):
         for j in range(columns):
             out[i, j] = np.nan
             v = planes[i, j, 3]
-            if v <= 0 or not light[i, j] > 0:
+            if v <= 0 or not amplitude[i, j] > 0:
                 continue
             x = rays[i, j, 0]
             y = rays[i, j, 1]
@@ -326,7 +326,7 @@ def albedo_image(
                 continue
             shade = cosine if own_lamp else one
             apart = length2 / (v * v)  # the squared range
-            out[i, j] = np.log(light[i, j] / shade * (apart if falls else one))
+            out[i, j] = np.log(amplitude[i, j] / shade * (apart if falls else one))
             if falloff != 0:
                 out[i, j] += np.float32(0.5 * falloff) * np.log(length2)
 
@@ -374,10 +374,10 @@ def smooth_and_slope(
         m1, p1, r1 = mean[k, 2 * h :], planes[i, 2 * h :], rays[i, 2 * h :]
         m2, p2, r2 = mean[k - h, here], planes[i - h, here], rays[i - h, here]
         m3, p3, r3 = mean[k + h, here], planes[i + h, here], rays[i + h, here]
-        light, to = image[i, here], out[i, here]
+        own, to = image[i, here], out[i, here]
         for j in range(inner):
             v = p[j, 3]
-            if v <= 0 or np.isnan(light[j]):
+            if v <= 0 or np.isnan(own[j]):
                 continue
             most = np.float32(jump) * v
             if not (

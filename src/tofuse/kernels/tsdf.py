@@ -114,7 +114,7 @@ def shrink_to_planes(
     """
     rows, columns = z.shape
     one = np.float32(1)
-    share, most = np.float32(detail), np.float32(sigmas)
+    relative, most = np.float32(detail), np.float32(sigmas)
     for r in range(rows):
         for c in range(columns):
             depth = z[r, c]
@@ -126,7 +126,7 @@ def shrink_to_planes(
             if not on_plane > 0:
                 continue
             plane = one / on_plane
-            relief = (share * depth) * (share * depth)
+            relief = (relative * depth) * (relative * depth)
             gain = relief / max(relief + noise, np.float32(1e-12))
             rest = (one - gain) * (one - gain)
             # d z = z^2 d(1/z); the removed part of the relief adds to the uncertainty.
@@ -138,21 +138,21 @@ def shrink_to_planes(
 
 
 @kernel
-def mark_jumps(z: Float32, sigma: Float32, share: float, sigmas: float, jump: UInt8) -> None:
+def mark_jumps(z: Float32, sigma: Float32, fraction: float, sigmas: float, jump: UInt8) -> None:
     """Mark the pixels on both sides of a depth edge.
 
     Parameters
     ----------
     z, sigma
         (H, W) depth in m, 0 where there is none, and its standard deviation.
-    share, sigmas
+    fraction, sigmas
         An edge is a difference by more than this fraction of the depth, and by more than this
         number of standard deviations.
     jump
         (H, W) of zeros; set to 1 at edges.
     """
     rows, columns = z.shape
-    part, limit = np.float32(share), np.float32(sigmas * sigmas)
+    part, limit = np.float32(fraction), np.float32(sigmas * sigmas)
     for r in range(rows):
         for c in range(columns):
             a = z[r, c]
@@ -464,7 +464,7 @@ def integrate(
     backs: Float32,
     near: UInt8,
     turns: int,
-    light: Float32,
+    intensity: Float32,
     shape: tuple[int, int],
     lookup: Float32,
     lookup_frame: Float64,
@@ -509,7 +509,7 @@ def integrate(
         (V, B) bit mask of the eighths of a block that are near a view's surface.
     turns
         Period of the round-robin integration of free space.
-    light
+    intensity
         (V, H W, C) float32 colour or amplitude; C may be 0.
     shape
         (H, W) of the views.
@@ -523,7 +523,7 @@ def integrate(
     seen
         (B, VOXELS) number of views with a surface within `reach`, updated.
     color
-        (B, VOXELS, C) mean of `light` over those views, updated.
+        (B, VOXELS, C) mean of `intensity` over those views, updated.
     free
         (B, 8) weight of free-space observations of whole eighths, not yet in `distance`; updated.
     """
@@ -627,8 +627,8 @@ def integrate(
                 _measure(code, points, d)
                 _average(d, w, back, reach, distance[b, voxels], weight[b, voxels])
                 _count(d, reach, seen[b, voxels])
-                if light.shape[2]:
-                    _average_color(place, d, reach, light[s], seen[b, voxels], color[b, voxels])
+                if intensity.shape[2]:
+                    _average_color(place, d, reach, intensity[s], seen[b, voxels], color[b, voxels])
 
 
 @kernel
@@ -707,7 +707,7 @@ def _average_color(
     place: Int32,
     distance: Float32,
     limit: float,
-    light: Float32,
+    intensity: Float32,
     seen: UInt16,
     color: Float32,
 ) -> None:
@@ -721,13 +721,13 @@ def _average_color(
             continue
         lit = False
         tinted = False
-        for n in range(light.shape[1]):
-            lit = lit or light[place[q], n] > 0
+        for n in range(intensity.shape[1]):
+            lit = lit or intensity[place[q], n] > 0
             tinted = tinted or color[q, n] > 0
         if lit:
-            share = np.float32(1) / np.float32(seen[q]) if tinted else np.float32(1)
-            for n in range(light.shape[1]):
-                color[q, n] += (light[place[q], n] - color[q, n]) * share
+            per_image = np.float32(1) / np.float32(seen[q]) if tinted else np.float32(1)
+            for n in range(intensity.shape[1]):
+                color[q, n] += (intensity[place[q], n] - color[q, n]) * per_image
 
 
 @kernel

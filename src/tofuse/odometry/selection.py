@@ -44,7 +44,7 @@ class HypothesisSelector:
         """
         best = self._first_usual(hypotheses, now)
         if best is None and in_sequence:
-            best = self._best_doubtful(hypotheses, now) or self._by_search(hypotheses, now)
+            best = self._best_uncertain(hypotheses, now) or self._by_search(hypotheses, now)
         elif best is not None and in_sequence and self._lost_constraints(best):
             best = self._better_constrained(best, hypotheses, now)
         self._degenerate = 0 if best is None else len(best.aligned.unobservable)
@@ -103,7 +103,7 @@ class HypothesisSelector:
                 return hypothesis
         return None
 
-    def _best_doubtful(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
+    def _best_uncertain(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
         """Return the alignment that explains the view best, unless both images contradict it."""
         best, best_score = None, -np.inf
         made = list(hypotheses)

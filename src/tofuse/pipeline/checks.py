@@ -567,8 +567,8 @@ def _poses_of(ranges: Sequence[Range]) -> str:
     return f"{'The pose' if one else 'Poses'} of {in_words(ranges)} {'is' if one else 'are'}"
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %"
 
 
 def _length(metres: float) -> str:

@@ -129,7 +129,7 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     changes
         Nested options as in a TOML file. Tables are merged; a table that names another part
         replaces the whole part, a list replaces the whole list. `memory_mb` is divided: fusion
-        gets its share of it, unless the same changes say otherwise.
+        gets its part of it, unless the same changes say otherwise.
     where
         Names the file in errors.
 
@@ -163,12 +163,12 @@ def read_changes(path: str | Path) -> dict[str, Any]:
 
 
 def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Add fusion's share of the memory that is asked for."""
+    """Add fusion's part of the memory that is asked for."""
     megabytes = changes.get("memory_mb")
     if type(megabytes) is not int:  # not asked for, or refused later
         return changes
-    share = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
-    return dict(_merge(share, changes))
+    part = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
+    return dict(_merge(part, changes))
 
 
 def _merge(base: Any, change: Any) -> Any:

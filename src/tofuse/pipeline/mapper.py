@@ -265,7 +265,7 @@ class Mapper:
         result = self._assembly().run(self._log, stages or NoCheckpoints())
         diagnostics = replace(
             result.diagnostics,
-            removed=self._preparation.counts.shares,
+            removed=self._preparation.counts.fractions,
             seconds=dict(self.watch.seconds),
             samples=self._observations.samples.all,
         )

@@ -60,7 +60,7 @@ def paint(
         for corrector in correctors:
             frame = corrector.apply(frame)
         view = TextureView.of(frame) if isinstance(frame, RangeFrame) else None
-        if view is not None and (not views or view.light.shape == views[0].light.shape):
+        if view is not None and (not views or view.intensity.shape == views[0].intensity.shape):
             views.append(view)
             poses.append(result.trajectory[k])
     if not views:

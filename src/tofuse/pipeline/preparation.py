@@ -68,7 +68,7 @@ class Counts:
         self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
     @property
-    def shares(self) -> dict[str, float]:
+    def fractions(self) -> dict[str, float]:
         """Fraction of the points that each filter removed."""
         return {name: self.removed[name] / max(seen, 1) for name, seen in self.seen.items()}
 

@@ -135,7 +135,9 @@ class Trial:
         return f"overlapping views do not clearly disagree as it predicts ({found})"
 
 
-def trial(recording: Recording, without: Prepare, corrected: Prepare, doubt: float = 0.2) -> Trial:
+def trial(
+    recording: Recording, without: Prepare, corrected: Prepare, relative_sigma: float = 0.2
+) -> Trial:
     """Estimate the strength of the error that a correction removes.
 
     Parameters
@@ -145,7 +147,7 @@ def trial(recording: Recording, without: Prepare, corrected: Prepare, doubt: flo
     without, corrected
         Prepare a frame for tracking without and with the correction. Called with the same frames,
         run by run.
-    doubt
+    relative_sigma
         Standard deviation of the correction, as a fraction of it.
     """
     if len(recording) < _VIEWS + _MIN_RUNS - 1:
@@ -159,7 +161,7 @@ def trial(recording: Recording, without: Prepare, corrected: Prepare, doubt: flo
         if (start, stride) in done:
             continue
         done.add((start, stride))
-        result = _regressed(*views.run(start, stride), doubt)
+        result = _regressed(*views.run(start, stride), relative_sigma)
         if result is not None:
             results.append(result)
     explained, predicted = np.array(results).reshape(-1, 2).T.tolist()
@@ -259,7 +261,9 @@ class _AlignedViews:
         return views, np.array(poses)
 
 
-def _regressed(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[float, float] | None:
+def _regressed(
+    views: Sequence[_View], poses: Float64, relative_sigma: float
+) -> tuple[float, float] | None:
     """Regress the disagreement of a run jointly with its poses: see `Trial`."""
     n = len(views)
     if n < 3:  # the pose of a pair absorbs nearly all of it
@@ -269,7 +273,7 @@ def _regressed(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[fl
     for _ in range(_ITERATIONS):
         A, g = np.zeros((6 * n + 1, 6 * n + 1)), np.zeros(6 * n + 1)
         for i, j in pairs:
-            rows = _compared(views[i], views[j], se3.inverse(poses[i]) @ poses[j], doubt)
+            rows = _compared(views[i], views[j], se3.inverse(poses[i]) @ poses[j], relative_sigma)
             if rows is None:
                 continue
             J, residual, weight = rows
@@ -288,7 +292,7 @@ def _regressed(views: Sequence[_View], poses: Float64, doubt: float) -> tuple[fl
 
 
 def _compared(
-    target: _View, source: _View, T: Float64, doubt: float
+    target: _View, source: _View, T: Float64, relative_sigma: float
 ) -> tuple[Float64, Float64, Float64] | None:
     """Return the distances of a view's points from another's planes, with derivatives.
 
@@ -296,7 +300,7 @@ def _compared(
     ----------
     T
         (4, 4) T_target_source.
-    doubt
+    relative_sigma
         Standard deviation of the correction, as a fraction of it.
 
     Returns
@@ -352,7 +356,7 @@ def _compared(
         axis=1,
     )
     noise = variance * z**4 + t.plane_variance[v, u] * target_z**4
-    prediction_variance = _SHARED * doubt**2 * (by_source**2 + by_target**2)
+    prediction_variance = _SHARED * relative_sigma**2 * (by_source**2 + by_target**2)
     # Errors of neighbours are correlated: a pair has the same weight for any number of points.
     weight = 1 / (2 * noise + _PLANE_M**2 + prediction_variance) / len(distance)
     return J, distance, weight

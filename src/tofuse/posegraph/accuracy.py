@@ -30,7 +30,7 @@ _EVEN, _WORST = 50, 10
 # Standard deviations of an unmeasured direction, practically unbounded: m and rad.
 _OPEN = np.array([30.0] * 3 + [10.0] * 3)
 # In a large model, errors of this fraction of its diagonal count as unbounded.
-_UNMEASURED_SHARE = 0.05
+_UNMEASURED_FRACTION = 0.05
 # Ratio of the total error to that in which views differ: errors of the sensor that all views of a
 # place share are invisible.
 _HIDDEN = 1.6
@@ -208,7 +208,7 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
     if n < 2:
         return Accuracy()
     least_m, least_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
-    limits = np.array([max(least_m, _UNMEASURED_SHARE * diagonal_m), least_rad])
+    limits = np.array([max(least_m, _UNMEASURED_FRACTION * diagonal_m), least_rad])
     covariances, unbounded = _single(graph, limits)
     free = tuple(graph.ids[unbounded.any(1)].tolist())
     even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))

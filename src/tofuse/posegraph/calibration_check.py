@@ -280,9 +280,9 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
     """Describe the correction of each error of the camera, as in `CalibrationCheck`, in words."""
     words = []
     if "focal" in errors:
-        share = 1 / (1 + errors["focal"]) - 1
-        more = "larger" if share > 0 else "smaller"
-        words.append(f"a focal length {abs(share):.1%} {more}")
+        change = 1 / (1 + errors["focal"]) - 1
+        more = "larger" if change > 0 else "smaller"
+        words.append(f"a focal length {abs(change):.1%} {more}")
     if "offset" in errors:
         more = "longer" if errors["offset"] > 0 else "shorter"
         words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")

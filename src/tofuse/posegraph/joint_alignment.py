@@ -652,9 +652,9 @@ def _solve(
         H[:, free[:, None], free].sum(0),
         g[:, free].sum(0),
     )
-    firm = _WEAK_PRIOR / _ERROR_UNIT**2 + _DAMPING * shared.small.diagonal()
+    damping = _WEAK_PRIOR / _ERROR_UNIT**2 + _DAMPING * shared.small.diagonal()
     if priors.gravity is not None:
-        firm = np.append(firm, np.zeros(2))
+        damping = np.append(damping, np.zeros(2))
         _add_gravity(poses, priors.gravity, prior, shared, system)
     matrix, gradient = system.relative(
         np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, prior
@@ -670,7 +670,7 @@ def _solve(
         right[k] += column.ravel() @ step[system.free].ravel()
     for k, column in enumerate(columns):
         small[k] += follow[:, system.free].reshape(len(columns), -1) @ column.ravel()
-    small[np.diag_indices(len(columns))] += firm
+    small[np.diag_indices(len(columns))] += damping
     change = -np.linalg.solve(small, right)
     errors = np.zeros(kernels.ERRORS)
     errors[free - 6] = change[: len(free)]
@@ -740,10 +740,10 @@ def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
     H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.H : kernels.G]
     H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.H : kernels.G]
     g = state.rows[:, kernels.G : kernels.G + kernels.UNKNOWNS]
-    firm = np.maximum(H[:, e, e], 1e-9)
-    state.exposure -= np.clip(g[:, e] / firm, -0.3, 0.3)
+    pivot = np.maximum(H[:, e, e], 1e-9)
+    state.exposure -= np.clip(g[:, e] / pivot, -0.3, 0.3)
     rest = np.delete(np.arange(kernels.UNKNOWNS), e)
-    lever = H[:, rest, e] / firm[:, None]
+    lever = H[:, rest, e] / pivot[:, None]
     return (
         H[:, rest[:, None], rest] - lever[:, :, None] * H[:, None, e, rest],
         g[:, rest] - lever * g[:, [e]],

@@ -449,5 +449,5 @@ def followed(poses: Float64, at: Intp, after: Float64) -> Float64:
     left = np.clip(np.searchsorted(at, every, side="right") - 1, 0, len(at) - 1)
     relative = [after[k] @ se3.inverse(poses[at[k]]) @ poses for k in (left, right)]
     gap = at[right] - at[left]
-    share = np.where(gap > 0, (every - at[left]) / np.maximum(gap, 1), 0.0)
-    return se3.interpolate(relative[0], relative[1], share)
+    fraction = np.where(gap > 0, (every - at[left]) / np.maximum(gap, 1), 0.0)
+    return se3.interpolate(relative[0], relative[1], fraction)

@@ -153,18 +153,18 @@ class Revisits(Bounded, LoopDetector):
         first
             Smallest j.
         """
-        pairs, shares = overlaps(views, poses, _MAX_APART, first=first)
+        pairs, overlap_of = overlaps(views, poses, _MAX_APART, first=first)
         found: list[tuple[int, int]] = []
         ends = np.searchsorted(pairs[:, 1], np.arange(len(views) + 1))
         for j in range(first, len(views)):
             mine = slice(ends[j], ends[j + 1])
-            partners, share = pairs[mine, 0], shares[mine]
+            partners, overlap = pairs[mine, 0], overlap_of[mine]
             # The camera never left the unbroken run of partners up to this view.
             seen = np.zeros(j + 1, bool)
             seen[partners], seen[j] = True, True
             start = int(np.flatnonzero(~seen)[-1]) if not seen.all() else -1
-            again = (partners < start) & (share >= self.overlap)
-            order = np.argsort(-share[again], kind="stable")[: self.per_view]
+            again = (partners < start) & (overlap >= self.overlap)
+            order = np.argsort(-overlap[again], kind="stable")[: self.per_view]
             found += [(int(i), j) for i in np.sort(partners[again][order])]
         return found
 
@@ -201,7 +201,7 @@ class _RevisitLoops(Loops):
         self._poses[view.index] = T_component_camera
         newest = self._store.views[-1] if self._store.views else None
         if newest is not None and newest.index == view.index:
-            self._chosen.share(newest)
+            self._chosen.push_posed(newest)
 
     @property
     def many(self) -> bool:

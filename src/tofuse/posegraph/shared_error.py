@@ -68,17 +68,17 @@ class Disagreement:
     ----------
     seen, noise
         (P,) weighted mean squares of the patches' residuals, and their expectation by noise, m^2.
-    share
+    expected
         (P,) their expectation by shared errors of variance 1.
     """
 
     seen: Float64
     noise: Float64
-    share: Float64
+    expected: Float64
 
     def variance(self, growth: Float64) -> float:
         """Return the variance of shared errors at growth 1; pairs have `growth` (P,) times it."""
-        explained = float(self.share @ growth)
+        explained = float(self.expected @ growth)
         return max(float((self.seen - self.noise).sum()), 0.0) / max(explained, 1e-12)
 
 

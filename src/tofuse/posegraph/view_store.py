@@ -257,7 +257,7 @@ class ViewStore(Generic[V]):
         self._add(PosedView(view, T_component_camera, component, self._spill))
         return True
 
-    def share(self, posed: PosedView[V]) -> bool:
+    def push_posed(self, posed: PosedView[V]) -> bool:
         """Add the next view of another store, if it is wanted; returns whether it is."""
         if not self.wants(posed.index, posed.depth, posed.T_component_camera, posed.component):
             return False
@@ -316,13 +316,13 @@ def overlaps(
     axes = poses[:, :3, 2]
     facing = np.einsum("ni,ni->n", axes[target], axes[source]) > 0
     target, source = target[facing], source[facing]
-    share = _shares(views, poses, target, source, least)
-    near = share >= least
+    overlap = _seen_fractions(views, poses, target, source, least)
+    near = overlap >= least
     target, source = target[near], source[near]
-    share = np.minimum(share[near], _shares(views, poses, source, target, least))
+    overlap = np.minimum(overlap[near], _seen_fractions(views, poses, source, target, least))
     order = np.lexsort((target, source))
-    order = order[share[order] >= least]
-    return np.stack([target[order], source[order]], 1), share[order]
+    order = order[overlap[order] >= least]
+    return np.stack([target[order], source[order]], 1), overlap[order]
 
 
 def looked_at(views: Sequence[Outlined], poses: Float64) -> Float64:
@@ -358,7 +358,7 @@ def nearby(middles: Float64, first: int = 0) -> tuple[Intp, Intp]:
     return np.asarray(i[late], np.intp), np.asarray(j[late], np.intp)
 
 
-def _shares(
+def _seen_fractions(
     views: Sequence[Outlined],
     poses: Float64,
     target: Intp,

@@ -156,30 +156,32 @@ class Comparison:
             self.ways, (T, se3.inverse(T)), (1, -1), strict=True
         ):
             count += len(points.points)
-            lights = np.empty((2, len(points.points)), np.float32)
+            log_albedos = np.empty((2, len(points.points)), np.float32)
             pose = np.ascontiguousarray(pose)
-            total += _one_way(points, by, nearest, pose, options, lights)
-            compared.append(sign * lights[:, np.isfinite(lights[0])])
+            total += _one_way(points, by, nearest, pose, options, log_albedos)
+            compared.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
-        lighter, slants = np.hstack(compared)
+        albedo_ratio, slants = np.hstack(compared)
         clash, alike, falloff = 0, float(on_surface), 0.0
-        if len(lighter):
+        if len(albedo_ratio):
             if self.unknown_falloff:
-                falloff = _falloff(lighter, slants, options.albedo)
-                lighter = lighter + np.float32(falloff) * slants
+                falloff = _falloff(albedo_ratio, slants, options.albedo)
+                albedo_ratio = albedo_ratio + np.float32(falloff) * slants
             # Exposure is the median difference.
-            apart = np.abs(lighter - np.float32(median(lighter))) / np.float32(options.albedo)
+            apart = np.abs(albedo_ratio - np.float32(median(albedo_ratio))) / np.float32(
+                options.albedo
+            )
             clash = int(np.count_nonzero(apart > _CLASH))
             alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
-        share = 1 / max(count, 1)
+        per_point = 1 / max(count, 1)
         return Agreement(
-            overlap=float(total[kernels.COMPARED] * share),
-            support=float((on_surface - clash) * share),
-            violation=float(violation * share),
-            clash=float(clash * share),
+            overlap=float(total[kernels.COMPARED] * per_point),
+            support=float((on_surface - clash) * per_point),
+            violation=float(violation * per_point),
+            clash=float(clash * per_point),
             rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
             points=count,
-            score=float(share * (alike - options.violation_weight * violation)),
+            score=float(per_point * (alike - options.violation_weight * violation)),
             falloff=falloff,
         )
 
@@ -193,7 +195,7 @@ def nearest_depth(view: PreparedView) -> Float32:
     return np.where(view.z > 0, least, np.float32(0)).astype(np.float32)
 
 
-def _falloff(lighter: Float32, slants: Float32, albedo: float) -> float:
+def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
     """Return the exponent at which differences in log albedo (n,) have the least spread.
 
     It is estimated by trimmed least squares, like the exposure at every pose anew: otherwise the
@@ -208,12 +210,12 @@ def _falloff(lighter: Float32, slants: Float32, albedo: float) -> float:
     """
     exponent = 0.0
     ridge = _CORRELATED_POINTS * (albedo / _FALLOFF) ** 2
-    keep = np.ones(len(lighter), bool)
+    keep = np.ones(len(albedo_ratio), bool)
     for _ in range(_ITERATIONS):
-        x, y = slants[keep].astype(np.float64), lighter[keep].astype(np.float64)
+        x, y = slants[keep].astype(np.float64), albedo_ratio[keep].astype(np.float64)
         x -= x.mean()
         exponent = -float(x @ (y - y.mean())) / (float(x @ x) + ridge)
-        off = lighter + np.float32(exponent) * slants
+        off = albedo_ratio + np.float32(exponent) * slants
         off = np.abs(off - np.float32(median(off[keep])))
         keep = off <= 3 / _MEDIAN_OF_NORMAL * np.float32(median(off[keep]))
     return exponent
@@ -225,14 +227,14 @@ def _one_way(
     nearest: Float32,
     T: Float64,
     options: AgreementOptions,
-    lights: Float32,
+    log_albedos: Float32,
 ) -> Float64:
     def work(a: int, b: int) -> Float64:
         return kernels.measure_agreement(
             points.points,
             points.normals,
             points.sigma,
-            points.light,
+            points.log_albedo,
             view.planes,
             view.plane_variance,
             view.albedo,
@@ -244,8 +246,8 @@ def _one_way(
             options.floor_m,
             options.floor_fraction,
             float(np.cos(options.max_angle)),
-            lights[0],
-            lights[1],
+            log_albedos[0],
+            log_albedos[1],
             a,
             b,
         )

@@ -121,8 +121,8 @@ class _Views:
 
 def _finest(view: Frame) -> float:
     """Return a view's point spacing in m, bounded below by that of some thousand points."""
-    share = min(1.0, _SPACED / max(len(view), 1))
-    return spacing(view) * max(_FINER, float(np.sqrt(share)))
+    fraction = min(1.0, _SPACED / max(len(view), 1))
+    return spacing(view) * max(_FINER, float(np.sqrt(fraction)))
 
 
 def register_clouds(

@@ -37,7 +37,7 @@ _NEAR, _ALIKE = 3.0, 0.75
 _EDGE, _LARGER = 2.0, 1.05
 _MAX_PATCHES, _MIN_PATCHES = 120, 12
 # Grid of variances of the field, relative to that of the noise of a patch.
-_SHARES = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
+_RATIOS = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
 # Grid of correlation lengths, from the patches' edge to this many sizes of the overlap: distortions
 # may be correlated beyond it.
 _LENGTHS, _FURTHEST = 5, 4.0
@@ -314,14 +314,14 @@ def _estimated(patches: _Patches, J: Float64) -> Float64:
         values = np.maximum(values, 0.0)
         seen, at = vectors.T @ y, vectors.T @ A
         noise, field = at.T @ at, (at.T * values) @ at
-        for share in _SHARES:
-            variance = 1 + share * values
+        for ratio in _RATIOS:
+            variance = 1 + ratio * values
             inner = (at.T / variance) @ at
             fit = np.linalg.pinv(inner, hermitian=True) @ ((at.T / variance) @ seen)
             square = float(((seen - at @ fit) ** 2 / variance).sum())
             logs = np.log(variance).sum() + np.linalg.slogdet(inner)[1]
             likely.append(-0.5 * logs - 0.5 * freedom * np.log(max(square, 1e-300)))
             # The scale's posterior mean, with the prior 1 / scale.
-            meat.append((noise + share * field) * square / max(freedom - 2, 1))
+            meat.append((noise + ratio * field) * square / max(freedom - 2, 1))
     weight = np.exp(np.array(likely) - max(likely))
     return np.asarray(np.tensordot(weight / weight.sum(), np.array(meat), 1), np.float64)

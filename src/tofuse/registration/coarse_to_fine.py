@@ -28,7 +28,7 @@ from tofuse.registration.surface_metrics import PlaneToPlane
 
 _SPACING_SAMPLE = 5000
 _SMALLEST_LEVEL = 60
-_EXTENT_SHARE = 10
+_CELLS_PER_EXTENT = 10
 # Median roughness above which normals are unreliable, and number of points of the estimate.
 _ROUGHEST, _ROUGHNESS_SAMPLE = 0.25, 1500
 _COARSER = 1.5
@@ -128,7 +128,7 @@ class CoarseToFine(Bounded, Registrar):
             size = self.resolution
             fine = size, averaged(source, size), averaged(target, size)
         levels = [fine]
-        most = extent(fine[2].points) / _EXTENT_SHARE
+        most = extent(fine[2].points) / _CELLS_PER_EXTENT
         most = most if self.coarsest is None else min(most, self.coarsest)
         while levels[-1][0] * 2 < most:
             resolution = 2 * levels[-1][0]

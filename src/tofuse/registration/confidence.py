@@ -17,7 +17,7 @@ from tofuse.arrays import Float64
 from tofuse.registration.agreement import Agreement
 
 # Tolerances of a right pose: fraction of the depth, and rad.
-RIGHT_SHARE, RIGHT_RAD = 0.05, float(np.radians(4.0))
+RIGHT_FRACTION, RIGHT_RAD = 0.05, float(np.radians(4.0))
 # Minimum probability of an accepted pose; the mean probability of accepted poses is much higher.
 ACCEPTED = 0.9
 # Minimum probability at which a pose aligned from a guess is accepted without a search, as it was

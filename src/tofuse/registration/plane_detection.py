@@ -26,7 +26,7 @@ class Plane:
         (3,) unit, away from the camera.
     offset
         m, above 0.
-    share
+    fraction
         Of the view's points, those on it.
     rms_m
         Distance of these from it.
@@ -34,7 +34,7 @@ class Plane:
 
     normal: Float64
     offset: float
-    share: float
+    fraction: float
     rms_m: float
 
 

@@ -367,11 +367,11 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     those of cameras that drop single pixels, of spot projectors, and depth that was projected into
     an image of higher resolution.
     """
-    projection, z, light, own = _at_working_resolution(frame, options.columns)
+    projection, z, amplitude, own = _at_working_resolution(frame, options.columns)
     rays = projection.rays
     w = _inverse(z, z > 0)
     lit = frame.amplitude_image is not None
-    sigma = _noise_law(frame, z, light if lit else None, projection) if own is None else own
+    sigma = _noise_law(frame, z, amplitude if lit else None, projection) if own is None else own
     # d(1/z) = dz / z^2
     weight = _inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = _typical_noise(w, weight)
@@ -391,12 +391,12 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
     planes, quality = _fit(w, rays, weight, known, limit, options)
     albedo = _no_albedo(rows, columns)
-    has_albedo = light is not None
-    if light is not None:
+    has_albedo = amplitude is not None
+    if amplitude is not None:
         albedo = np.full((rows, columns, 3), np.nan, np.float32)
         raw_albedo = np.empty((rows, columns), np.float32)
         falls = lit and frame.amplitude_kind == "raw"
-        albedo_image(planes, rays, light, falls, lit, options.falloff or 0.0, raw_albedo)
+        albedo_image(planes, rays, amplitude, falls, lit, options.falloff or 0.0, raw_albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
                 raw_albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
@@ -527,8 +527,8 @@ def _edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -
         n, m = noise[a] ** 2, noise[b] ** 2
         # A large change of the noise is an edge between surfaces.
         differs = np.float32(options.edge_sigmas) * np.sqrt(np.minimum(n + m, 4 * np.minimum(n, m)))
-        share = np.minimum(np.maximum(differs, np.float32(options.edge_jump)), np.float32(0.9))
-        across = np.abs(w[a] - w[b]) > share * np.maximum(w[a], w[b])
+        limit = np.minimum(np.maximum(differs, np.float32(options.edge_jump)), np.float32(0.9))
+        across = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
     return _dilate(edge, options.edge_margin)
@@ -567,21 +567,21 @@ def _at_working_resolution(
     """Return projection, z, amplitude (or luminance) and the frame's sigma of z, downsampled."""
     z = frame.z
     z = np.where(frame.valid & (z > _MIN_DEPTH) & (z < _MAX_DEPTH), z, np.float32(0))
-    light = _amplitude(frame)
+    amplitude = _amplitude(frame)
     sigma = _own_sigma(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
         variance = z if sigma is None else sigma * sigma
-        halves = _halve(z, z if light is None else light, variance)
+        halves = _halve(z, z if amplitude is None else amplitude, variance)
         z = halves[0]
-        light = None if light is None else halves[1]
+        amplitude = None if amplitude is None else halves[1]
         sigma = None if sigma is None else np.sqrt(halves[2])
         step *= 2
     projection = _projection(frame.camera, step)
     if step > 1 and projection.unknown is not None:
         # The mean ray of a block with an unknown ray is unknown.
         z[projection.unknown] = 0
-    return projection, z, light, sigma
+    return projection, z, amplitude, sigma
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:
@@ -589,9 +589,11 @@ def _amplitude(frame: RangeFrame) -> Float32 | None:
 
     The gamma of colours becomes a constant factor of the log albedo.
     """
-    light = frame.amplitude_image
-    if light is not None:
-        return np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
+    amplitude = frame.amplitude_image
+    if amplitude is not None:
+        return np.where(amplitude < SATURATED_AMPLITUDE, amplitude, np.float32(0)).astype(
+            np.float32
+        )
     if frame.color_image is None or not frame.color_registered:
         return None
     grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
@@ -622,10 +624,10 @@ def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
     return np.asarray(np.where(known, picked, 0) / np.sqrt(lengths2), np.float32)
 
 
-def _halve(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
+def _halve(z: Float32, amplitude: Float32, variance: Float32) -> list[Float32]:
     out = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
     run_chunks(
-        lambda a, b: halve(z, light, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
+        lambda a, b: halve(z, amplitude, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
         len(out[0]),
         _chunks(len(out[0])),
     )
@@ -688,8 +690,8 @@ def _filled(z: Float32, options: SurfaceOptions) -> tuple[int, int]:
         beside = np.asarray(cv2.dilate(missing, cross), np.uint8)
         usable = ~_dilate(beside, options.edge_margin)
     size = 2 * options.radii[0] + 1
-    share = cv2.blur(usable.astype(np.float32), (size, size))
-    filled = (share >= options.fill) & (z > 0)
+    density = cv2.blur(usable.astype(np.float32), (size, size))
+    filled = (density >= options.fill) & (z > 0)
     return int(np.count_nonzero(filled)), int(np.count_nonzero(z > 0))
 
 
@@ -723,16 +725,16 @@ def _typical_noise(w: Float32, weight: Float32) -> float:
 
 
 def _noise_law(
-    frame: RangeFrame, z: Float32, light: Float32 | None, projection: Projection
+    frame: RangeFrame, z: Float32, amplitude: Float32 | None, projection: Projection
 ) -> Float32:
     """Return the sigma of z (H, W) in m up to a factor, by a law of the sensor family."""
-    if light is None or frame.amplitude_kind == "ir":
+    if amplitude is None or frame.amplitude_kind == "ir":
         return np.float32(0.001) + np.float32(0.003) * z * z
     if frame.amplitude_kind == "raw":
-        raw = light
+        raw = amplitude
     else:
         r2 = z * z * projection.lengths2
-        raw = light * _inverse(r2, r2 > 0)
+        raw = amplitude * _inverse(r2, r2 > 0)
     lit = raw[::2, ::2]
     lit = lit[lit > 0]
     if len(lit) == 0:
@@ -743,13 +745,13 @@ def _noise_law(
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
 
-def _scale_at(share: float, z: Float32, sigma: Float32) -> float:
-    """Return the variance scale at which a typical pixel's sigma is `share` times its depth."""
+def _scale_at(relative: float, z: Float32, sigma: Float32) -> float:
+    """Return the variance scale at which a typical pixel's sigma is `relative` times its depth."""
     z, sigma = z[::4, ::4], sigma[::4, ::4]
     known = (z > 0) & (sigma > 0)
     if not known.any():
         return 0.0
-    return median(share * z[known] / sigma[known]) ** 2
+    return median(relative * z[known] / sigma[known]) ** 2
 
 
 def _noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> float:

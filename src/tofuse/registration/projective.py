@@ -269,7 +269,7 @@ def align(
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
             points = points_of(source, level.stride)
-        total, doubt, weak, size, done = steps.iterate_level(
+        total, spurious, weak, size, done = steps.iterate_level(
             points,
             views,
             lookups,
@@ -300,7 +300,7 @@ def align(
         converged=size < options.convergence,
         iterations=iterations,
         information=steps.information(total),
-        cross=steps.cross_information(total) - doubt,
+        cross=steps.cross_information(total) - spurious,
         unobservable=weak,
         points=len(points) * len(targets),
         landed=int(total[kernels.PROJECTED]),

@@ -283,9 +283,9 @@ def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generat
 
 def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
     """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n)."""
-    share = (weight / weight.sum(1, keepdims=True))[..., None]
-    p0, q0 = (share * p).sum(1), (share * q).sum(1)
-    H = np.einsum("kni,knj->kij", share * (p - p0[:, None]), q - q0[:, None])
+    relative = (weight / weight.sum(1, keepdims=True))[..., None]
+    p0, q0 = (relative * p).sum(1), (relative * q).sum(1)
+    H = np.einsum("kni,knj->kij", relative * (p - p0[:, None]), q - q0[:, None])
     U, _, Vt = np.linalg.svd(H)
     mirrored = np.linalg.det(U) * np.linalg.det(Vt) < 0
     Vt[mirrored, 2] *= -1

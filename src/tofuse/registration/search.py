@@ -66,7 +66,7 @@ _MIN_POINTS = 50
 _SEEN = 3000
 # The whole grid is scored on a sixth of the points; the best poses, this many times the number of
 # candidates, on all.
-_COARSE_SHARE, _KEPT = 6, 200
+_COARSE_DIVISOR, _KEPT = 6, 200
 # In six dimensions the centres of cells of eight translations are scored first, with the reach
 # multiplied by the first number; the best fraction of the cells is then scored in full.
 _WIDER, _PROMISING = 1.5, 0.1
@@ -374,8 +374,8 @@ def _low_pass(albedo: Float64, sigma: float) -> Float32:
     known = np.isfinite(albedo)
     size = (0, 0)
     total = cv2.GaussianBlur(np.where(known, albedo, 0), size, sigma, borderType=_NO_BORDER)
-    share = cv2.GaussianBlur(known.astype(float), size, sigma, borderType=_NO_BORDER)
-    mean = total / np.maximum(share, 1e-9)
+    density = cv2.GaussianBlur(known.astype(float), size, sigma, borderType=_NO_BORDER)
+    mean = total / np.maximum(density, 1e-9)
     return np.where(known, mean, np.nan).astype(np.float32)
 
 
@@ -412,7 +412,7 @@ def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
     step = depth * max(_FULL_STEP, _FULL_ANGLE)
     scorer = _Scorer(s, t, [None, None], step)
     turns, shifts = _promising(scorer, rotations, moves, _FULL_STEP * depth, options)
-    few = max(1, _FULL_POINTS // _COARSE_SHARE)
+    few = max(1, _FULL_POINTS // _COARSE_DIVISOR)
     scores = scorer(rotations[turns], moves[shifts][:, None], few)[:, 0]
     top = _highest(scores, _KEPT * options.full_candidates)
     return _thinned(
@@ -433,7 +433,7 @@ def _promising(
     count = np.bincount(cell)
     middles = np.stack([np.bincount(cell, axis) for axis in moves.T], 1) / count[:, None]
     wider = replace(scorer, reach=_WIDER * scorer.reach)
-    few = max(1, _FULL_POINTS // _COARSE_SHARE)
+    few = max(1, _FULL_POINTS // _COARSE_DIVISOR)
     scores = wider(rotations, middles[None], few).ravel()
     best = _highest(scores, max(options.full_candidates, round(_PROMISING * len(scores))))
     turns, at = np.divmod(best, len(cells))
@@ -493,7 +493,7 @@ def _best(
     scorer: _Scorer, rotations: Float64, translations: Float64, points: int, count: int
 ) -> Float64:
     """Score a grid and return its `count` best poses (N, 4, 4) after non-maximum suppression."""
-    scores = scorer(rotations, translations[None], max(1, points // _COARSE_SHARE)).ravel()
+    scores = scorer(rotations, translations[None], max(1, points // _COARSE_DIVISOR)).ravel()
     turns, shifts = np.divmod(_highest(scores, _KEPT * count), len(translations))
     return _thinned(scorer, rotations[turns], translations[shifts], points, count)
 

@@ -287,12 +287,12 @@ def _seen_variance(
     """
     n = len(found.weights)
     M = np.eye(n) - (found.responses / found.weights[:, None]) @ bread @ found.responses.T
-    share = found.weights / found.weights.sum()
-    share = np.minimum(share, 4 * median(share))
-    expected = float(share @ ((M @ alike) * M).sum(1))
-    noise = float(share @ ((M / found.weights) * M).sum(1))
-    surplus = float(share @ found.means**2) - noise
-    return max(surplus, 0.0) / max(expected, 0.1 * float(share.sum()))
+    relative = found.weights / found.weights.sum()
+    relative = np.minimum(relative, 4 * median(relative))
+    expected = float(relative @ ((M @ alike) * M).sum(1))
+    noise = float(relative @ ((M / found.weights) * M).sum(1))
+    surplus = float(relative @ found.means**2) - noise
+    return max(surplus, 0.0) / max(expected, 0.1 * float(relative.sum()))
 
 
 def _slope(found: Patches, options: UncertaintyOptions) -> Float64:

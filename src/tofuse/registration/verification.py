@@ -150,8 +150,8 @@ class UsualFit:
 
 def _statistics(a: Aligned) -> Float64:
     n = max(a.compared, 1)
-    shares = np.array([1 - a.inliers / n, a.in_front / n])
-    odds = np.log((shares + _ODDS_FLOOR) / (1 - shares + _ODDS_FLOOR))
+    fractions = np.array([1 - a.inliers / n, a.in_front / n])
+    odds = np.log((fractions + _ODDS_FLOOR) / (1 - fractions + _ODDS_FLOOR))
     noise = np.log(a.noise_scale) if 0 < a.noise_scale < np.inf else np.nan
     albedo = np.log(a.photo_scale) if a.photometric and a.photo_scale > 0 else np.nan
     return np.array([*odds, noise, albedo])

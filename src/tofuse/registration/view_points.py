@@ -22,14 +22,14 @@ class ViewPoints:
         (N, 3) m, and unit, away from the camera.
     sigma
         (N,) of their z, m.
-    light
+    log_albedo
         (N,) log albedo, NaN where unknown.
     """
 
     points: Float32
     normals: Float32
     sigma: Float32
-    light: Float32
+    log_albedo: Float32
 
     @classmethod
     def of(cls, view: PreparedView, count: int) -> ViewPoints:

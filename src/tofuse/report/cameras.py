@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
-from tofuse.report.fields import OF_95_PERCENT, accuracy_shares
+from tofuse.report.fields import OF_95_PERCENT, normalized_accuracy
 from tofuse.report.packing import pack
 from tofuse.report.scene import RigCameras
 from tofuse.report.subject import Subject
@@ -26,7 +26,7 @@ def packed(s: Subject) -> dict[str, Any]:
     records = {r.index: r for r in s.result.diagnostics.frames}
     known = [records.get(int(k)) for k in index]
     errors = position_errors(s)
-    shares = np.round(255 * accuracy_shares(errors)).astype(np.uint8)
+    levels = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
     before = s.result.diagnostics.sequential
     if before.shape != s.result.trajectory.shape:
         before = np.full_like(s.result.trajectory, np.nan)
@@ -37,7 +37,7 @@ def packed(s: Subject) -> dict[str, Any]:
         else {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
         "index": pack(index.astype("<u4")),
         "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in known),
-        "errors": pack(shares) if np.isfinite(errors).any() else None,
+        "errors": pack(levels) if np.isfinite(errors).any() else None,
         "after": _poses(s.result.trajectory, s.straight),
         "before": _poses(before, s.straight),
     }

@@ -53,18 +53,18 @@ class Field:
         return {
             "label": self.label,
             "said": self.said,
-            "ends": [float(self.shares(np.array(end))) for end in (self.low, self.high)],
+            "ends": [float(self.normalized(np.array(end))) for end in (self.low, self.high)],
             "span": self.span,
-            "values": pack(np.round(255 * self.shares(self.values)).astype(np.uint8)),
+            "values": pack(np.round(255 * self.normalized(self.values)).astype(np.uint8)),
         }
 
-    def shares(self, values: Float64) -> Float64:
+    def normalized(self, values: Float64) -> Float64:
         """Return values as fractions of the span, 0 to 1; 1 where unknown."""
         low, high = self.span
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
-        share: Float64 = (values - low) / max(high - low, 1e-9)
-        return np.clip(np.nan_to_num(share, nan=1.0), 0, 1)
+        fraction: Float64 = (values - low) / max(high - low, 1e-9)
+        return np.clip(np.nan_to_num(fraction, nan=1.0), 0, 1)
 
 
 def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
@@ -91,9 +91,9 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     return out
 
 
-def accuracy_shares(metres: Float64) -> Float64:
+def normalized_accuracy(metres: Float64) -> Float64:
     """Return 95 % bounds in m as fractions of the span of a field of accuracies."""
-    return _accuracy(metres).shares(metres)
+    return _accuracy(metres).normalized(metres)
 
 
 def _height(heights: Float64, ends: tuple[float, float]) -> Field:

@@ -61,7 +61,7 @@ def render_pair(result: PairResult) -> str:
         target_color=_css(TARGET),
         none_color=_css(images.GONE),
         bar=color_bar(),
-        ticks=[_mm(scene.cap_m * share) for share in (0, 0.25, 0.5, 0.75, 1)],
+        ticks=[_mm(scene.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
         beyond=words.length(scene.none_m),
         started="the guess" if result.guess is not None else "the identity",
         thinned=_thinned(scene),
@@ -129,11 +129,11 @@ def _thinned(scene: PairScene) -> str:
 
 def _distance(scene: PairScene) -> str:
     """The median distance between the views where both have a surface, as text."""
-    if scene.share == 0:
+    if scene.fraction == 0:
         return f"No point is within {words.length(scene.none_m)} of the other view."
     return (
-        f"Median distance {_mm(scene.median_m)}, over the {pair_words.percent(scene.share)} of the "
-        f"points that are within {words.length(scene.none_m)} of the other view."
+        f"Median distance {_mm(scene.median_m)}, over the {pair_words.percent(scene.fraction)} of "
+        f"the points that are within {words.length(scene.none_m)} of the other view."
     )
 
 

@@ -51,7 +51,7 @@ class PairScene:
         Distance at the end of the colour bar.
     none_m
         Distance beyond which a point has no counterpart.
-    median_m, share
+    median_m, fraction
         Median distance of the points with a counterpart, and their fraction, 0 to 1.
     layers
         Source and target in the target's local frame, for each of `MODES`.
@@ -64,7 +64,7 @@ class PairScene:
     cap_m: float
     none_m: float
     median_m: float
-    share: float
+    fraction: float
     layers: dict[str, tuple[Scene, Scene]]
     yaw: float
     pitch: float
@@ -122,8 +122,8 @@ def pair_scene(result: PairResult) -> PairScene:
 
 def distance_colors(distance: Float64, cap_m: float) -> UInt8:
     """Return colours (N, 3) of distances in m; grey for points without a counterpart."""
-    share = np.clip(distance / cap_m, 0, 1)
-    colors = images.viridis(_FROM_BASE + (1 - _FROM_BASE) * share)
+    fraction = np.clip(distance / cap_m, 0, 1)
+    colors = images.viridis(_FROM_BASE + (1 - _FROM_BASE) * fraction)
     colors[distance > _NONE_CAPS * cap_m] = images.GONE
     return colors
 

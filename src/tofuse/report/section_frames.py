@@ -63,10 +63,12 @@ def frames(s: Subject) -> Values:
     bad = index[[r.status in ("lost", "skipped") for r in records]]
     if len(bad):
         out["health_legend"] = [("bad", "x", "lost or skipped")]
-    share = np.array([np.nan if r.inlier_share is None else r.inlier_share for r in records], float)
+    inliers = np.array(
+        [np.nan if r.inlier_share is None else r.inlier_share for r in records], float
+    )
     rms = np.array([np.nan if r.rms_m is None else r.rms_m for r in records], float)
     for values, scale, ylabel, label in (
-        (share, 100.0, "inliers, %", "Inliers over frames"),
+        (inliers, 100.0, "inliers, %", "Inliers over frames"),
         (rms, 1000.0, "rms residual, mm", "Rms residual over frames"),
     ):
         if np.isfinite(values).any():
@@ -90,7 +92,7 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
     if record.reason:
         parts[0] += f" – {record.reason}"
     if record.inlier_share is not None:
-        parts.append(f"{words.share(record.inlier_share)} inliers")
+        parts.append(f"{words.percent(record.inlier_share)} inliers")
     if record.rms_m is not None:
         parts.append(f"rms residual {words.length(record.rms_m)}")
     if len(record.unobservable):
@@ -110,10 +112,10 @@ def loops(s: Subject) -> Values:
             f"{p.i} and {p.j}",
             "✓ accepted" if p.accepted else "✗ rejected",
             p.reason or "–",
-            words.share(p.overlap),
+            words.percent(p.overlap),
             words.length(p.rms_m),
-            words.share(p.free_space_violation),
-            words.share(p.margin),
+            words.percent(p.free_space_violation),
+            words.percent(p.margin),
             [[p.i, p.i], [p.j, p.j]],
         )
         for p in loops

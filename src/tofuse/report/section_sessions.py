@@ -74,8 +74,8 @@ def _pair(pair: SessionPair, names: list[str]) -> Values:
     return {
         "names": f"{names[pair.a]}, {names[pair.b]}",
         "joined": joined,
-        "overlap": words.share(pair.overlap) if pair.joined else "–",
+        "overlap": words.percent(pair.overlap) if pair.joined else "–",
         "links": f"{pair.links:,}" if pair.joined else "–",
         "probability": "–" if pair.probability is None else probability_text(pair.probability),
-        "support": "–" if pair.support is None else words.share(pair.support),
+        "support": "–" if pair.support is None else words.percent(pair.support),
     }

@@ -196,7 +196,7 @@ def optimised(s: Subject) -> Values:
             f"Global refinement over {words.count(r.views, 'view')} in "
             f"{words.count(r.pairs, 'overlapping pair')}. "
         )
-        support = f"{words.share(r.support[0])} to {words.share(r.support[1])}"
+        support = f"{words.percent(r.support[0])} to {words.percent(r.support[1])}"
         if r.kept:
             refined += (
                 f"Poses moved by up to {words.length(r.moved_m)} and "

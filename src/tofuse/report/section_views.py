@@ -26,7 +26,7 @@ def filters(s: Subject) -> Values:
         for k, (name, frame) in enumerate(steps):
             if k:
                 gone = len(last) - len(frame)
-                part = words.share(gone / len(last) if len(last) else None)
+                part = words.percent(gone / len(last) if len(last) else None)
                 text = f"removed {part} ({gone:,} points), {len(frame):,} are left"
                 if not gone and name not in removed:
                     text = f"corrects; {words.count(len(frame), 'point')}"
@@ -61,8 +61,8 @@ def filters(s: Subject) -> Values:
     rows = []
     for name in names:
         gone, seen = here.get(name, (0, 0))
-        part = words.share(gone / seen) if seen else "–"
-        rows.append((name, words.share(removed.get(name)), part))
+        part = words.percent(gone / seen) if seen else "–"
+        rows.append((name, words.percent(removed.get(name)), part))
     return {"filter_rows": rows, "filter_steps": shown, "filter_note": note}
 
 

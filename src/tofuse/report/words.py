@@ -30,7 +30,7 @@ def signed_length(metres: float) -> str:
     return ("+" if metres >= 0 else "−") + length(abs(metres))
 
 
-def share(value: float | None) -> str:
+def percent(value: float | None) -> str:
     """Return a fraction as text, in percent."""
     if value is None or not np.isfinite(value):
         return "–"

@@ -295,7 +295,7 @@ def run_json(result: Reconstruction, tiled: tiles.TilingSummary | None = None) -
                 for s in d.priors
             ],
             "refinement": _refinement(d.refinement),
-            "filters": {name: {"removed": share} for name, share in d.removed.items()},
+            "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},
         }
     )
 

@@ -196,11 +196,11 @@ class _ImageRenderer:
         view = TextureView.of(replace(frame, color_image=None))
         if view is None:
             return None
-        light = view.light[..., 0]
-        lit = light > 0
+        intensity = view.intensity[..., 0]
+        lit = intensity > 0
         if self._white is None and lit.any():
-            self._white = float(np.percentile(light[lit], _WHITE_PERCENTILE))
-        level = (np.where(lit, light, 0) / (self._white or 1.0)).clip(0, 1)
+            self._white = float(np.percentile(intensity[lit], _WHITE_PERCENTILE))
+        level = (np.where(lit, intensity, 0) / (self._white or 1.0)).clip(0, 1)
         # Gamma 1/2.2: albedo is linear, screens are not. Known pixels are never black.
         grey = np.where(lit, np.maximum(1, np.round(255 * level ** (1 / 2.2))), 0)
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)

@@ -58,9 +58,9 @@ class Track:
         right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         before, after = self.times[right - 1], self.times[right]
         gap = after - before
-        share = (times - before) / np.maximum(gap, 1e-12)
-        known = (share >= 0) & (share <= 1) & (gap <= _GAP * self.interval)
-        T = se3.interpolate(self.poses[right - 1], self.poses[right], np.clip(share, 0, 1))
+        fraction = (times - before) / np.maximum(gap, 1e-12)
+        known = (fraction >= 0) & (fraction <= 1) & (gap <= _GAP * self.interval)
+        T = se3.interpolate(self.poses[right - 1], self.poses[right], np.clip(fraction, 0, 1))
         return T, known
 
     def turning(self) -> tuple[Float64, Float64]:
@@ -131,14 +131,14 @@ def combined(a: HandEye, b: HandEye) -> HandEye:
     apart = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
     both = a.covariance + b.covariance
     ratio = float(apart @ np.linalg.pinv(both, hermitian=True) @ apart) / len(apart)
-    share = a.covariance @ np.linalg.pinv(both, hermitian=True)
-    C = a.covariance - share @ a.covariance
+    gain = a.covariance @ np.linalg.pinv(both, hermitian=True)
+    C = a.covariance - gain @ a.covariance
     variances = np.array([a.time_sigma_s**2, b.time_sigma_s**2]) + 1e-18
     known = float((1 / variances).sum())
     offset = (a.time_offset_s / variances[0] + b.time_offset_s / variances[1]) / known
     return replace(
         b,
-        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(share @ apart)), np.float64),
+        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(gain @ apart)), np.float64),
         covariance=np.asarray(0.5 * (C + C.T) * max(ratio, 1.0), np.float64),
         time_offset_s=float(offset),
         time_sigma_s=float(known**-0.5),
@@ -162,8 +162,8 @@ def _start(a: Track, b: Track, offset: float, *, one_world: bool) -> tuple[Float
     if one_world:
         return _mean(se3.inverse(T_a) @ T_b), np.eye(4)
     motions_a, motions_b = [], []
-    for share in _SPANS:
-        step = max(1, round(share * len(T_a)))
+    for span in _SPANS:
+        step = max(1, round(span * len(T_a)))
         motions_a.append(se3.inverse(T_a[:-step]) @ T_a[step:])
         motions_b.append(se3.inverse(T_b[:-step]) @ T_b[step:])
     A, B = np.concatenate(motions_a), np.concatenate(motions_b)
@@ -257,8 +257,8 @@ def _sigma(e: Float64) -> Float64:
 
 def _weights(e: Float64, sigma: Float64) -> Float64:
     """Return weights (N, 6): Tukey's biweight of the residual of each pose."""
-    share = ((e / sigma) ** 2).mean(1) / _ROBUST**2
-    return np.repeat((np.maximum(1 - share, 0) ** 2)[:, None], 6, axis=1)
+    ratio = ((e / sigma) ** 2).mean(1) / _ROBUST**2
+    return np.repeat((np.maximum(1 - ratio, 0) ** 2)[:, None], 6, axis=1)
 
 
 def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:
@@ -297,12 +297,12 @@ def _correlation_time(e: Float64, times: Float64, taken: float) -> float:
     """
     interval = float(np.median(np.diff(times)))
     power = float((e**2).sum())
-    shares = []
+    correlations = []
     for k in range(1, max(len(e) // 4, 2)):
-        share = float((e[:-k] * e[k:]).sum()) / max(power, 1e-12)
-        if share <= 0:
+        correlation = float((e[:-k] * e[k:]).sum()) / max(power, 1e-12)
+        if correlation <= 0:
             break
-        shares.append(share)
-    first = 1 + 2 * sum(shares)
+        correlations.append(correlation)
+    first = 1 + 2 * sum(correlations)
     missing = min(taken * first / len(e) + _UPPER * np.sqrt(first / e.size), 0.5)
-    return float(1 + 2 * sum((s + missing) / (1 + missing) for s in shares)) * interval
+    return float(1 + 2 * sum((s + missing) / (1 + missing) for s in correlations)) * interval

@@ -89,7 +89,7 @@ class OffscreenCells:
         (2,) sides of a cell.
     rays
         (M, 2) x/z and y/z of the cells' centres.
-    share
+    fraction
         (M,) illuminated fraction of a cell.
     planes
         (M, 3) a, b, c of the mapped plane 1/z = a x + b y + c in the cell; 0 where unknown.
@@ -99,7 +99,7 @@ class OffscreenCells:
 
     pitch: Float64
     rays: Float64
-    share: Float64
+    fraction: Float64
     planes: Float64
     albedo: Float64
 
@@ -153,7 +153,7 @@ class OffscreenCells:
         out = np.empty((len(self.rays), 9), np.float32)
         count = kernels.offscreen_sources(
             self.rays,
-            self.share * self.pitch.prod(),
+            self.fraction * self.pitch.prod(),
             self.planes,
             self.albedo / gain,
             surfaces.nodes[border],
@@ -186,5 +186,5 @@ def _cells(
     outside = (gi < 0) | (gi >= count[0]) | (gj < 0) | (gj >= count[1])
     rays = low + (np.stack([gi, gj], 1)[outside] + 0.5) * pitch
     # Cells on the border of the illumination count in part.
-    share = np.clip((limit - np.sqrt((rays**2).sum(1))) / pitch.mean() + 0.5, 0, 1)
-    return pitch, rays[share > 0], share[share > 0]
+    fraction = np.clip((limit - np.sqrt((rays**2).sum(1))) / pitch.mean() + 0.5, 0, 1)
+    return pitch, rays[fraction > 0], fraction[fraction > 0]

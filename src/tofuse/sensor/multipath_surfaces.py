@@ -23,11 +23,11 @@ _FLAT = 0.006
 LEAST_COSINE = 0.12
 
 
-def block_nodes(z: Float32, rays: Float32, light: Float32, step: int) -> Float64:
+def block_nodes(z: Float32, rays: Float32, amplitude: Float32, step: int) -> Float64:
     """Return the nodes (Hn, Wn, COLUMNS) of an image without planes, see `kernels.multipath`."""
     size = -(-z.shape[0] // step), -(-z.shape[1] // step)
     nodes = np.empty((*size, COLUMNS))
-    kernels.block_means(z, rays, light, step, _JUMP, nodes)
+    kernels.block_means(z, rays, amplitude, step, _JUMP, nodes)
     return nodes
 
 
@@ -120,8 +120,8 @@ class Surfaces:
             return 0.0
         albedo, area = self.albedo[pick], self.area[pick]
         order = np.argsort(albedo, kind="stable")
-        share = np.cumsum(area[order])
-        return float(albedo[order][np.searchsorted(share, 0.9 * share[-1])])
+        cumulative = np.cumsum(area[order])
+        return float(albedo[order][np.searchsorted(cumulative, 0.9 * cumulative[-1])])
 
 
 def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:

@@ -221,10 +221,10 @@ class NoiseModel(Bounded):
         return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
 
     def _parameters(self) -> Float64:
-        light = self.amplitude or AmplitudeLaw(1.0, 0.0)
+        law = self.amplitude or AmplitudeLaw(1.0, 0.0)
         power = 0.0 if self.confidence is None else self.confidence.power
         return np.array(
-            [self.ceiling_m, light.floor, light.shot, light.dark, light.falloff,
+            [self.ceiling_m, law.floor, law.shot, law.dark, law.falloff,
              self.range.a, self.range.b, power, self.footprint]
         )  # fmt: skip
 

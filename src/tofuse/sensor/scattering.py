@@ -65,14 +65,14 @@ class Scattering:
         return measured - _enlarge(scattered, step, measured.shape)
 
 
-def blur(light: Complex128, width: float) -> Complex128:
+def blur(phasors: Complex128, width: float) -> Complex128:
     """Blur phasors (H, W) by a Gaussian of `width` times the image's width, padded by zeros.
 
     Computed on a coarse grid.
     """
-    step = _coarse_step(light.shape[1], width)
-    small = _blur(_reduce(light, step), width * light.shape[1] / step)
-    return _enlarge(small, step, light.shape)
+    step = _coarse_step(phasors.shape[1], width)
+    small = _blur(_reduce(phasors, step), width * phasors.shape[1] / step)
+    return _enlarge(small, step, phasors.shape)
 
 
 def _coarse_step(columns: int, width: float) -> int:
@@ -80,13 +80,13 @@ def _coarse_step(columns: int, width: float) -> int:
     return max(1, min(columns // _COLUMNS, int(width * columns / 2)))
 
 
-def _reduce(light: Complex128, step: int) -> Float64:
+def _reduce(phasors: Complex128, step: int) -> Float64:
     """Block means (h, w, 2): real and imaginary part."""
-    rows, columns = light.shape
+    rows, columns = phasors.shape
     h, w = -(-rows // step), -(-columns // step)
     padded = np.zeros((h * step, w * step, 2))
-    padded[:rows, :columns, 0] = light.real
-    padded[:rows, :columns, 1] = light.imag
+    padded[:rows, :columns, 0] = phasors.real
+    padded[:rows, :columns, 1] = phasors.imag
     size = (w, h)
     return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float64)
 
@@ -104,7 +104,7 @@ def _enlarge(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
 
 
 def estimate_fractions(
-    light: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
+    phasors: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
 ) -> Float64:
     """Estimate the scattered fractions from moving objects in front of a static background.
 
@@ -114,7 +114,7 @@ def estimate_fractions(
 
     Parameters
     ----------
-    light
+    phasors
         (N, H, W) phasors.
     source, still
         (H, W) masks of moving and of static pixels, over all images.
@@ -126,10 +126,10 @@ def estimate_fractions(
     The fraction of each width; all 0 if scattering is insignificant or not observable.
     """
     none = np.zeros(len(widths))
-    still = still & (light != 0).all(0)
-    if np.count_nonzero(still) < _MIN_PIXELS or len(light) < 3:
+    still = still & (phasors != 0).all(0)
+    if np.count_nonzero(still) < _MIN_PIXELS or len(phasors) < 3:
         return none
-    seen = light[:, still]
+    seen = phasors[:, still]
     mean = seen.mean(0)
 
     def own_change(values: Complex128) -> Float64:
@@ -138,7 +138,7 @@ def estimate_fractions(
         change = change - common[:, None] * mean
         return np.concatenate([change.real.ravel(), change.imag.ravel()])
 
-    moving = np.where(source, light, 0)
+    moving = np.where(source, phasors, 0)
     images = [np.stack([blur(image, width)[still] for image in moving]) for width in widths]
     A = np.stack([own_change(image) for image in images], 1)
     b = own_change(seen)

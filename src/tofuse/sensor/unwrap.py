@@ -88,20 +88,20 @@ class UnwrapOptions:
 _DEFAULT = UnwrapOptions()
 
 
-def white_amplitude(light: Float32, radial_range: Float32, valid: Bool) -> float:
+def white_amplitude(amplitude: Float32, radial_range: Float32, valid: Bool) -> float:
     """Estimate the raw amplitude of a white surface at 1 m from the brightest pixels; 0 if unknown.
 
     Wrapped pixels appear too dark, so they have no effect unless most pixels are wrapped.
 
     Parameters
     ----------
-    light, radial_range, valid
+    amplitude, radial_range, valid
         (H, W) raw amplitude, radial range in m, and mask.
     """
-    seen = valid & (light > 0)
+    seen = valid & (amplitude > 0)
     if not seen.any():
         return 0.0
-    at_1_m = light[seen].astype(float) * radial_range[seen].astype(float) ** 2
+    at_1_m = amplitude[seen].astype(float) * radial_range[seen].astype(float) ** 2
     return float(np.quantile(at_1_m, 1 - _GLOSSY))
 
 
@@ -139,7 +139,7 @@ def on_surface(radial_range: Float32, period_m: float) -> Bool:
 
 def count_periods(
     radial_range: Float32,
-    light: Float32,
+    amplitude: Float32,
     period_m: float,
     white: float,
     pitch: float,
@@ -151,7 +151,7 @@ def count_periods(
     ----------
     radial_range
         (H, W) in m, in [0, period), 0 where invalid.
-    light
+    amplitude
         (H, W) raw amplitude, not compensated for range; 0 where unknown.
     period_m
         Ambiguity range.
@@ -167,7 +167,7 @@ def count_periods(
         return out
     side = max(1, round(radial_range.shape[1] / options.columns))
     surfaces = np.where(on_surface(radial_range, period_m), radial_range, np.float32(0))
-    blocks = _Blocks.of(surfaces, light, period_m, side)
+    blocks = _Blocks.of(surfaces, amplitude, period_m, side)
     unary = _albedo_cost(blocks, period_m, white, pitch * side, options)
     messages = np.zeros((4, *unary.shape), np.float32)
 
@@ -190,11 +190,11 @@ class _Blocks:
     """Range (h, w) in [0, period), mean amplitude and validity of square blocks of pixels."""
 
     range_m: Float32
-    light: Float32
+    amplitude: Float32
     valid: Bool
 
     @classmethod
-    def of(cls, radial_range: Float32, light: Float32, period: float, side: int) -> Self:
+    def of(cls, radial_range: Float32, amplitude: Float32, period: float, side: int) -> Self:
         height, width = radial_range.shape
         rows, columns = -(-height // side), -(-width // side)
         spare = ((0, rows * side - height), (0, columns * side - width))
@@ -205,13 +205,13 @@ class _Blocks:
 
         seen = radial_range > 0
         # Weighted by the root of the amplitude, so that bright surfaces don't dominate dark ones.
-        strength = np.where(seen, np.sqrt(np.maximum(light, 0)) + 1e-3, 0)
+        strength = np.where(seen, np.sqrt(np.maximum(amplitude, 0)) + 1e-3, 0)
         phase = 2 * np.pi * radial_range.astype(float) / period
         range_m = _range_of(
             summed(strength * np.cos(phase)), summed(strength * np.sin(phase)), period
         )
         count = summed(seen.astype(float))
-        mean = summed(np.where(seen, light, 0)) / np.maximum(count, 1)
+        mean = summed(np.where(seen, amplitude, 0)) / np.maximum(count, 1)
         return cls(range_m, mean.astype(np.float32), count >= 0.5 * side * side)
 
 
@@ -233,7 +233,7 @@ def _albedo_cost(
         beyond = np.maximum(blocks.range_m + k * period, 1e-6)
         # The slope implied by neighbouring ranges depends on the size of a pixel at that range.
         cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _MIN_COSINE)
-        albedo = np.maximum(blocks.light * beyond**2 / (white * cosine), 1e-6)
+        albedo = np.maximum(blocks.amplitude * beyond**2 / (white * cosine), 1e-6)
         unlikely = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
         cost[..., k] = np.minimum(unlikely, options.max_albedo_cost) + options.wrap_cost * k
     return np.float32(options.albedo_weight) * cost
@@ -281,8 +281,8 @@ def _with_surfaces_moved(
         at = range_m + periods * period
         difference = at[b] - at[a]
         now = jump(difference)
-        held = now < options.max_difference_cost
-        graph = coo_array((np.ones(held.sum()), (a[held], b[held])), (index.size, index.size))
+        joined = now < options.max_difference_cost
+        graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), (index.size, index.size))
         count, piece = connected_components(graph, directed=False)
         cut = piece[a] != piece[b]
         pa, pb, gap, paid = piece[a][cut], piece[b][cut], difference[cut], now[cut]

@@ -155,10 +155,10 @@ def peaks_bound(sigma: float) -> float:
     return mean_distance(C[:, :3, :3])
 
 
-def peaks_bound_of_one(sigma: float, shares: Sequence[float]) -> Float64:
+def peaks_bound_of_one(sigma: float, quantiles: Sequence[float]) -> Float64:
     """Quantiles (m) of the mean error of single recordings for a method at the bound."""
     C = joint_covariance(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
-    return np.asarray(np.quantile(mean_distances(C), shares), np.float64)
+    return np.asarray(np.quantile(mean_distances(C), quantiles), np.float64)
 
 
 def _seen() -> Bool:

@@ -116,7 +116,7 @@ def seen_by(plan: Plan, raw: int) -> Seen:
     phase = phase_noise(model, strength, diffuse, plan.effects, plan.scene.ambient)
     whole = np.isfinite(distance) & (distance < model.ambiguity_m) & (diffuse > 0)
     whole &= np.isfinite(phase) & (phase > 0)
-    light = np.log(np.where(whole, diffuse, 1.0))
+    brightness = np.log(np.where(whole, diffuse, 1.0))
     inner = np.zeros(shape, bool)
     inner[1:-1, 1:-1] = whole[1:-1, 1:-1]
     slopes = np.zeros((*shape, 2))
@@ -129,21 +129,21 @@ def seen_by(plan: Plan, raw: int) -> Seen:
             inner[middle] &= whole[side] & (apart < _JUMP * distance[middle])
         column = 1 - axis
         across = rays[ahead][..., column] - rays[behind][..., column]
-        slopes[(*middle, column)] = (light[ahead] - light[behind]) / across
+        slopes[(*middle, column)] = (brightness[ahead] - brightness[behind]) / across
     return Seen(points[inner], normals[inner], slopes[inner], phase[inner])
 
 
-def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, TrajectoryBound]:
+def trajectory_bounds(plan: Plan, *, every: int = 8) -> tuple[TrajectoryBound, TrajectoryBound]:
     """Bounds of a recording: from distances only, and from distances and albedo.
 
     Parameters
     ----------
-    share
-        One of `share` cells is evaluated and represents the others.
+    every
+        One of `every` cells is evaluated and represents the others.
     """
     poses, period = plan.poses, plan.model.period_m
     n = len(poses)
-    height, light = _Cells(n), _Cells(n)
+    height, photometric = _Cells(n), _Cells(n)
     pitch = float(np.nanmedian(np.abs(np.diff(plan.model.camera.rays()[..., 0], axis=1))))
     size = 0.0
     for k, raw in enumerate(plan.raw.tolist()):
@@ -151,17 +151,17 @@ def trajectory_bounds(plan: Plan, *, share: int = 8) -> tuple[TrajectoryBound, T
         p, m = view.points, view.normals
         size = size or pitch * float(np.median(p[:, 2]))
         cells = _cells(se3.transform(poses[k], p), m @ poses[k][:3, :3].T, size)
-        some = np.abs(cells * _PRIMES[0]) % share == 0
+        some = np.abs(cells * _PRIMES[0]) % every == 0
         p, m, cells = p[some], m[some], cells[some]
         phase, slopes, z = view.phase[some], view.slopes[some], view.points[some, 2:]
         # Error normal to the surface = error along the ray times the cosine.
         cosine = np.maximum(np.abs((p * m).sum(1)) / np.linalg.norm(p, axis=1), 1e-3)
         sigma = phase / (2 * np.pi) * period * cosine
-        height.add(k, cells, _rows(m, p, 0.0), share / sigma**2)
+        height.add(k, cells, _rows(m, p, 0.0), every / sigma**2)
         d = np.hstack([slopes, -(slopes * p[:, :2] / z).sum(1, keepdims=True)]) / z
-        light.add(k, cells, _rows(d, p, -1.0), share / phase**2)
+        photometric.add(k, cells, _rows(d, p, -1.0), every / phase**2)
     of_distances = height.information()
-    of_both = of_distances + light.information()
+    of_both = of_distances + photometric.information()
     unknowns = np.arange(n * _UNKNOWNS)
     # The first view's pose and exposure are given. Exposures affect albedo only.
     moving = unknowns >= _UNKNOWNS

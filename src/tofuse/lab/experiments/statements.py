@@ -122,7 +122,7 @@ def _legs(run: Run) -> tuple[Float64, Float64]:
 
 def _pushed_together(results: Results, method: str) -> Finding:
     case = results.cases["rail"]
-    share = {
+    fractions = {
         guess: [
             float(estimate[0] / true[0])
             for estimate, true in map(_legs, case.select(method, guess))
@@ -130,9 +130,9 @@ def _pushed_together(results: Results, method: str) -> Finding:
         for guess in ("identity", "previous")
     }
     return graded(
-        [s < 0.9 for s in share["identity"]],
-        f"The way out comes out {_mid(share['identity']):.0%} as long as it is "
-        f"({_mid(share['previous']):.0%} with the previous motion as guess).",
+        [s < 0.9 for s in fractions["identity"]],
+        f"The way out comes out {_mid(fractions['identity']):.0%} as long as it is "
+        f"({_mid(fractions['previous']):.0%} with the previous motion as guess).",
     )
 
 
@@ -712,7 +712,7 @@ def _previous_is_better(results: Results, method: str) -> Finding:
 
 
 def _worsened(results: Results, method: str) -> Finding:
-    shares = []
+    fractions = []
     for case in results.cases.values():
         for run in case.select(method):
             truth = measures.motions(run.truth)
@@ -720,10 +720,10 @@ def _worsened(results: Results, method: str) -> Finding:
                 measures.displacement_m(measures.motions(p), truth) for p in (run.before, run.after)
             )
             good = before <= np.nanmedian(before)
-            shares.append(float(np.mean(after[good] > before[good])))
+            fractions.append(float(np.mean(after[good] > before[good])))
     return graded(
-        [1.0 if s > 0.4 else 0.5 if s > 0.2 else 0.0 for s in shares],
-        f"Of the better half of the motions {_mid(shares):.0%} are worse after optimisation.",
+        [1.0 if s > 0.4 else 0.5 if s > 0.2 else 0.0 for s in fractions],
+        f"Of the better half of the motions {_mid(fractions):.0%} are worse after optimisation.",
         "run",
     )
 

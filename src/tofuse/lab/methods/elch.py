@@ -46,9 +46,9 @@ class Elch(Optimiser):
         order = np.flatnonzero(graph.loop)
         order = order[np.argsort(graph.edges[order].max(axis=1), kind="stable")]
         for loop in map(int, order):
-            share = [_shares(graph, length, known, loop) for length in lengths]
-            if share[0] is not None and share[1] is not None:
-                poses = _spread(poses, graph, loop, share[0], share[1])
+            fractions = [_fractions(graph, length, known, loop) for length in lengths]
+            if fractions[0] is not None and fractions[1] is not None:
+                poses = _spread(poses, graph, loop, fractions[0], fractions[1])
                 history.append(graph.with_poses(poses).chi2())
             known[loop] = True
         part = parts_of(len(poses), graph.edges)
@@ -73,7 +73,7 @@ def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:
     return out[0], out[1]
 
 
-def _shares(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float64 | None:
+def _fractions(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float64 | None:
     """(N,) fraction of the loop's error for each pose, 0 to 1; None if it closes no loop."""
     n = len(graph.ids)
     start, end = graph.edges[loop]
@@ -94,11 +94,11 @@ def _shares(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float6
     _, _, nearest = dijkstra(
         links, directed=False, indices=on_path, min_only=True, return_predecessors=True
     )
-    share = np.zeros(n)
+    fraction = np.zeros(n)
     reached = nearest >= 0
-    share[reached] = (distance / distance[end])[nearest[reached]]
-    share[on_path] = distance[on_path] / distance[end]
-    return share
+    fraction[reached] = (distance / distance[end])[nearest[reached]]
+    fraction[on_path] = distance[on_path] / distance[end]
+    return fraction
 
 
 def _spread(poses: Float64, graph: PoseGraph, loop: int, slide: Float64, turn: Float64) -> Float64:

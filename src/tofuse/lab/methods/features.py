@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float64, Int64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
-from tofuse.lab.methods.keypoints import Detector, Keypoints, Light, keypoints
+from tofuse.lab.methods.keypoints import Channel, Detector, Keypoints, keypoints
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
@@ -40,7 +40,7 @@ class Features(Bounded, Registrar):
     ----------
     detector
         "sift", "orb" or "fast".
-    light
+    channel
         Image of the detector: the "albedo" (amplitude times squared range), the "color", or "auto":
         the albedo if there is amplitude.
     count
@@ -59,7 +59,7 @@ class Features(Bounded, Registrar):
     """
 
     detector: Detector = "sift"
-    light: Light = "auto"
+    channel: Channel = "auto"
     count: Annotated[int, Bounds(3, 100_000)] = 1000
     ratio: Annotated[float, Bounds(0.01, 1)] = 0.9
     mutual: bool = True
@@ -82,7 +82,7 @@ class Features(Bounded, Registrar):
         (a, s), (b, t) = self._found(source), self._found(target)
         pairs = self.pairs(a, b)
         found = consensus(pairs, self.consensus, rng)
-        shares = [c.score / len(pairs) for c in found]
+        scores = [c.score / len(pairs) for c in found]
         if self.verify:
             said = [agreement(s, t, c.T_target_source).score for c in found]
             if max(said) <= 0:
@@ -90,10 +90,10 @@ class Features(Bounded, Registrar):
                     f"{found[0].count} of {len(pairs)} pairs of points agree on a motion that "
                     "what both images saw contradicts"
                 )
-            shares = [a + b for a, b in zip(shares, said, strict=True)]
-        best = max(range(len(found)), key=lambda k: shares[k])
-        rival = max((share for k, share in enumerate(shares) if k != best), default=0.0)
-        return registration_of(pairs, found[best], shares[best] - max(rival, 0.0))
+            scores = [a + b for a, b in zip(scores, said, strict=True)]
+        best = max(range(len(found)), key=lambda k: scores[k])
+        rival = max((score for k, score in enumerate(scores) if k != best), default=0.0)
+        return registration_of(pairs, found[best], scores[best] - max(rival, 0.0))
 
     def _found(self, view: Frame) -> tuple[Keypoints, PreparedView]:
         if not isinstance(view, RangeFrame):
@@ -103,7 +103,7 @@ class Features(Bounded, Registrar):
             view,
             surface,
             detector=self.detector,
-            light=self.light,
+            channel=self.channel,
             count=self.count,
             blur_px=self.blur_px,
         )

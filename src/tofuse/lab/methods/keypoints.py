@@ -15,7 +15,7 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 
 Detector = Literal["sift", "orb", "fast"]
-Light = Literal["auto", "albedo", "color"]
+Channel = Literal["auto", "albedo", "color"]
 
 # Min image width of the detectors, px: smaller images are enlarged.
 _WIDE = 500
@@ -56,7 +56,7 @@ class Keypoints:
         return len(self.points)
 
 
-def light_image(frame: RangeFrame, light: Light) -> UInt8:
+def channel_image(frame: RangeFrame, channel: Channel) -> UInt8:
     """(H, W) reflectance as grey levels; black where unknown.
 
     The albedo is the amplitude times the squared range (unless the camera compensates it), on a
@@ -65,7 +65,7 @@ def light_image(frame: RangeFrame, light: Light) -> UInt8:
     Raises RegistrationError if the frame lacks the requested channel.
     """
     has_color = frame.color_image is not None and frame.color_registered
-    if frame.amplitude_image is not None and light != "color":
+    if frame.amplitude_image is not None and channel != "color":
         r = frame.radial_range
         known = (
             (r > 0) & (frame.amplitude_image > 0) & (frame.amplitude_image < SATURATED_AMPLITUDE)
@@ -74,13 +74,13 @@ def light_image(frame: RangeFrame, light: Light) -> UInt8:
         if frame.amplitude_kind != "range_compensated":
             albedo = albedo * np.where(known, r * r, np.float32(1))
         grey = np.log(albedo)
-    elif has_color and light != "albedo":
+    elif has_color and channel != "albedo":
         assert frame.color_image is not None
         grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
         grey = grey.astype(np.float32)
         known = np.ones(grey.shape, bool)
     else:
-        what = {"albedo": "amplitude", "color": "colour"}.get(light, "amplitude nor colour")
+        what = {"albedo": "amplitude", "color": "colour"}.get(channel, "amplitude nor colour")
         raise RegistrationError(f"has no {what} to find points in", where=f"frame {frame.index}")
     if not known.any():
         raise RegistrationError("shows nothing but black", where=f"frame {frame.index}")
@@ -97,7 +97,7 @@ def keypoints(
     surface: PreparedView,
     *,
     detector: Detector,
-    light: Light,
+    channel: Channel,
     count: int,
     blur_px: float,
 ) -> Keypoints:
@@ -110,14 +110,14 @@ def keypoints(
     detector
         "sift" (Lowe 2004), "orb" (Rublee et al. 2011), or "fast": FAST corners (Rosten and
         Drummond 2006), upright and described as those of SIFT, all over patches of one size.
-    light
+    channel
         "albedo", "color", or "auto": the albedo if available, else colour.
     count
         Number of strongest keypoints to keep.
     blur_px
         Standard deviation of the detected position, in pixels of the frame.
     """
-    image = light_image(frame, light)
+    image = channel_image(frame, channel)
     enlarged = max(1, round(_WIDE / image.shape[1]))
     if enlarged > 1:
         size = image.shape[1] * enlarged, image.shape[0] * enlarged

@@ -49,7 +49,7 @@ class _Feet:
     point: Int64
     distance: Float64
     normal: Float64
-    light: Float64
+    intensity: Float64
     gradient: Float64
 
 
@@ -67,8 +67,8 @@ class LeastSquaresMatching(Bounded, Registrar):
     numeric derivatives of the surface. The seven parameters of a similarity are observations as
     well, with individual weights: that of the scale decides whether it is free. Points whose foot
     lies on no triangle are beyond the surface's boundary; in each iteration, observations with
-    residuals beyond `outlier` standard deviations are rejected (section 2.3). With `light` a second
-    surface is matched, whose height is the intensity (Akca 2007).
+    residuals beyond `outlier` standard deviations are rejected (section 2.3). With `intensity`, a
+    second surface is matched, whose height is the intensity (Akca 2007).
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class LeastSquaresMatching(Bounded, Registrar):
         K of section 2.3: residuals beyond K sigma_0 are rejected.
     scale_sigma
         Relative standard deviation of the scale's observation; 0 fixes the scale to one.
-    light
+    intensity
         Height in m of the intensity surface per median amplitude of the target; 0: not used.
     max_iterations
         Maximum number of iterations.
@@ -93,7 +93,7 @@ class LeastSquaresMatching(Bounded, Registrar):
     reach: Annotated[float, Bounds(0, exclusive=True)] = 5.0
     outlier: Annotated[float, Bounds(0, exclusive=True)] = 4.0
     scale_sigma: Annotated[float, Bounds(0)] = 0.0
-    light: Annotated[float, Bounds(0)] = 0.0
+    intensity: Annotated[float, Bounds(0)] = 0.0
     max_iterations: Annotated[int, Bounds(1)] = 50
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -109,7 +109,7 @@ class LeastSquaresMatching(Bounded, Registrar):
         """
         data = Points.of(source, at_most(self.points).select(source, rng))
         model = Points.of(target, All().select(target, rng))
-        light = (data.amplitude, model.amplitude) if self.light else None
+        intensity = (data.amplitude, model.amplitude) if self.intensity else None
         middle = data.points.mean(0)
         arm = data.points - middle
         size = float(np.sqrt((arm**2).sum(1).mean()))
@@ -120,12 +120,12 @@ class LeastSquaresMatching(Bounded, Registrar):
         while not converged and len(errors) < self.max_iterations:
             turned = scale * arm @ T[:3, :3].T
             centre = T[:3, :3] @ middle + T[:3, 3]
-            feet = self._feet(turned + centre, model, light)
+            feet = self._feet(turned + centre, model, intensity)
             if len(feet.point) < _FEWEST:
                 raise RegistrationError(
                     f"only {len(feet.point)} points lie on the target's surface, {_FEWEST} needed"
                 )
-            N, g = self._normal_equations(turned[feet.point], feet, light, scale)
+            N, g = self._normal_equations(turned[feet.point], feet, intensity, scale)
             step = np.zeros(7)
             free = 7 if self.scale_sigma else 6
             step[:free] = np.linalg.lstsq(N[:free, :free], g[:free], rcond=1e-12)[0]
@@ -153,14 +153,14 @@ class LeastSquaresMatching(Bounded, Registrar):
         self,
         arm: Float64,
         feet: _Feet,
-        light: tuple[Float64, Float64] | None,
+        intensity: tuple[Float64, Float64] | None,
         scale: float,
     ) -> tuple[Float64, Float64]:
         """N (7, 7) and right-hand side (7,) of the inlier observations, and the scale's.
 
         `arm` (k, 3) are the source's points relative to their centroid, in the target's frame.
         """
-        A, height = self._equations(arm, feet, light)
+        A, height = self._equations(arm, feet, intensity)
         keep = np.abs(height) <= self.outlier * _sigma(height)
         A, height = A[keep], height[keep]
         weight = 1 / max(_sigma(height), _SMALLEST_SIGMA * self.resolution) ** 2
@@ -171,21 +171,21 @@ class LeastSquaresMatching(Bounded, Registrar):
         return N, g
 
     def _equations(
-        self, arm: Float64, feet: _Feet, light: tuple[Float64, Float64] | None
+        self, arm: Float64, feet: _Feet, intensity: tuple[Float64, Float64] | None
     ) -> tuple[Float64, Float64]:
         """Design matrix (k, 7) and distances (k,) in m, of geometry and intensity."""
         A = _rows(arm, feet.normal)
-        if light is None:
+        if intensity is None:
             return A, feet.distance
-        unit = self.light / max(float(np.median(light[1])), 1e-12)
-        r = unit * (feet.light - light[0][feet.point])
+        unit = self.intensity / max(float(np.median(intensity[1])), 1e-12)
+        r = unit * (feet.intensity - intensity[0][feet.point])
         return np.vstack([A, _rows(arm, unit * feet.gradient)]), np.r_[feet.distance, r]
 
     def _feet(
         self,
         x: Float64,
         model: Points,
-        light: tuple[Float64, Float64] | None,
+        intensity: tuple[Float64, Float64] | None,
     ) -> _Feet:
         """Foot points of x (n, 3) on the triangles around the nearest points of the target."""
         surface = neighbourhood(model)
@@ -214,9 +214,9 @@ class LeastSquaresMatching(Bounded, Registrar):
         row, best = row[good], best[good]
         n, d = normal[row, best], height[row, best]
         value, gradient = np.zeros(len(row)), np.zeros((len(row), 3))
-        if light is not None:
-            A = light[1][q[row]]
-            B, C = (light[1][f[row, best]] for f in (fan, np.roll(fan, -1, axis=1)))
+        if intensity is not None:
+            A = intensity[1][q[row]]
+            B, C = (intensity[1][f[row, best]] for f in (fan, np.roll(fan, -1, axis=1)))
             value = A + u[row, best] * (B - A) + v[row, best] * (C - A)
             E1, E2, twice = e1[row, best], e2[row, best], double[row, best][:, None]
             gradient = (

@@ -79,16 +79,16 @@ class PlaneSets(Bounded, Registrar):
         if not poses:
             raise RegistrationError("no plane of one view matches one of the other")
         said = [agreement(s, t, T).score for _, _, T in poses]
-        shares = [share + score for (share, _, _), score in zip(poses, said, strict=True)]
-        best = max(range(len(poses)), key=lambda k: shares[k])
+        scores = [fraction + score for (fraction, _, _), score in zip(poses, said, strict=True)]
+        best = max(range(len(poses)), key=lambda k: scores[k])
         if said[best] <= 0:
             raise RegistrationError(
                 f"{len(poses[best][1])} planes match under a pose that what both images saw "
                 "contradicts"
             )
-        rival = max((share for k, share in enumerate(shares) if k != best), default=0.0)
+        rival = max((score for k, score in enumerate(scores) if k != best), default=0.0)
         _, pairs, T = poses[best]
-        margin = shares[best] - max(rival, 0.0)
+        margin = scores[best] - max(rival, 0.0)
         return self._told(a, b, pairs, T, len(poses), depth, margin)
 
     def _prepared(self, view: Frame) -> PreparedView:
@@ -121,8 +121,8 @@ class PlaneSets(Bounded, Registrar):
                 if len(pairs) < len(some):
                     continue
                 T = _pose(a, b, pairs, R, guess)
-                share = sum(min(a[i].share, b[j].share) for i, j in pairs)
-                found.append((float(share), pairs, T))
+                fraction = sum(min(a[i].fraction, b[j].fraction) for i, j in pairs)
+                found.append((float(fraction), pairs, T))
         found.sort(key=lambda one: -one[0])
         return found
 
@@ -237,7 +237,7 @@ def _pose(
     a: list[Plane], b: list[Plane], pairs: list[tuple[int, int]], R: Float64, guess: Float64
 ) -> Float64:
     """Least-squares pose (4, 4) of pairs of planes; keeps the guess where unconstrained."""
-    weight = np.sqrt([min(a[i].share, b[j].share) for i, j in pairs])[:, None]
+    weight = np.sqrt([min(a[i].fraction, b[j].fraction) for i, j in pairs])[:, None]
     there, here = (
         np.stack([planes[k].normal for k in which])
         for planes, which in zip((a, b), zip(*pairs, strict=True), strict=True)

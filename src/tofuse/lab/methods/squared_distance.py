@@ -60,7 +60,7 @@ def approximant(matches: Matches, alignment: Alignment) -> Float64:
     n = alignment.target.normals[j]
     d = ((alignment.moved[matches.source] - alignment.target.points[j]) * n).sum(1)
     bent = d[:, None] * bending.curvature[j]
-    share = np.divide(bent, bent - 1, out=np.zeros_like(bent), where=bent < 0)
+    weight = np.divide(bent, bent - 1, out=np.zeros_like(bent), where=bent < 0)
     tangents = bending.directions[j]
-    along: Float64 = np.einsum("nt,nti,ntj->nij", share, tangents, tangents)
+    along: Float64 = np.einsum("nt,nti,ntj->nij", weight, tangents, tangents)
     return along + n[:, :, None] * n[:, None]

@@ -380,8 +380,8 @@ class LensScatter:
     to be sampled at every fourth pixel (or coarser).
     """
 
-    def __init__(self, width: int, height: int, share: float) -> None:
-        self.share = share
+    def __init__(self, width: int, height: int, fraction: float) -> None:
+        self.fraction = fraction
         step = max(4, width // 44)
         self._parts = [
             (mass, _spread(height, step, sigma * width), _spread(width, step, sigma * width))
@@ -390,15 +390,15 @@ class LensScatter:
 
     def __call__(self, image: Float64) -> Float64:
         """Return the scattered light (H, W) of an image (H, W)."""
-        if self.share == 0:
+        if self.fraction == 0:
             return image
-        out = (1 - self.share) * image
+        out = (1 - self.fraction) * image
         for mass, (up_rows, down_rows), (up_columns, down_columns) in self._parts:
             # einsum, not a matrix product: BLAS may sum differently with more threads.
             small = np.einsum("iv,vu->iu", down_rows, image)
             small = np.einsum("iu,ju->ij", small, down_columns)
             large = np.einsum("vi,ij->vj", up_rows, small)
-            out += self.share * mass * np.einsum("vj,uj->vu", large, up_columns)
+            out += self.fraction * mass * np.einsum("vj,uj->vu", large, up_columns)
         return out
 
 

@@ -48,7 +48,7 @@ class Passing:
     ----------
     kind
         "person" walks with swinging limbs; "box" slides.
-    share
+    fraction
         Fraction of the image covered at mid-pass, 0 to 1. The body is scaled down where the room
         has not enough depth.
     seconds
@@ -60,7 +60,7 @@ class Passing:
     """
 
     kind: Kind = "person"
-    share: float = 0.25
+    fraction: float = 0.25
     seconds: float = 2.0
     period_s: float = 4.0
     start_s: float = 1.0
@@ -68,8 +68,10 @@ class Passing:
     def __post_init__(self) -> None:
         if self.kind not in ("person", "box"):
             raise InputError(f"is {self.kind!r}", where="passing", remedy="use person or box")
-        if not 0 < self.share < 1:
-            raise InputError(f"is {self.share}", where="share", remedy="give one between 0 and 1")
+        if not 0 < self.fraction < 1:
+            raise InputError(
+                f"is {self.fraction}", where="fraction", remedy="give one between 0 and 1"
+            )
         if not 0 < self.seconds <= self.period_s:
             raise InputError(
                 f"is {self.seconds} s of {self.period_s} s",
@@ -164,7 +166,7 @@ def enter(
             )
 
         least = [covered(t, far, parts, bodies) for t, far in zip(middles, farthest, strict=True)]
-        if not least or np.median(least) <= passing.share:
+        if not least or np.median(least) <= passing.fraction:
             break
     side = 1 if np.random.default_rng([seed, 5]).random() < 0.5 else -1
     passes = []
@@ -172,7 +174,7 @@ def enter(
         near, distance = _NEAREST_M, far
         for _ in range(10):
             middle = 0.5 * (near + distance)
-            if covered(t, middle, parts, bodies) < passing.share:
+            if covered(t, middle, parts, bodies) < passing.fraction:
                 distance = middle
             else:
                 near = middle

@@ -79,9 +79,9 @@ def there_and_back(
     out = outward_fraction * seconds
 
     def path(t: float) -> Float64:
-        share = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
+        progress = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
         step = np.eye(4)
-        step[0, 3] = length_m * share
+        step[0, 3] = length_m * progress
         return T_room_camera @ step
 
     return path

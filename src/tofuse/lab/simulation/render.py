@@ -17,8 +17,8 @@ from tofuse.sensor.models import CameraModel
 
 _DEFAULT = Effects()
 _NOTABLE_M = 0.003
-_MIXED_M, _MIXED_SHARE = 0.02, 0.01
-_MIRROR_SHARE = 0.1
+_MIXED_M, _MIXED_FRACTION = 0.02, 0.01
+_MIRROR_FRACTION = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,21 +257,21 @@ def _pixel_flags(
     out |= _bit(expected.saturated, Flag.SATURATED)
     if grid.window > 1:
         off = np.max([optics.off_plane(grid, tap.returns) for tap in taps], axis=0)
-        limit = np.maximum(_MIXED_M, _MIXED_SHARE * np.where(hit, distance, 0))
+        limit = np.maximum(_MIXED_M, _MIXED_FRACTION * np.where(hit, distance, 0))
         out |= _bit(off > limit, Flag.MIXED)
     # Half of the shortest ambiguity period.
     out |= _bit(
         hit & (np.abs(ranges - np.where(hit, distance, 0)) > model.period_m / 2), Flag.WRAPPED
     )
-    share = np.zeros(distance.shape)
+    fraction = np.zeros(distance.shape)
     for tap in taps:
         strength = tap.returns.strength
         if strength.shape[1] > 1:
             whole = strength.sum(1)
             part = strength[:, 1:].sum(1) / np.where(whole > 0, whole, 1)
             fine = part.reshape(grid.directions.shape[:2])
-            share = np.maximum(share, fine[grid.centre])
-    return out | _bit(share > _MIRROR_SHARE, Flag.MIRROR)
+            fraction = np.maximum(fraction, fine[grid.centre])
+    return out | _bit(fraction > _MIRROR_FRACTION, Flag.MIRROR)
 
 
 def _recorded(model: CameraModel, radial: Float64) -> Float32:

@@ -99,8 +99,8 @@ def expose(
         full = np.maximum(a, b) >= model.full_well_electrons
         saturated = np.asarray(full.any((0, 1)))
         a, b = np.minimum(a, model.full_well_electrons), np.minimum(b, model.full_well_electrons)
-    share = (a + b) / (2 * model.full_well_electrons)
-    read = (a - b) * (1 - effects.amplitude_nonlinearity * model.compression * share)
+    fraction = (a + b) / (2 * model.full_well_electrons)
+    read = (a - b) * (1 - effects.amplitude_nonlinearity * model.compression * fraction)
     phasors = phasor_of(np.moveaxis(read, 1, 0))
     amplitude = np.abs(phasors[0]) * model.counts_per_electron
     return Measurement(unwrapped(model, phasors), amplitude, saturated)

@@ -147,12 +147,12 @@ def _read_csv(path: Path) -> Cells:
         raise InputError("has no x, y and z per line", where=path, remedy="export x, y, z")
     columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if named else {}
     at = [columns.get(name, k) for k, name in enumerate("xyz")]
-    light = next((columns[name] for name in _AMPLITUDES if name in columns), None)
+    column = next((columns[name] for name in _AMPLITUDES if name in columns), None)
     if not named and table.shape[1] == 4:
-        light = 3
+        column = 3
     with np.errstate(over="ignore"):
         points = to_float32(table[:, at])
-        amplitude = None if light is None else to_float32(table[:, light])
+        amplitude = None if column is None else to_float32(table[:, column])
     return Cells(points, amplitude)
 
 
@@ -204,15 +204,15 @@ class _Frames:
             )
         image = np.full((pixel, 3), np.nan, np.float32)
         image[at] = points[seen]
-        light, color = cells.amplitude, cells.color
-        if light is not None:
-            light, chosen = np.zeros(pixel, np.float32), light[seen]
-            light[at] = chosen
+        amplitude, color = cells.amplitude, cells.color
+        if amplitude is not None:
+            amplitude, chosen = np.zeros(pixel, np.float32), amplitude[seen]
+            amplitude[at] = chosen
         if color is not None:
             color, picked = np.zeros((pixel, 3), np.uint8), color[seen]
             color[at] = picked
         shape = (self.raster.height, self.raster.width, 3)
-        return image.reshape(shape), Cells(image, light, color)
+        return image.reshape(shape), Cells(image, amplitude, color)
 
 
 def _moved(points: Float32, behind: float) -> Float32:

@@ -92,7 +92,7 @@ def _stops(poses: Float64) -> Path:
         place = min(max(t / SECONDS_EACH, 0.0), len(poses) - 1.0)
         k = min(int(place), len(poses) - 2)
         # Half of the rest precedes the motion, half follows it.
-        share = paths.smooth_step((place - k - (1 - _MOVING) / 2) / _MOVING)
-        return np.asarray(poses[k] @ se3.exp(share * steps[k]))
+        progress = paths.smooth_step((place - k - (1 - _MOVING) / 2) / _MOVING)
+        return np.asarray(poses[k] @ se3.exp(progress * steps[k]))
 
     return path

@@ -188,16 +188,16 @@ def plant(assembly: Assembly, T: Float64, rng: np.random.Generator, leaves: int 
     foliage: list[Mesh] = []
     golden = np.pi * (3 - np.sqrt(5))
     for k in range(leaves):
-        share = (k + 0.5) / leaves
+        fraction = (k + 0.5) / leaves
         azimuth = golden * k + rng.uniform(-0.3, 0.3)
-        height = 0.42 + 0.62 * share + rng.uniform(-0.04, 0.04)
-        reach = (0.22 - 0.14 * share) * rng.uniform(0.8, 1.2)
+        height = 0.42 + 0.62 * fraction + rng.uniform(-0.04, 0.04)
+        reach = (0.22 - 0.14 * fraction) * rng.uniform(0.8, 1.2)
         out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        root = 0.03 * out + [0, 0, 0.26 + 0.4 * share]
+        root = 0.03 * out + [0, 0, 0.26 + 0.4 * fraction]
         tip = reach * out + [0, 0, height]
         stems.append(meshes.rod(root, tip, 0.006, 0.004, 6))
         blade = leaf(rng.uniform(0.20, 0.28), rng.uniform(0.09, 0.13), rng.uniform(0.3, 0.9))
-        pitch = rng.uniform(0.1, 0.7) + 0.3 * share
+        pitch = rng.uniform(0.1, 0.7) + 0.3 * fraction
         c, s = np.cos(pitch), np.sin(pitch)
         pose = np.eye(4)
         across = np.cross([0.0, 0.0, 1.0], out)

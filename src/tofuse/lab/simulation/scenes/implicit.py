@@ -37,9 +37,9 @@ def limb(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> 
     axis = b - a
 
     def distance(p: Float64) -> Float64:
-        share = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
-        nearest = a + share[..., None] * axis
-        return np.linalg.norm(p - nearest, axis=-1) - (radius + share * (end_radius - radius))
+        fraction = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
+        nearest = a + fraction[..., None] * axis
+        return np.linalg.norm(p - nearest, axis=-1) - (radius + fraction * (end_radius - radius))
 
     return distance
 
@@ -75,8 +75,8 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
         a = np.moveaxis(value, axis, 0)[:-1]
         b = np.moveaxis(value, axis, 0)[1:]
         cut = (a < 0) != (b < 0)
-        share = np.where(cut, a / np.where(cut, a - b, 1.0), 0.0)
-        cut, share = np.moveaxis(cut, 0, axis), np.moveaxis(share, 0, axis)
+        fraction = np.where(cut, a / np.where(cut, a - b, 1.0), 0.0)
+        cut, fraction = np.moveaxis(cut, 0, axis), np.moveaxis(fraction, 0, axis)
         j, k = (axis + 1) % 3, (axis + 2) % 3
         # Each cell has four edges along this axis.
         for dj in (0, 1):
@@ -84,7 +84,7 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
                 window: list[slice] = [slice(None)] * 3
                 window[j] = slice(dj, cells[j] + dj)
                 window[k] = slice(dk, cells[k] + dk)
-                here, at = cut[tuple(window)], share[tuple(window)]
+                here, at = cut[tuple(window)], fraction[tuple(window)]
                 crossings += here
                 total[..., axis] += at
                 total[..., j] += dj * here

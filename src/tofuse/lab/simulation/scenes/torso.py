@@ -93,10 +93,10 @@ def _snapped(mesh: Mesh, distance: Float64) -> Float64:
     # Difference of the distances to both materials, at either end: 0 on the border.
     at_a = distance[label[b], a] - distance[label[a], a]
     at_b = distance[label[b], b] - distance[label[a], b]
-    share = at_a / np.maximum(at_a - at_b, 1e-12)
-    near = share <= 0.5
-    a, b, share = a[near], b[near], share[near]
-    step = share[:, None] * (mesh.vertices[b] - mesh.vertices[a])
+    fraction = at_a / np.maximum(at_a - at_b, 1e-12)
+    near = fraction <= 0.5
+    a, b, fraction = a[near], b[near], fraction[near]
+    step = fraction[:, None] * (mesh.vertices[b] - mesh.vertices[a])
     # The last assignment of a vertex prevails: the shortest step.
     order = np.argsort(-np.linalg.norm(step, axis=1), kind="stable")
     vertices = mesh.vertices.copy()
