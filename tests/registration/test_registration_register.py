@@ -263,5 +263,5 @@ def test_the_finest_level_is_coarser_where_noise_is_thicker():
     "make", [lambda: CoarseToFine(resolution=0.0), lambda: CoarseToFine(points=5)]
 )
 def test_senseless_options_are_refused(make):
-    with pytest.raises(ValueError, match="is"):
+    with pytest.raises(ValueError, match="must be"):
         make()
