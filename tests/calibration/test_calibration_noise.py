@@ -217,7 +217,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(capsys.readouterr().out)
     assert NoiseModel.from_dict(told["model"]).amplitude == NoiseModel.load(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
-    with pytest.raises(InputError, match="give metres"):
+    with pytest.raises(InputError, match="a must be 0 to 5"):
         noise_model_for(recording)
 
 
