@@ -307,6 +307,33 @@ def test_a_fault_is_named(code, turn) -> None:
     assert str(named) in found.warnings
 
 
+def test_edges_of_different_things_are_not_mirrored() -> None:
+    """Many edges of depth to the left and of colour to the right correlate if mirrored."""
+    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
+    rng = np.random.default_rng(5)
+
+    def boxes(image, columns, value) -> None:
+        for _ in range(12):
+            x, y = rng.integers(*columns), rng.integers(0, 105)
+            image[y : y + rng.integers(6, 15), x : x + rng.integers(6, 15)] = value()
+
+    frames = []
+    for k in range(6):
+        depth = np.full((120, 160), 2.0, np.float32)
+        grey = np.full((120, 160), 60, np.uint8)
+        boxes(depth, (0, 45), lambda: rng.uniform(1.0, 1.8))
+        boxes(grey, (100, 145), lambda: rng.integers(90, 250))
+        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=np.dstack([grey] * 3)))
+    assert "mirrored" not in codes(frames)
+    turned = [replace(f, depth=np.ascontiguousarray(f.depth[:, ::-1])) for f in frames]
+    same = [replace(f, color_image=_shades(f.depth)[:, ::-1]) for f in turned]
+    assert "mirrored" in codes(same)
+
+
+def _shades(depth):
+    return np.dstack([(depth * 100).astype(np.uint8)] * 3)
+
+
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_a_wrong_focal_length_is_measured(factor) -> None:
     plain = turning(camera=BROWN)

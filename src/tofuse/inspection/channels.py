@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -50,7 +50,12 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
         lead = best - identity
         error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
-        if best.mean() > _MIN_CORRELATION and lead.mean() > max(_LEAD, _SIGMAS * error):
+        turned = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
+        if (
+            best.mean() > _MIN_CORRELATION
+            and lead.mean() > max(_LEAD, _SIGMAS * error)
+            and _fit_unshifted(turned)
+        ):
             yield Finding(
                 "mirrored",
                 f"Depth and {name} do not match: their edges correlate by {best.mean():.2f} with "
@@ -152,6 +157,18 @@ def _correlation(a: Float32, b: Float32) -> float:
     a, b = a - a.mean(), b - b.mean()
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / size if size > 0 else 0.0
+
+
+def _fit_unshifted(edges: Sequence[tuple[Float32, Float32]]) -> bool:
+    """Whether edges of two channels coincide best without a shift.
+
+    Those of different things correlate too where both lie in the same part of the images, but
+    then a shift fits as well.
+    """
+    reach = round(_MAX_SHIFT * edges[0][0].shape[1])
+    scores = np.mean([_shifted(a, b, reach) for a, b in edges], axis=0)
+    i, j = np.unravel_index(int(scores.argmax()), scores.shape)
+    return bool(np.hypot(i - reach, j - reach) <= _PEAK_PIXELS)
 
 
 def _shifted(a: Float32, b: Float32, reach: int) -> Float64:
