@@ -413,6 +413,7 @@ def test_clouds_are_refused():
         ("views.columns", -1),
         ("views.columns", "wide"),
         ("views.falloff", float("nan")),
+        ("views.range_falloff", -1.0),
         ("views.photometric", 2),
         ("searches", "often"),
         ("minimum_points", -5),

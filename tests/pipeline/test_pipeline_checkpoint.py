@@ -56,7 +56,7 @@ def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> None:
     recording = tofuse.open(room_recording).select(every=2)
     kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
-    known = {"views": {"falloff": 0.0}}  # which is not looked for then
+    known = {"views": {"falloff": 0.0, "range_falloff": 0.0}}  # not looked for then
     changes = {"corrections": kept_as_it_is, "odometry": known}
     config = changed(from_method("default"), changes, where="test")
     never = Kept(0)

@@ -1,4 +1,4 @@
-"""The falloff of amplitude towards the corners is estimated from the recording."""
+"""The falloffs of amplitude and of colour are estimated from the recording."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.arrays import Float64
+from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
@@ -27,6 +29,22 @@ def frames() -> list[RangeFrame]:
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")
     taken = [render(scene, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
+    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+
+
+@pytest.fixture(scope="module")
+def forward() -> list[RangeFrame]:
+    """Into a furnished room, so that ranges change."""
+    scene, sequence = build("room", texture=True)
+    start = sequence.T_room_camera(0.0)
+
+    def path(t: float) -> Float64:
+        return start @ se3.exp(np.array([0.05 * t, 0, 0.3 * t, 0, 0.1 * t, 0]))
+
+    going = replace(sequence, camera_path=path)
+    effects = Effects.none(shot_noise=True)
+    model = camera_model("sr4000")
+    taken = [render(scene, going, model, k, effects=effects).frame for k in range(0, 48, 2)]
     return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
 
 
@@ -89,3 +107,36 @@ def test_light_helps_where_geometry_does_not_tell_the_motion(wall, exponent):
 def test_a_few_pairs_are_enough(frames):
     few = recording(frames[:4], 4.0)
     assert estimate_falloff(few, lambda f: f, SurfaceOptions()) == pytest.approx(4.0, abs=0.6)
+
+
+def colored(frames: list[RangeFrame], exponent: float) -> Recording:
+    """Return frames with colour, of a gamma of 2.2, instead of amplitude."""
+    out = []
+    for frame in frames:
+        log_albedo = prepare_view(frame, SurfaceOptions(falloff=0.0)).albedo[..., 0]
+        far = np.fmax(frame.radial_range, 0.3)
+        log_light = log_albedo - exponent * np.log(far)
+        gamma = np.exp((log_light - np.nanmedian(log_light)) / 2.2)
+        grey = np.clip(np.nan_to_num(80 * gamma), 0, 255).astype(np.uint8)
+        color = np.dstack([grey] * 3)
+        out.append(replace(frame, amplitude_image=None, color_image=color, color_registered=True))
+    return Recording.of(ArraySource(tuple(out)), "made", "arrays")
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 3.0])
+def test_colour_falls_off_with_the_range_only_if_lit_by_the_camera(forward, exponent):
+    config = adapted(from_method("default"), colored(forward, exponent), threads=1)
+    assert config.odometry.views.range_falloff == pytest.approx(exponent / 2.2, abs=0.1)
+    assert config.odometry.views.falloff == 0.0
+
+
+def test_colour_is_compensated_for_its_falloff(forward):
+    lit, ambient = colored(forward[:1], 4.4)[0], colored(forward[:1], 0.0)[0]
+    view = prepare_view(lit, SurfaceOptions(range_falloff=2.0))
+    expected = prepare_view(ambient, SurfaceOptions(range_falloff=0.0))
+    plain = prepare_view(lit, SurfaceOptions(range_falloff=0.0))
+    off, before = (v.albedo[..., 0] - expected.albedo[..., 0] for v in (view, plain))
+    assert np.nanstd(off) < np.nanstd(before) / 4
+    # As it is compensated for the estimate, slopes included.
+    more = plain.with_range_falloff(2.0).albedo - view.albedo
+    assert np.nanmedian(more, axis=(0, 1)) == pytest.approx(0, abs=0.02)

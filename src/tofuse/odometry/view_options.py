@@ -23,16 +23,22 @@ class ViewOptions(Bounded):
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.
+    range_falloff
+        Exponent of the range by which colour gets darker, as if lit by a lamp on the camera; None
+        to estimate it from the recording.
     """
 
     columns: Annotated[int, Bounds(16, 4096)] = 320
     photometric: bool = True
     falloff: Annotated[float | None, Bounds(-20, 20)] = None
+    range_falloff: Annotated[float | None, Bounds(0, 10)] = None
 
     @property
     def surface(self) -> SurfaceOptions:
         """Options of `prepare_view`."""
-        return SurfaceOptions(columns=self.columns, falloff=self.falloff)
+        return SurfaceOptions(
+            columns=self.columns, falloff=self.falloff, range_falloff=self.range_falloff
+        )
 
     @property
     def alignment(self) -> ProjectiveOptions:

@@ -15,9 +15,10 @@ from tofuse.filters.confidence import Confidence
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.odometry.view_options import ViewOptions
 from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, check_views, kind_of
-from tofuse.pipeline.falloff import estimate_falloff
+from tofuse.pipeline.falloff import RANGE, estimate_falloff
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.trial import Prepare, trial
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -38,7 +39,7 @@ def adapted(
     """Return the configuration with everything that is left to the recording filled in.
 
     These are defaults that depend on the recording (`with_recording_defaults`), what corrections
-    and filters learn from up to 30 frames, and the falloff of the amplitude towards the corners.
+    and filters learn from up to 30 frames, and the falloffs of the amplitude and of colour.
     Corrections on trial are kept only if overlapping views show the error that they correct
     (`trial`). An adapted configuration stays as it is.
 
@@ -75,13 +76,27 @@ def adapted(
             config = replace(config, filters=filters, model_filters=model_filters)
             config = _learned(config, recording)
         odometry = config.odometry
-        if isinstance(odometry, Keyframes | GivenPoses) and odometry.views.falloff is None:
-            falloff = 0.0
-            if _has_amplitude(recording):
-                falloff = estimate_falloff(recording, _preparation(config), odometry.views.surface)
-            views = replace(odometry.views, falloff=falloff)
+        if isinstance(odometry, Keyframes | GivenPoses):
+            views = _with_falloffs(odometry.views, recording, _preparation(config))
             config = replace(config, odometry=replace(odometry, views=views))
     return config
+
+
+def _with_falloffs(views: ViewOptions, recording: Recording, prepare: Prepare) -> ViewOptions:
+    """Return the options with the falloffs of amplitude and of colour that were not given."""
+    if views.falloff is not None and views.range_falloff is not None:
+        return views
+    frame = recording.first_readable()
+    amplitude = isinstance(frame, RangeFrame) and frame.amplitude_image is not None
+    color = isinstance(frame, RangeFrame) and frame.color_image is not None and not amplitude
+    if views.falloff is None:
+        # Colour cameras compensate their vignetting.
+        found = estimate_falloff(recording, prepare, views.surface) if amplitude else 0.0
+        views = replace(views, falloff=found)
+    if views.range_falloff is None:
+        found = estimate_falloff(recording, prepare, views.surface, RANGE) if color else 0.0
+        views = replace(views, range_falloff=max(found, 0.0))
+    return views
 
 
 def with_recording_defaults(config: Config, recording: Recording) -> Config:
@@ -112,12 +127,6 @@ def _known_noise(recording: Recording) -> NoiseModel | None:
     """Return the noise model that the recording states, or that of its camera's family."""
     model = noise_model_for(recording)
     return None if model == NOISE["unknown"] else model
-
-
-def _has_amplitude(recording: Recording) -> bool:
-    """Whether its images have amplitude; colour cameras compensate their vignetting."""
-    frame = recording.first_readable()
-    return isinstance(frame, RangeFrame) and frame.amplitude_image is not None
 
 
 def _learned(config: Config, recording: Recording) -> Config:

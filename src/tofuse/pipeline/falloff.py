@@ -1,4 +1,4 @@
-"""Falloff of the amplitude towards the corners, estimated from a recording.
+"""Falloff of the amplitude towards the corners, or of colour with the range, from a recording.
 
 Lens and illumination together make an image darker off the axis, about as a power of the cosine to
 the axis (natural vignetting of a lens is the fourth power; illumination adds to it, and cameras may
@@ -9,6 +9,11 @@ places of the image: the difference of their albedo shows the exponent, whatever
 Along a wall, geometry alone does not constrain the motion. Then views are aligned by geometry and
 amplitude, compensated by the exponent that this shows, and aligned again until it converges. The
 exponents of pairs are pooled, weighted by their information, which grows with the motion.
+
+Colour in ambient light falls off with nothing. Where a lamp on the camera lights the scene, colour
+gets darker with range and incidence. The range stands for both: on a plane, which keeps its
+distance to the camera as it moves along, the cosine of incidence is inverse to the range; and
+unlike the cosine it is nearly free of noise.
 """
 
 from __future__ import annotations
@@ -35,8 +40,8 @@ Prepare = Callable[[Frame], Frame]
 # Number of pairs, evenly spaced over the recording; frames between the views of a pair, which are
 # doubled up to this number of times while there is too little motion.
 _PAIRS, _STRIDE, _MAX_DOUBLINGS = 7, 2, 3
-# Desired and minimum mean motion of points in the image, in units of x/z; and the minimum inlier
-# fraction of an alignment.
+# Desired and minimum mean motion of points (`Law.travel`), in units of x/z or of the logarithm of
+# the range; and the minimum inlier fraction of an alignment.
 _DESIRED_MOTION, _MIN_MOTION, _MIN_INLIERS = 0.05, 0.02, 0.6
 # Alignment by geometry alone, with wide priors; and with amplitude.
 _GEOMETRIC = ProjectiveOptions(levels=PATIENT, photometric=False, prior_m=3.0, prior_rad=3.0)
@@ -49,8 +54,51 @@ _NEAR_M, _NEAR = 0.01, 0.01
 _MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 300, 3, 0.01
 
 
-def estimate_falloff(recording: Recording, prepare: Prepare, options: SurfaceOptions) -> float:
-    """Return the exponent of the cosine by which amplitude falls off; 0 if not significant.
+@dataclass(frozen=True)
+class Law:
+    """A quantity by a power of which light falls off.
+
+    Attributes
+    ----------
+    logarithm
+        Its logarithm at points (N, 3) in the camera's frame.
+    compensated
+        Returns a view with an albedo that is compensated for an exponent.
+    travel
+        Mean motion, by which the law shows, of points (N, 3) from their position in one view to
+        that in another one.
+    """
+
+    logarithm: Callable[[Float64], Float64]
+    compensated: Callable[[PreparedView, float], PreparedView]
+    travel: Callable[[Float64, Float64], float]
+
+
+def _in_image(p: Float64, q: Float64) -> float:
+    return float(np.linalg.norm(p[:, :2] / p[:, 2:] - q[:, :2] / q[:, 2:], axis=1).mean())
+
+
+def _log_range(p: Float64) -> Float64:
+    return -0.5 * np.log((p**2).sum(1))
+
+
+# The cosine to the optical axis, of amplitude; and the inverse of the range, of colour.
+OFF_AXIS = Law(
+    lambda p: -0.5 * np.log1p((p[:, :2] ** 2).sum(1) / p[:, 2] ** 2),
+    PreparedView.with_falloff,
+    _in_image,
+)
+RANGE = Law(
+    _log_range,
+    PreparedView.with_range_falloff,
+    lambda p, q: float(np.abs(_log_range(p) - _log_range(q)).mean()),
+)
+
+
+def estimate_falloff(
+    recording: Recording, prepare: Prepare, options: SurfaceOptions, law: Law = OFF_AXIS
+) -> float:
+    """Return the exponent by which amplitude, or else colour, falls off; 0 if not significant.
 
     Parameters
     ----------
@@ -60,13 +108,15 @@ def estimate_falloff(recording: Recording, prepare: Prepare, options: SurfaceOpt
         Corrects and filters a frame as for tracking.
     options
         How views are prepared.
+    law
+        By which it falls off.
     """
-    views = _Views(recording, prepare, replace(options, falloff=0.0))
+    views = _Views(recording, prepare, replace(options, falloff=0.0, range_falloff=0.0))
     slopes: list[_Slope] = []
     for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
         # The initial exponent is the median so far: nearly compensated amplitude hardly biases.
         initial = float(np.median([one.exponent for one in slopes])) if slopes else 0.0
-        slope = _slope_from(views, int(start), initial)
+        slope = _slope_from(views, int(start), initial, law)
         if slope is not None:
             slopes.append(slope)
     if len(slopes) < _MIN_PAIRS:
@@ -80,7 +130,7 @@ def estimate_falloff(recording: Recording, prepare: Prepare, options: SurfaceOpt
 
 @dataclass(frozen=True)
 class _Slope:
-    """Exponent of a pair, its information (sum of squares of x), and the motion in the image."""
+    """Exponent of a pair, its information (sum of squares of x), and the motion (`Law.travel`)."""
 
     exponent: float
     information: float
@@ -107,7 +157,7 @@ class _Views:
         return view if view.has_albedo else None
 
 
-def _slope_from(views: _Views, start: int, initial: float) -> _Slope | None:
+def _slope_from(views: _Views, start: int, initial: float, law: Law) -> _Slope | None:
     """Return the slope of a view and a later one with enough motion in between, if any."""
     target = views.get(start)
     if target is None:
@@ -115,7 +165,7 @@ def _slope_from(views: _Views, start: int, initial: float) -> _Slope | None:
     best, T, stride = None, np.eye(4), _STRIDE
     for _ in range(1 + _MAX_DOUBLINGS):
         source = views.get(start + stride)
-        aligned = None if source is None else _aligned(source, target, T, initial)
+        aligned = None if source is None else _aligned(source, target, T, initial, law)
         if aligned is None:
             if best is not None or stride < _STRIDE:
                 break
@@ -133,7 +183,7 @@ def _slope_from(views: _Views, start: int, initial: float) -> _Slope | None:
 
 
 def _aligned(
-    source: PreparedView, target: PreparedView, guess: Float64, initial: float
+    source: PreparedView, target: PreparedView, guess: Float64, initial: float, law: Law
 ) -> tuple[Float64, _Slope | None] | None:
     """Return T_target_source (4, 4) and the slope of two views; None if they don't fit.
 
@@ -145,16 +195,16 @@ def _aligned(
         Initial exponent.
     """
     T = _constrained_pose(source, target, guess, _GEOMETRIC)
-    slope = None if T is None else _slope(source, target, T)
+    slope = None if T is None else _slope(source, target, T, law)
     if T is not None and slope is not None:
         return T, slope
     T, exponent, slope = guess, initial, None
     for _ in range(_MAX_ROUNDS):
-        compensated = source.with_falloff(exponent), target.with_falloff(exponent)
+        compensated = law.compensated(source, exponent), law.compensated(target, exponent)
         pose = _constrained_pose(*compensated, T, _PHOTOMETRIC)
         if pose is None:
             return None
-        T, slope = pose, _slope(source, target, pose)
+        T, slope = pose, _slope(source, target, pose, law)
         if slope is None or abs(slope.exponent - exponent) < _CONVERGED:
             return T, slope
         exponent = slope.exponent
@@ -171,8 +221,8 @@ def _constrained_pose(
     return aligned.T_world_source
 
 
-def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | None:
-    """Regress the difference of log albedo on that of the log cosine; None without much motion.
+def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> _Slope | None:
+    """Regress the difference of log albedo on that of the law; None without much motion.
 
     Parameters
     ----------
@@ -192,19 +242,18 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | N
     near &= np.isfinite(lighter)
     if np.count_nonzero(near) < _MIN_POINTS:
         return None
-    here, there = p[near, :2] / p[near, 2:], q[near, :2] / q[near, 2:]
-    motion = float(np.linalg.norm(there - here, axis=1).mean())
+    motion = law.travel(p[near], q[near])
     if motion < _MIN_MOTION:
         return None
-    cosine = -0.5 * (np.log1p((there**2).sum(1)) - np.log1p((here**2).sum(1)))
+    change = law.logarithm(q[near]) - law.logarithm(p[near])
     y = lighter[near].astype(np.float64)
     keep = np.ones(len(y), bool)
     slope = squares = 0.0
     for _ in range(4):  # least squares, trimmed at three robust standard deviations
-        x = cosine[keep] - cosine[keep].mean()
+        x = change[keep] - change[keep].mean()
         squares = max(float(x @ x), 1e-12)
         slope = float(x @ (y[keep] - y[keep].mean()) / squares)
-        off = y - slope * cosine
+        off = y - slope * change
         off -= np.median(off[keep])
         keep = np.abs(off) < 3 * 1.48 * float(np.median(np.abs(off[keep]))) + 1e-9
     return _Slope(slope, squares, motion)

@@ -102,6 +102,9 @@ class SurfaceOptions:
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.
+    range_falloff
+        Exponent of the range by which colour gets darker, as if lit by a lamp on the camera; None
+        to estimate it from the recording.
     smoothed
         Options for views with hardly any noise.
     """
@@ -117,6 +120,7 @@ class SurfaceOptions:
     offset: float = 0.2
     albedo_radius: int = 1
     falloff: float | None = None
+    range_falloff: float | None = None
     smoothed: Smoothed = Smoothed()
 
     def for_pitch(self, pitch: float) -> SurfaceOptions:
@@ -301,6 +305,17 @@ class PreparedView:
         more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
         return replace(self, albedo=np.asarray(self.albedo + exponent * more, np.float32))
 
+    def with_range_falloff(self, exponent: float) -> PreparedView:
+        """Return the view with an albedo that is compensated for this falloff with the range."""
+        if exponent == 0 or not self.has_albedo:
+            return self
+        # The range is the length of the ray over w = 1/z, of which a and b are the slopes.
+        a, b, _, w = np.moveaxis(self.planes, -1, 0)
+        w = np.where(w > 0, w, np.float32(np.nan))
+        near = np.stack([np.log(w), a / w, b / w], -1)
+        view = self.with_falloff(exponent)
+        return replace(view, albedo=np.asarray(view.albedo - exponent * near, np.float32))
+
     def subsampled(self, columns: int) -> PreparedView:
         """Return the view at every n-th pixel, so that it has at most `columns` columns.
 
@@ -395,6 +410,9 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     if amplitude is not None:
         albedo = np.full((rows, columns, 3), np.nan, np.float32)
         raw_albedo = np.empty((rows, columns), np.float32)
+        if not lit and options.range_falloff:
+            far = np.sqrt(projection.lengths2) * _inverse(planes[..., 3], planes[..., 3] > 0)
+            light = light * far ** np.float32(options.range_falloff)
         falls = lit and frame.amplitude_kind == "raw"
         albedo_image(planes, rays, amplitude, falls, lit, options.falloff or 0.0, raw_albedo)
         run_chunks(
