@@ -137,6 +137,6 @@ def test_colour_is_compensated_for_its_falloff(forward):
     plain = prepare_view(lit, SurfaceOptions(range_falloff=0.0))
     off, before = (v.albedo[..., 0] - expected.albedo[..., 0] for v in (view, plain))
     assert np.nanstd(off) < np.nanstd(before) / 4
-    # As it is compensated for the estimate, slopes included.
-    more = plain.with_range_falloff(2.0).albedo - view.albedo
-    assert np.nanmedian(more, axis=(0, 1)) == pytest.approx(0, abs=0.02)
+    slopes = [v.albedo[..., 1:] - expected.albedo[..., 1:] for v in (view, plain)]
+    right, wrong = (np.abs(np.nanmedian(s, axis=(0, 1))).max() for s in slopes)
+    assert right < wrong / 4

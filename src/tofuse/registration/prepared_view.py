@@ -410,9 +410,6 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     if amplitude is not None:
         albedo = np.full((rows, columns, 3), np.nan, np.float32)
         raw_albedo = np.empty((rows, columns), np.float32)
-        if not lit and options.range_falloff:
-            far = np.sqrt(projection.lengths2) * _inverse(planes[..., 3], planes[..., 3] > 0)
-            light = light * far ** np.float32(options.range_falloff)
         falls = lit and frame.amplitude_kind == "raw"
         albedo_image(planes, rays, amplitude, falls, lit, options.falloff or 0.0, raw_albedo)
         run_chunks(
@@ -424,7 +421,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         )
     shared = _shared_sigma(frame, projection.lengths2)
     variance, own_variance = _add_shared_error(quality[..., 1] * np.float32(scale), planes, shared)
-    return PreparedView(
+    view = PreparedView(
         frame.index,
         rays,
         z,
@@ -439,6 +436,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
             lit and options.falloff is None and frame.amplitude_kind != "range_compensated"
         ),
     )
+    return view if lit else view.with_range_falloff(options.range_falloff or 0.0)
 
 
 @lru_cache(maxsize=16)
