@@ -285,7 +285,9 @@ class Search:
         depth = 0.5 * (s.depth + t.depth)
         reaches = np.maximum(0.25 * depth * _NARROWER, 3 * floor)
         _refine(s, t, poses, reaches, _ICP_POINTS, options.max_angle)
-        judged = self._evaluated(poses)
+        # Many converge to the same pose, which is evaluated once.
+        R, x = poses[:, :3, :3].copy(), poses[:, :3, 3].copy()
+        judged = self._evaluated(poses[kernels.select_distinct(R, x, depth, floor, len(poses))])
         best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
         finer = np.stack([candidate.T_target_source for candidate in best])
         reaches = np.maximum(8 * floor * _NARROWER, 1.3 * floor)
