@@ -5,12 +5,14 @@ degrees), how many of those are accepted, and how many are accepted and wrong; b
 RANSAC over FPFH with point-to-plane ICP, if it is installed. `fit` fits the logistic models of
 `tofuse.registration.confidence` to simulated pairs, some of which share nothing, and prints their
 coefficients, with area under the ROC curve and calibration on scenes that took no part in the fit.
-For them a pose is right within 5 % of the depth and 4 degrees. `methods` compares what
-`tofuse.register` chooses for each pair with each of the ways that it chooses from, and with an
-oracle that takes a right one where there is any.
+For them a pose is right within 5 % of the depth and 4 degrees. `cameras` gives what the models are
+worth for the other cameras and scenes of `pair_views`, beside models fitted to all of these but the
+camera's own. `methods` compares what `tofuse.register` chooses for each pair with each of the ways
+that it chooses from, and with an oracle that takes a right one where there is any.
 
     python benchmarks/pairs.py table [--data ../shared/data] [--scenes room kitchen]
     python benchmarks/pairs.py fit
+    python benchmarks/pairs.py cameras
     python benchmarks/pairs.py methods
 
 Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
@@ -36,6 +38,7 @@ from tofuse.arrays import Bool, Float64, Intp
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import tofuse
+from pair_views import TAKEN, recorded
 from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
 from tofuse.errors import RegistrationError
@@ -48,7 +51,14 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.confidence import ACCEPTED, RIGHT_FRACTION, RIGHT_RAD, Evidence, logistic
+from tofuse.registration.confidence import (
+    ACCEPTED,
+    IMAGES,
+    RIGHT_FRACTION,
+    RIGHT_RAD,
+    Evidence,
+    logistic,
+)
 from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -59,6 +69,8 @@ _RIDGE = 0.1
 _APART = 0.02
 # How far guesses are off, m and degrees, to which the model for followed poses is fitted.
 GUESSES = ((0.0, 0.0), (0.1, 4.0), (0.3, 12.0), (0.8, 30.0))
+# Views apart that `cameras` registers.
+_STEPS = (1, 2, 3, 5)
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 
@@ -373,7 +385,7 @@ def samples(most: int, data: Path) -> tuple[Samples, Samples]:
     searched: list[tuple[Float64, bool, int]] = []
     followed: list[tuple[Float64, bool, int]] = []
     rng = np.random.default_rng([1, 3])
-    views = {name: _prepared(name, data) for name in FITTED}
+    views = {name: _views(opened(name, data)) for name in FITTED}
     for number, name in enumerate(FITTED):
         maps, T = views[name]
         for apart in SCENES[name].apart:
@@ -396,8 +408,7 @@ def samples(most: int, data: Path) -> tuple[Samples, Samples]:
     return stacked(searched), stacked(followed)
 
 
-def _prepared(name: str, data: Path) -> tuple[list[PreparedView], Float64]:
-    recording = opened(name, data)
+def _views(recording: Recording) -> tuple[list[PreparedView], Float64]:
     assert recording.reference is not None
     frames = [frame for frame in recording if isinstance(frame, RangeFrame)]
     return [prepare_view(frame, SurfaceOptions()) for frame in frames], recording.reference
@@ -476,9 +487,67 @@ def print_fit(title: str, all_of: Samples) -> None:
     print_calibration(p, all_of.right)
 
 
+def print_cameras(most: int) -> None:
+    """What the models in use are worth for each camera, and those fitted without it."""
+    searched, followed, cameras = samples_of_cameras(most)
+    for title, poses, coefficients in (
+        ("Searched", searched, IMAGES.searched),
+        ("Followed from a guess", followed, IMAGES.followed),
+    ):
+        print(
+            f"\n| {title} | poses | right | area under the ROC curve | right and accepted"
+            " | wrong and accepted | the same, fitted without it | | |\n"
+            "|---|---|---|---|---|---|---|---|---|"
+        )
+        in_use = np.array([logistic(float(v)) for v in poses.x @ np.array(coefficients)])
+        held_out = np.empty(len(in_use))
+        for number, camera in enumerate(cameras):
+            mine = poses.scene == number
+            w = fitted(poses.x[~mine], poses.right[~mine])
+            held_out[mine] = [logistic(float(v)) for v in poses.x[mine] @ w]
+            print(_camera_row(camera, poses.right[mine], in_use[mine], held_out[mine]))
+        print(_camera_row("all", poses.right, in_use, held_out))
+        print_calibration(in_use, poses.right)
+
+
+def _camera_row(title: str, right: Bool, *probabilities: Float64) -> str:
+    cells: list[object] = [title, len(right), right.sum()]
+    for p in probabilities:
+        accepted = p >= ACCEPTED
+        cells += [f"{roc_area(p, right):.3f}", (accepted & right).sum(), (accepted & ~right).sum()]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def samples_of_cameras(most: int) -> tuple[Samples, Samples, list[str]]:
+    """Poses that were searched, and that were followed from guesses, by camera."""
+    searched: list[tuple[Float64, bool, int]] = []
+    followed: list[tuple[Float64, bool, int]] = []
+    views = {taken: _views(recorded(taken)) for taken in TAKEN}
+    cameras = sorted({taken.camera for taken in TAKEN})
+    for taken, (maps, T) in views.items():
+        number, rng = cameras.index(taken.camera), np.random.default_rng([7, taken.seed])
+        within = [pair for apart in _STEPS for pair in chosen(len(maps), apart, most)]
+        for _ in range(most):
+            i, j = rng.choice(len(maps), 2, replace=False)
+            within.append((int(i), int(j)))
+        for i, j in within:
+            true = se3.inverse(T[i]) @ T[j]
+            _add(searched, followed, maps[j], maps[i], true, number, rng)
+        others = [other for other in TAKEN if other.place != taken.place]
+        for k in range(most):
+            # Half of them by the same camera.
+            alike = [other for other in others if other.camera == taken.camera]
+            some = alike if k % 2 and alike else others
+            other = views[some[int(rng.integers(len(some)))]][0]
+            source, target = (v[int(rng.integers(len(v)))] for v in (maps, other))
+            _add(searched, followed, source, target, None, number, rng)
+        print(f"{taken}: {len(searched)} searched, {len(followed)} followed so far", flush=True)
+    return stacked(searched), stacked(followed), cameras
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["table", "fit", "methods"])
+    parser.add_argument("what", choices=["table", "fit", "cameras", "methods"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--scenes", nargs="*", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--pairs", type=int, default=8, help="of each step")
@@ -488,6 +557,9 @@ def main(arguments: list[str] | None = None) -> None:
         return
     if given.what == "methods":
         print_methods(given.scenes, given.data, given.pairs)
+        return
+    if given.what == "cameras":
+        print_cameras(given.pairs)
         return
     of_search, of_guesses = samples(given.pairs, given.data)
     print_fit("Searched: constant, root of margin, root of contradiction, degenerate", of_search)

@@ -251,11 +251,17 @@ UNUSUAL: dict[str, Unusual] = {
 }
 
 
-def record(one: Unusual, seed: int) -> Recording:
-    """Simulate a recording in memory; the true poses are its reference."""
+def record(one: Unusual, seed: int, *without: str) -> Recording:
+    """Simulate a recording in memory; the true poses are its reference.
+
+    Parameters
+    ----------
+    without
+        Effects that are switched off; multipath and smear unless given.
+    """
     sequence = scenes.Sequence(one.frames, 1, one.rate_hz, one.path(seed))
     model = replace(one.camera, frame_rate_hz=one.rate_hz)
-    effects = Effects().without("multipath", "smear")
+    effects = Effects().without(*(without or ("multipath", "smear")))
     made = Plan(one.scene(seed), sequence, model, effects, seed, np.arange(one.frames))
     factory = sensor.calibrated(model, effects)
     frames = [
