@@ -275,7 +275,7 @@ class Search:
         """Refine further poses T_target_source (N, 4, 4) and rank them among the candidates."""
         if not len(poses):
             return match
-        return replace(match, candidates=self._ordered(self._refined(poses), match.candidates))
+        return replace(match, candidates=self._ordered([*match.candidates, *self._refined(poses)]))
 
     def _refined(self, poses: Float64) -> list[Candidate]:
         """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
@@ -298,18 +298,15 @@ class Search:
         agreements = run_all([partial(self.compared.at, T) for T in poses])
         return [Candidate(T, agreement) for T, agreement in zip(poses, agreements, strict=True)]
 
-    def _ordered(
-        self, found: Sequence[Candidate], aligned: Sequence[Candidate] = ()
-    ) -> tuple[Candidate, ...]:
-        """Rank candidates after photometric alignment of the best ones; `aligned` ones were."""
-        distinct = _distinct([*aligned, *found], self.distinct_m)
+    def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
+        """Rank candidates after photometric alignment of the best ones."""
+        distinct = _distinct(found, self.distinct_m)
         if not (self.source.has_albedo and self.target.has_albedo):
             return distinct
         falloff = distinct[0].agreement.falloff
         source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
-        best = [candidate for candidate in distinct if candidate not in aligned][:count]
-        rest = [candidate for candidate in distinct if candidate not in best]
+        best, rest = distinct[:count], distinct[count:]
         targets = [Target(target, np.eye(4))]
         moved = run_all(
             [
