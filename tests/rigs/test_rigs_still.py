@@ -1,0 +1,74 @@
+"""Cameras that stand still around something that moves: their poses and their clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from rig_room import ROOM
+from rig_scene import CAMERA, looked_at
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.lab.simulation.rig import around, relative
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.rigs.calibrate import Calibration, calibrate_cameras
+from tofuse.rigs.inputs import Camera
+
+STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)]
+INTERVAL_S = 0.1
+Board = tuple[tuple[float, ...], float, float]
+
+
+def board(centre: np.ndarray, half: float) -> Board:
+    distance = float(np.linalg.norm(centre))
+    return tuple(centre / distance), distance, half
+
+
+def phase(t: float) -> float:
+    """Faster and slower, so that no other offset fits as well."""
+    return 2.1 * t + 1.3 * np.sin(0.9 * t) + 0.7 * np.sin(2.3 * t + 1)
+
+
+def towards(t: float) -> Board:
+    """A board that moves towards the cameras and away from them."""
+    at = phase(t)
+    return board(np.array([-0.45 + 0.12 * np.sin(at), 0.05 * np.sin(0.7 * at), 0.3]), 0.3)
+
+
+def sideways(t: float) -> Board:
+    at = phase(t)
+    return board(np.array([0.2 + 0.1 * np.sin(0.8 * at), 0.45 * np.sin(at), 0.75]), 0.4)
+
+
+def filmed(k: int, clock_s: float, moving: Callable[[float], Board]) -> Camera:
+    """Images of a camera whose clock shows `clock_s` less than the time."""
+    rng = np.random.default_rng([k, 5])
+    frames = []
+    for i in range(60):
+        t = (i + 0.4 * k) * INTERVAL_S
+        image = looked_at(STANDS[k], rng, 0.0, (*ROOM, moving(t)))
+        frames.append(RangeFrame(i, t - clock_s, CAMERA, image.depth, "z", None))
+    return Camera(f"cam{k}", Recording.of(ArraySource(frames), f"cam{k}", "array"))
+
+
+def calibrated(clock_s: float, moving: Callable[[float], Board]) -> Calibration:
+    return calibrate_cameras([filmed(0, 0.0, moving), filmed(1, clock_s, moving)], ["a", "b"])
+
+
+def test_clocks_are_aligned_by_what_moves_and_all_instants_count() -> None:
+    found = calibrated(100.0, towards)
+    assert found.how == "60 instants"
+    camera = found.rig.cameras[1]
+    assert abs(camera.time_offset_s - 100.0) < INTERVAL_S
+    assert any("cam1 differs by 100.00 s" in note for note in found.notes)
+    off = se3.inverse(camera.T_rig_camera) @ relative(STANDS)[1]
+    assert np.linalg.norm(off[:3, 3]) < 0.002
+    assert np.degrees(se3.angle(off)) < 0.05
+
+
+def test_clocks_that_the_motion_does_not_align_are_refused() -> None:
+    with pytest.raises(InputError, match="no motion that both see determines the offset"):
+        calibrated(100.0, sideways)
