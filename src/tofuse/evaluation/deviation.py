@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2 as chi_squared
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri, gammaincinv  # scipy.stats takes long to import
 
 from tofuse.arrays import Float64, Intp
 from tofuse.evaluation.trajectory import align
@@ -38,7 +37,7 @@ from tofuse.registration.projective import UNITS
 
 _LEVEL = 0.95
 # Of a chi-square variable with six degrees of freedom: its median, and Huber's threshold.
-_MEDIAN, _RARE = float(chi_squared.median(6)), float(chi_squared.ppf(0.99, 6))
+_MEDIAN, _RARE = 2 * float(gammaincinv(3, 0.5)), 2 * float(gammaincinv(3, 0.99))
 _FITS = 3
 # Degrees of freedom of the prior of the scale, the stated covariances.
 _STATED = 6.0
@@ -175,7 +174,7 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
     aligned = align(poses, graph.poses, arm_m=fit.depth_m) @ poses
     x = se3.log(se3.inverse(graph.poses) @ aligned)
     problem = _Corrections(graph, fit.depth_m)
-    chance = float(f_distribution.ppf(_LEVEL, fit.unknowns, fit.spare))
+    chance = float(fdtri(fit.unknowns, fit.spare, _LEVEL))
     estimate = problem.smallest(x, _USUAL * fit.unknowns)
     bound = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
     known = accuracy_of(graph, Shown(), 0.0)
@@ -248,7 +247,7 @@ def _steps(graph: PoseGraph, poses: Float64) -> Intp:
     row = np.flatnonzero(j == i + 1)
     per_pair = (len(graph.ids) - 1) / len(graph.edges)
     squares = _squares(replace(graph, poses=poses))[row] / per_pair
-    rare = float(chi_squared.ppf(1 - (1 - _LEVEL) / max(len(row), 1), 6))
+    rare = 2 * float(gammaincinv(3, 1 - (1 - _LEVEL) / max(len(row), 1)))
     return graph.edges[row[squares > _AT_WORST * rare]]
 
 

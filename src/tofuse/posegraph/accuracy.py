@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
@@ -330,4 +330,5 @@ def _quantile(C: Float64) -> float:
     if mean <= 0 or variance <= 0:
         return 0.0
     degrees = 2 * mean**2 / variance
-    return float(chi2.ppf(_LEVEL, degrees) * mean / degrees)
+    chi_squared = 2 * gammaincinv(degrees / 2, _LEVEL)  # scipy.stats takes long to import
+    return float(chi_squared * mean / degrees)
