@@ -192,13 +192,8 @@ def test_a_scheduler_that_goes_away_loses_nothing(
         f"tofuse: {address}: the scheduler disappeared; restart it, and run the same command again "
         "to resume\n"
     )
-    with measured.own_processes(2, tmp_path / "dask") as (address, _):
-        # More memory than any worker declares: told before anything is begun.
+    with measured.own_processes(2, tmp_path / "dask"):
         words = ("--scheduler", tmp_path / "dask" / "scheduler.json")
-        refused = measured.start_batch(listed, out, *words, "--memory", "1GB")
-        _, said = refused.communicate(timeout=60)
-        assert "needs 1000000000 bytes" in said
-        assert said.count("\n") == 1
         measured.finish(measured.start_batch(listed, out, *words))
     assert same(measured, alone, out)
 
