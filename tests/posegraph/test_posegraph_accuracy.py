@@ -107,6 +107,25 @@ def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
     )
 
 
+def test_directions_that_differ_slightly_do_not_bound_each_other() -> None:
+    """A slide along x, of which every pair of views knows the direction to a degree only."""
+    rng = np.random.default_rng(3)
+    pairs = [(i, j) for i in range(N) for j in range(i + 1, min(i + 5, N))]
+    steps = [
+        Measured(i, j, se3.inverse(TRUE[i]) @ TRUE[j], np.diag([1e7] * 3 + [1e8] * 3))
+        for i, j in pairs
+    ]
+    graph = build_graph(list(range(N)), TRUE, steps)
+    directions = []
+    for i, j in pairs:
+        slides = {i, j} & set(range(5, 10))
+        x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, 1, 2))]
+        directions.append(np.array([[*x, 0, 0, 0]]) if slides else np.zeros((0, 6)))
+    a = accuracy_of(without_degenerate(graph, directions), Shown(), 1.0)
+    assert set(range(5, 10)) <= set(a.unbounded)
+    assert not set(range(5)) & set(a.unbounded)
+
+
 def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> None:
     """That its keyframe was degenerate beside an earlier one says nothing of it."""
     graph = walk()

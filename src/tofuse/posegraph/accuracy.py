@@ -39,6 +39,8 @@ _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = ProjectiveOptions()
+# Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
+_LEAK = _DISTINCT * _ALIGNMENT.prior_m / UNITS[0]
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,9 @@ def without_degenerate(
     """Return the graph without information of its edges along their degenerate directions.
 
     Information there comes from noise (`uncertainty`) or from the prediction. These directions get
-    practically unbounded variances.
+    practically unbounded variances. They are known to a few degrees only, and differ that much
+    between edges, which together would seem to constrain them. So the error along them, up to the
+    smallest that counts as unbounded, is also part of the error in the other directions.
 
     Parameters
     ----------
@@ -188,7 +192,9 @@ def without_degenerate(
         H = information[k] * np.outer(UNITS, UNITS)
         scaled = H - H @ u @ np.linalg.pinv(u.T @ H @ u, hermitian=True) @ u.T @ H
         free = u @ np.linalg.inv(u.T @ open_variance @ u) @ u.T
-        information[k] = (scaled + free) / np.outer(UNITS, UNITS)
+        measured = scaled + free
+        measured = np.linalg.solve(np.eye(6) + _LEAK**2 * measured, measured)
+        information[k] = 0.5 * (measured + measured.T) / np.outer(UNITS, UNITS)
     return replace(graph, information=information)
 
 
