@@ -20,9 +20,9 @@ SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, 
 def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
     out = np.empty(kernels.SIZE)
     surface = prepare_view(target, SHARP)
-    points = points_of(prepare_view(source, SHARP), 1)
+    seen = prepare_view(source, SHARP)
     kernels.pair_equations(
-        points,
+        points_of(seen, 1),
         surface.target,
         surface.projection.lookup,
         surface.projection.frame,
@@ -30,6 +30,8 @@ def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
         *settings,
         np.zeros(kernels.ERRORS) if errors is None else errors,
         known,
+        seen.measures_range,
+        surface.measures_range,
         out,
     )
     return out
@@ -55,15 +57,21 @@ def test_the_step_leads_back_to_the_truth(pair):
     assert np.abs(away[3:]).max() < 5e-4
 
 
+def as_measured(frame, kind):
+    """Return the frame with the depth that a camera of a kind, "z" or "range", measures."""
+    return frame if kind == "z" else replace(frame, depth=frame.radial_range, depth_kind=kind)
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
 @pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
 @pytest.mark.parametrize("error", range(kernels.ERRORS))
 def test_an_error_of_the_camera_moves_the_gradient_as_the_matrix_says(
-    pair, error, scale_p, tolerance
+    pair, error, scale_p, tolerance, kind
 ):
     """To first order g(e) = g(0) + H e: the mixed block is the slope of the gradient."""
     _, _, T = pair
     # A pattern so coarse that it makes no difference at which pixel a point lands.
-    source, target = corner(T, waves=0.1), corner(np.eye(4), waves=0.1)
+    source, target = (as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4)))
     known = KNOWN.copy()
     known[error] = 0
     wide = (0.0, 1.0, scale_p, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
@@ -78,6 +86,33 @@ def test_an_error_of_the_camera_moves_the_gradient_as_the_matrix_says(
     chosen = [*range(6), 7 + error]
     scale = np.sqrt(np.diag(H)[chosen] * H[7 + error, 7 + error])
     assert np.abs((slope - column)[chosen] / scale).max() < tolerance
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+def test_with_the_error_of_the_focal_length_views_agree_as_with_the_true_camera(pair, kind):
+    """What is measured stays: z, or the range along another ray."""
+    source, target, T = pair
+    share = 1.02
+
+    def stated(frame):
+        camera = frame.camera
+        wrong = replace(camera, fx=share * camera.fx, fy=share * camera.fy)
+        return replace(as_measured(frame, kind), camera=wrong)
+
+    views = stated(source), stated(target)
+    errors = np.zeros(kernels.ERRORS)
+    errors[kernels.FOCAL] = share - 1
+    known = KNOWN.copy()
+    known[kernels.FOCAL] = 0
+    plain = (0.0, 1.0, 0.1, 0.002, 4.0, 0.5)
+
+    def misfit(out):
+        return 1 - out[kernels.SUPPORT] / out[kernels.TERMS]
+
+    true = misfit(evaluate(source, target, T, settings=plain))
+    corrected = misfit(evaluate(*views, T, errors, known, plain))
+    wrong = misfit(evaluate(*views, T, known=known, settings=plain))
+    assert corrected - true < 0.3 * (wrong - true)
 
 
 def test_what_is_not_asked_for_has_no_equations(pair):

@@ -82,11 +82,16 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     )
 
 
-def seen_by(recording: Recording, share: float) -> Recording:
-    """The recording as if its camera had so many times its focal length."""
+def seen_by(recording: Recording, share: float, kind: str = "z") -> Recording:
+    """The recording as if its camera had so many times its focal length.
+
+    The camera measures z, or `kind` "range".
+    """
     frames = []
     for item in recording:
         assert isinstance(item, RangeFrame)
+        if kind == "range":
+            item = replace(item, depth=item.radial_range, depth_kind="range")
         camera = item.camera
         assert isinstance(camera, Pinhole)
         frames.append(
@@ -132,6 +137,16 @@ def test_a_wrong_focal_length_is_corrected(wrong) -> None:
     assert "calibration_alarm" in {r.code for r in stated.diagnostics.reasons}
     assert error_of(wrong, result) < 0.3 * error_of(wrong, stated)
     # It is a 95 % bound, of an error of which one draw is looked at.
+    assert error_of(wrong, result) < 1.1 * result.diagnostics.accuracy.position_m
+
+
+def test_a_wrong_focal_length_of_a_camera_that_measures_range_is_corrected(recording) -> None:
+    """Rotation scales with the focal length and all views agree: only the loop shows it."""
+    wrong = seen_by(recording, 1.05, "range")
+    result = reconstruct(wrong)
+    found = result.diagnostics.calibrated
+    assert found is not None
+    assert found.focal == pytest.approx(0.05, abs=0.01)
     assert error_of(wrong, result) < 1.1 * result.diagnostics.accuracy.position_m
 
 

@@ -51,7 +51,7 @@ def sums_of(source, target, T):
     row = np.empty(kernels.SIZE)
     kernels.pair_equations(
         source.points, surface.target, lookup, frame, T, 0.0, WIDE[0], 0.0, 0.0, *WIDE[1:],
-        np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64), row,
+        np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64), False, False, row,
     )  # fmt: skip
     return sums, row
 

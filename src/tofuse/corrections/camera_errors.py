@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.corrections.base import Correction, Corrector
-from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.geometry.cameras import Camera, Pinhole, RayTable, ray_lengths
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
@@ -85,8 +85,9 @@ class _Corrector(Corrector):
             # What is valid stays valid.
             least = np.float32(1e-3)
             longer = np.maximum(frame.radial_range + np.float32(options.offset_m), least)
-            depth = np.where(frame.depth > 0, longer, np.float32(0))
-            frame = replace(frame, depth=depth, depth_kind="range")
+            if frame.depth_kind == "z":
+                longer /= ray_lengths(frame.camera).astype(np.float32)
+            frame = replace(frame, depth=np.where(frame.depth > 0, longer, np.float32(0)))
         return frame
 
     def is_independent(self, frame: Frame) -> bool:

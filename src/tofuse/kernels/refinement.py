@@ -49,7 +49,7 @@ from tofuse.kernels.projection import jacobian_row, project_ray
 # Errors of the camera, in the order of their unknowns.
 OFFSET = 0  # to be added to the range, m
 SCALE = 1  # relative, to be added to the depth
-FOCAL = 2  # relative, to be added to the ray coordinates
+FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
 ERRORS = 3
 
 EXPOSURE = 6  # index of the exposure among the unknowns
@@ -69,10 +69,11 @@ SIZE = HISTOGRAM + BINS
 
 
 @kernel
-def displacement(B: Float64, x: float, y: float, z: float, known: Int64) -> None:
+def displacement(B: Float64, x: float, y: float, z: float, radial: bool, known: Int64) -> None:
     """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
 
-    Errors that are flagged in `known` (ERRORS,) get 0.
+    Errors that are flagged in `known` (ERRORS,) get 0. `radial` tells whether the camera measures
+    the distance along the ray, and not z.
     """
     for k in range(ERRORS):
         B[k, 0] = B[k, 1] = B[k, 2] = 0.0
@@ -88,6 +89,12 @@ def displacement(B: Float64, x: float, y: float, z: float, known: Int64) -> None
     if not known[FOCAL]:
         B[FOCAL, 0] = x
         B[FOCAL, 1] = y
+        if radial:
+            side2 = x * x + y * y
+            shorter = side2 / (side2 + z * z)
+            B[FOCAL, 0] -= shorter * x
+            B[FOCAL, 1] -= shorter * y
+            B[FOCAL, 2] -= shorter * z
 
 
 @kernel
@@ -105,6 +112,8 @@ def pair_equations(
     min_cosine: float,
     errors: Float64,
     known: Int64,
+    radial_source: bool,
+    radial_target: bool,
     out: Float64,
 ) -> None:
     """Sum the normal equations of one pair into `out` (SIZE,), which is overwritten.
@@ -119,6 +128,8 @@ def pair_equations(
         (ERRORS,) current estimate of the camera's errors, by which points and planes are displaced.
     known
         (ERRORS,) non-zero for errors that are not estimated.
+    radial_source, radial_target
+        Whether the cameras measure radial range, and not z.
     """
     out[:] = 0.0
     rows, columns = target.shape[0], target.shape[1]
@@ -148,7 +159,7 @@ def pair_equations(
         py = np.float64(point[POINT + 1])
         pz = np.float64(point[POINT + 2])
         if asked:
-            displacement(Bp, px, py, pz, known)
+            displacement(Bp, px, py, pz, radial_source, known)
             for p in range(asked):
                 px += errors[p] * Bp[p, 0]
                 py += errors[p] * Bp[p, 1]
@@ -178,7 +189,7 @@ def pair_equations(
         across = n0 * x + n1 * y + n2 * z
         r = across - distance
         if asked:
-            displacement(Bq, x, y, z, known)
+            displacement(Bq, x, y, z, radial_target, known)
             for p in range(asked):
                 r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
         along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])

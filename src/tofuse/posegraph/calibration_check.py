@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -44,6 +45,9 @@ _CLOSED = (0.01, np.radians(0.5))
 _MAX_SIGMA = 0.4
 # Change of the views' support that the choice of points alone explains.
 _CHANCE = 0.003
+# Maximum number of secant steps to the error that closes a loop; change at convergence, and an
+# implausible error, relative to the tolerance.
+_SECANTS, _CONVERGED, _IMPLAUSIBLE = 4, 0.05, 10.0
 # The spread between views is not known from fewer.
 _MIN_VIEWS = 8
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
@@ -67,6 +71,11 @@ class Gap:
     before: tuple[float, float]
     after: tuple[float, float]
     depth: float = 0.0
+
+    @property
+    def remaining_m(self) -> float:
+        """Distance by which `after` moves points at the views' depth, m."""
+        return self.after[0] + self.depth * self.after[1]
 
     @property
     def closes(self) -> bool:
@@ -168,8 +177,10 @@ def check_calibration(
         if abs(estimate[_NUMBERS[name]])
         > max(_LIKELY * sigma[_NUMBERS[name]], _MIN_FIRST_STEP * TOLERANCES[name])
     ]
+    sigmas = {name: float(sigma[_NUMBERS[name]]) for name in determined}
+    by_loop = partial(_check_by_loop, views, refined, sigmas, focal_sigma, options)
     if not likely:
-        return CalibrationCheck(focal_sigma=focal_sigma)
+        return by_loop()
     few, some = list(views), pairs
     if len(pairs) > _ENOUGH_PAIRS:
         few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
@@ -192,11 +203,13 @@ def check_calibration(
     alarm = gap is not None and gap.closes and _gain(best, views) > _CHANCE
     if alarm:  # alternative explanations
         found |= {name: estimated(name) for name in determined if name not in found}
+    elif (closed := by_loop()).alarm:
+        return closed
     support = float(best.before.of_views(len(views)).mean())
     return CalibrationCheck(
         alarm,
         {name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found},
-        {name: float(sigma[k]) for name, k in _NUMBERS.items() if name in found},
+        {name: sigmas[name] for name in _NUMBERS if name in found},
         (support, support + _gain(best, views)),
         gap,
         name_of_best,
@@ -242,23 +255,140 @@ def loop_gap(
     poses, errors
         (N, 4, 4) and (ERRORS,) result with them.
     """
-    ends = longest_loop(refined.pairs)
-    if ends is None:
+    loop = _Loop.longest(views, refined, options)
+    if loop is None:
         return None
-    i, j = ends
-    chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
-    pairs = np.concatenate([chain, [[i, j]]])
-    gaps = []
-    for at, wrong in ((refined.poses, np.zeros(kernels.ERRORS)), (poses, errors)):
-        T = se3.inverse(at[pairs[:, 0]]) @ at[pairs[:, 1]]
-        T = align_pairs(views, pairs, T, options, wrong)
+    without = loop.miss(refined.poses, np.zeros(kernels.ERRORS))
+    return loop.gap(without, loop.miss(poses, errors))
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
+
+    views: Sequence[KeptView]
+    i: int
+    j: int
+    options: RefineOptions
+
+    @classmethod
+    def longest(
+        cls, views: Sequence[KeptView], refined: Refined, options: RefineOptions
+    ) -> _Loop | None:
+        """Return the longest loop of refined views; None if there is none."""
+        ends = longest_loop(refined.pairs)
+        return None if ends is None else cls(views, *ends, options)
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the two ends, m."""
+        return 0.5 * (self.views[self.i].surface.depth + self.views[self.j].surface.depth)
+
+    def miss(self, poses: Float64, errors: Float64) -> Float64:
+        """Return the motion (4, 4) by which chained pairwise alignments miss the end of the loop.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4) T_world_camera, where the alignments start.
+        errors
+            (ERRORS,) assumed errors of the camera.
+        """
+        i, j = self.i, self.j
+        chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
+        pairs = np.concatenate([chain, [[i, j]]])
+        T = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+        T = align_pairs(self.views, pairs, T, self.options, errors)
         chained = np.eye(4)
         for step in T[:-1]:
             chained = chained @ step
-        miss = se3.inverse(T[-1]) @ chained
-        gaps.append((float(np.linalg.norm(miss[:3, 3])), float(se3.angle(miss))))
-    depth = 0.5 * (views[i].surface.depth + views[j].surface.depth)
-    return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1], depth)
+        return np.asarray(se3.inverse(T[-1]) @ chained, np.float64)
+
+    def gap(self, before: Float64, after: Float64) -> Gap:
+        """Return the gap, given `miss` without and with errors of the camera."""
+        first, last = (self.views[k].surface.index for k in (self.i, self.j))
+        return Gap(first, last, _size(before), _size(after), self.depth)
+
+    def closing_error(self, poses: Float64, number: int, step: float) -> tuple[float, Float64]:
+        """Return the error of the camera that closes the loop best, and `miss` with it.
+
+        Gauss-Newton on the gap at the views' depth, with derivatives by secants.
+
+        Parameters
+        ----------
+        poses
+            As for `miss`.
+        number
+            Which error.
+        step
+            First difference.
+        """
+        unit = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
+        errors = np.zeros(kernels.ERRORS)
+        before, residual = 0.0, se3.log(self.miss(poses, errors)) * unit
+        error = step
+        for _ in range(_SECANTS):
+            errors[number] = error
+            miss = self.miss(poses, errors)
+            last, residual = residual, se3.log(miss) * unit
+            slope = (residual - last) / (error - before)
+            before = error
+            error -= float(slope @ residual) / max(float(slope @ slope), 1e-12)
+            if abs(error - before) < _CONVERGED * step or abs(error) > _IMPLAUSIBLE * step:
+                break
+        return before, miss
+
+
+def _size(T: Float64) -> tuple[float, float]:
+    return float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
+
+
+def _check_by_loop(
+    views: Sequence[KeptView],
+    refined: Refined,
+    sigmas: Mapping[str, float],
+    focal_sigma: float,
+    options: RefineOptions,
+) -> CalibrationCheck:
+    """Estimate the errors of the camera from the drift over the longest loop alone.
+
+    A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
+    residuals show nothing. Pairwise alignments from the poses before it don't depend on it.
+
+    Parameters
+    ----------
+    views, refined, options
+        As for `check_calibration`.
+    sigmas
+        Standard deviations of the errors that the views determine.
+    focal_sigma
+        See `CalibrationCheck`.
+    """
+    none = CalibrationCheck(focal_sigma=focal_sigma)
+    loop = _Loop.longest(views, refined, options)
+    if loop is None:
+        return none
+    poses = refined.start
+    open_end = loop.miss(poses, np.zeros(kernels.ERRORS))
+    if not loop.gap(open_end, open_end).contradicts:
+        return none
+    found: dict[str, tuple[float, Gap]] = {}
+    for name in sigmas:
+        error, end = loop.closing_error(poses, _NUMBERS[name], TOLERANCES[name])
+        gap = loop.gap(open_end, end)
+        if gap.closes and _large(name, error, sigmas[name]):
+            found[name] = error, gap
+    if not found:
+        return none
+    best = min(found, key=lambda name: found[name][1].remaining_m)
+    return replace(
+        none,
+        alarm=True,
+        errors={name: error for name, (error, _) in found.items()},
+        sigmas={name: sigmas[name] for name in found},
+        gap=found[best][1],
+        best=best,
+    )
 
 
 def longest_loop(pairs: Intp) -> tuple[int, int] | None:

@@ -124,6 +124,8 @@ class Refined:
     ----------
     poses
         (N, 4, 4) T_world_camera; the first has not moved.
+    start
+        (N, 4, 4) poses that the alignment started from.
     errors
         (ERRORS,) of the camera, in the order of `kernels.refinement`; 0 where not estimated.
     pairs
@@ -141,6 +143,7 @@ class Refined:
     """
 
     poses: Float64
+    start: Float64
     errors: Float64
     pairs: Intp
     moved: tuple[float, ...]
@@ -288,7 +291,7 @@ def refine(
     measured = _pairwise_measurements(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
     scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
-    return Refined(poses, errors, pairs, tuple(moved), before, after, *measured, scales)
+    return Refined(poses, start, errors, pairs, tuple(moved), before, after, *measured, scales)
 
 
 def support_of(
@@ -519,7 +522,7 @@ def _evaluate(
 
     def work(a: int, b: int) -> None:
         for k in order[a:b]:
-            target = views[state.target[k]].surface
+            source, target = (views[i[k]].surface for i in (state.source, state.target))
             kernels.pair_equations(
                 views[state.source[k]].points,
                 target.target,
@@ -534,6 +537,8 @@ def _evaluate(
                 cosine,
                 errors,
                 known,
+                source.measures_range,
+                target.measures_range,
                 rows[k],
             )
 

@@ -167,7 +167,9 @@ def refine_submaps(
         nobody = Support(none.astype(np.intp), none.astype(np.intp), none, none)
         measured = np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
         errors = np.zeros(kernels.ERRORS)
-        still = Refined(poses, errors, pairs, (), nobody, nobody, *measured, np.zeros((0, 3)))
+        still = Refined(
+            poses, poses, errors, pairs, (), nobody, nobody, *measured, np.zeros((0, 3))
+        )
         return still, []
     errors = np.median([r.errors for _, r in found], axis=0)
     asked = np.concatenate([part.pairs for part, _ in found])
@@ -180,6 +182,7 @@ def refine_submaps(
     ]
     whole = Refined(
         solved,
+        poses,
         errors,
         asked,
         max((r.moved for _, r in found), key=len, default=()),
@@ -223,7 +226,7 @@ def _or_unchanged(refined: Refined, start: Float64) -> Refined:
     i, j = refined.pairs.T
     stays = se3.inverse(start[i]) @ start[j]
     return Refined(
-        start, np.zeros_like(refined.errors), refined.pairs, refined.moved, refined.before,
+        start, start, np.zeros_like(refined.errors), refined.pairs, refined.moved, refined.before,
         refined.before, stays, refined.information, refined.scales,
     )  # fmt: skip
 

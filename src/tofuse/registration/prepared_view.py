@@ -252,6 +252,8 @@ class PreparedView:
         (H, W) `plane_variance` with correlated errors counted once; None without such errors.
     unknown_falloff
         Whether `albedo` includes an unknown falloff of the amplitude towards the corners.
+    measures_range
+        Whether the camera measures radial range, of which z was computed.
     """
 
     index: int
@@ -265,6 +267,7 @@ class PreparedView:
     has_albedo: bool = field(default=False)
     pixel_variance: Float32 | None = None
     unknown_falloff: bool = False
+    measures_range: bool = False
     _subsampled: dict[int, PreparedView] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -351,6 +354,7 @@ class PreparedView:
             self.has_albedo,
             pixel_variance=None if own is None else np.ascontiguousarray(own[kept]),
             unknown_falloff=self.unknown_falloff,
+            measures_range=self.measures_range,
         )
         return self._subsampled[step]
 
@@ -435,6 +439,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         unknown_falloff=(
             lit and options.falloff is None and frame.amplitude_kind != "range_compensated"
         ),
+        measures_range=frame.depth_kind == "range",
     )
     return view if lit else view.with_range_falloff(options.range_falloff or 0.0)
 
