@@ -6,7 +6,7 @@ from tofuse.arrays import Float64
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.search import SearchOptions, differ
+from tofuse.registration.search import DISTINCT_M, SearchOptions, differ
 from tofuse.registration.verification import UsualFit, comparable
 from tofuse.registration.view_pair import register_pair
 
@@ -99,7 +99,12 @@ class Relocalizer:
             self._budget -= 1
             # Even where an alignment seems certain: a box looks the same from its other side.
             registration = register_pair(
-                view, keyframe.view, usual=self._usual, options=self._search, always_search=True
+                view,
+                keyframe.view,
+                usual=self._usual,
+                options=self._search,
+                always_search=True,
+                rival_m=DISTINCT_M,
             )
             self._cache = {p: r for p, r in self._cache.items() if p[0] == view.index}
             self._cache[pair] = registration

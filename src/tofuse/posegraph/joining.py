@@ -446,7 +446,9 @@ class _Joiner:
 
     def _registered(self, first: View, second: View) -> Link | None:
         """Register two similar views; only an exhaustive search counts against the budget."""
-        found = register_pair(second.view, first.view, usual=self._usual, options=self._search)
+        found = register_pair(
+            second.view, first.view, usual=self._usual, options=self._search, rival_m=DISTINCT_M
+        )
         if found is None or found.margin is not None:
             self._searches -= 1
         return _link(first, second, found)

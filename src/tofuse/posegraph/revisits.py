@@ -39,7 +39,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
-from tofuse.registration.search import SearchOptions
+from tofuse.registration.search import DISTINCT_M, SearchOptions
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_descriptor import view_descriptor
 from tofuse.registration.view_pair import follow, register_pair
@@ -467,7 +467,7 @@ def register_anywhere(
     source: PreparedView, target: PreparedView, usual: UsualFit, options: SearchOptions
 ) -> Registration | None:
     """Register two views by exhaustive search, without a guess."""
-    return register_pair(source, target, usual=usual, options=options)
+    return register_pair(source, target, usual=usual, options=options, rival_m=DISTINCT_M)
 
 
 def _path_lengths(poses: Mapping[int, Float64]) -> dict[int, Float64]:

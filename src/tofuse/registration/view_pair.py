@@ -7,6 +7,7 @@ evaluated by the agreement of both images and by its lead over rival poses.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -100,6 +101,7 @@ def register_pair(
     always_search: bool = False,
     proposals: Callable[[], Float64] | None = None,
     uncertainty: UncertaintyOptions | None = None,
+    rival_m: float = math.inf,
 ) -> Registration | None:
     """Register two prepared views.
 
@@ -120,6 +122,8 @@ def register_pair(
         accepted.
     uncertainty
         Constants of the covariance; those of views without multipath unless given.
+    rival_m
+        Poses further apart than this, or 4 % of the depth if that is less, are rivals.
 
     Returns
     -------
@@ -128,7 +132,7 @@ def register_pair(
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, uncertainty)
+    pair = _Pair.of(source, target, usual, uncertainty, rival_m)
     near = pair.followed(np.eye(4) if guess is None else guess)
     if near is not None and near.is_certain and not always_search:
         return pair.registration(near, near.evidence, None)
@@ -189,6 +193,7 @@ class _Pair:
         target: PreparedView,
         usual: UsualFit | None,
         uncertainty: UncertaintyOptions | None,
+        rival_m: float = math.inf,
     ) -> _Pair:
         """Adapt the tolerances to the depth of the views and the usual errors of the camera.
 
@@ -202,7 +207,8 @@ class _Pair:
         depth = 0.5 * (source.depth + target.depth)
         compared = self_scaled(usual)
         compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))
-        return cls(source, target, usual, compared, _DISTINCT * depth, uncertainty)
+        distinct_m = min(rival_m, _DISTINCT * depth)
+        return cls(source, target, usual, compared, distinct_m, uncertainty)
 
     def followed(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
