@@ -130,6 +130,38 @@ def test_colour_falls_off_with_the_range_only_if_lit_by_the_camera(forward, expo
     assert config.odometry.views.falloff == 0.0
 
 
+def infrared(frames: list[RangeFrame], exponent: float) -> Recording:
+    """Return frames whose amplitude falls off with the range, of kind "ir"."""
+    out = []
+    for frame in frames:
+        assert frame.amplitude_image is not None
+        amplitude = frame.amplitude_image / np.fmax(frame.radial_range, 0.3) ** exponent
+        out.append(
+            replace(frame, amplitude_image=amplitude.astype(np.float32), amplitude_kind="ir")
+        )
+    return Recording.of(ArraySource(tuple(out)), "made", "arrays")
+
+
+@pytest.mark.parametrize("exponent", [0.0, 2.0])
+def test_an_infrared_image_is_raw_unless_the_recording_shows_otherwise(forward, exponent):
+    config = adapted(from_method("default"), infrared(forward, exponent), threads=1)
+    views = config.odometry.views
+    assert views.range_falloff == pytest.approx(exponent, abs=0.2)
+    assert abs(views.falloff) < 0.5
+    compensated, raw = infrared(forward[:1], 0.0)[0], infrared(forward[:1], exponent)[0]
+    expected = prepare_view(compensated, SurfaceOptions(falloff=0.0, range_falloff=0.0))
+    alone = prepare_view(raw, SurfaceOptions(falloff=0.0, range_falloff=exponent))
+    assert np.nanstd(alone.albedo[..., 0] - expected.albedo[..., 0]) < 0.02
+
+
+def test_without_a_recording_an_infrared_image_is_raw(forward):
+    raw = infrared(forward[:1], 2.0)[0]
+    assert isinstance(raw, RangeFrame)
+    alone = prepare_view(raw, SurfaceOptions(falloff=0.0))
+    expected = prepare_view(raw, SurfaceOptions(falloff=0.0, range_falloff=2.0))
+    np.testing.assert_array_equal(alone.albedo, expected.albedo)
+
+
 def test_colour_is_compensated_for_its_falloff(forward):
     lit, ambient = colored(forward[:1], 4.4)[0], colored(forward[:1], 0.0)[0]
     view = prepare_view(lit, SurfaceOptions(range_falloff=2.0))

@@ -24,8 +24,8 @@ class ViewOptions(Bounded):
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.
     range_falloff
-        Exponent of the range by which colour gets darker, as if lit by a lamp on the camera; None
-        to estimate it from the recording.
+        Exponent of the range by which colour (as if lit by a lamp on the camera) or infrared
+        images of kind "ir" get darker; None to estimate it from the recording.
     """
 
     columns: Annotated[int, Bounds(16, 4096)] = 320

@@ -24,6 +24,7 @@ from tofuse.pipeline.trial import Prepare, trial
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import RAW_RANGE_FALLOFF
 from tofuse.sensor.noise import NOISE, NoiseModel
 
 # Frames, evenly spaced: enough for the background behind an object that turns once.
@@ -89,14 +90,20 @@ def _with_falloffs(views: ViewOptions, recording: Recording, prepare: Prepare) -
     frame = recording.first_readable()
     amplitude = isinstance(frame, RangeFrame) and frame.amplitude_image is not None
     color = isinstance(frame, RangeFrame) and frame.color_image is not None and not amplitude
-    if views.falloff is None:
+    infrared = isinstance(frame, RangeFrame) and amplitude and frame.amplitude_kind == "ir"
+    falloff, by_range = views.falloff, views.range_falloff
+    if by_range is None:
+        # That of a time-of-flight camera, unless the recording shows otherwise.
+        by_range = RAW_RANGE_FALLOFF if infrared else 0.0
+        if color or infrared:
+            surface = replace(views.surface, falloff=falloff or 0.0, range_falloff=by_range)
+            by_range += estimate_falloff(recording, prepare, surface, RANGE)
+    by_range = max(by_range, 0.0)
+    if falloff is None:
         # Colour cameras compensate their vignetting.
-        found = estimate_falloff(recording, prepare, views.surface) if amplitude else 0.0
-        views = replace(views, falloff=found)
-    if views.range_falloff is None:
-        found = estimate_falloff(recording, prepare, views.surface, RANGE) if color else 0.0
-        views = replace(views, range_falloff=max(found, 0.0))
-    return views
+        surface = replace(views.surface, falloff=0.0, range_falloff=by_range)
+        falloff = estimate_falloff(recording, prepare, surface) if amplitude else 0.0
+    return replace(views, falloff=falloff, range_falloff=by_range)
 
 
 def with_recording_defaults(config: Config, recording: Recording) -> Config:

@@ -98,7 +98,7 @@ RANGE = Law(
 def estimate_falloff(
     recording: Recording, prepare: Prepare, options: SurfaceOptions, law: Law = OFF_AXIS
 ) -> float:
-    """Return the exponent by which amplitude, or else colour, falls off; 0 if not significant.
+    """Return the exponent of a falloff that views still show; 0 if not significant.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ def estimate_falloff(
     prepare
         Corrects and filters a frame as for tracking.
     options
-        How views are prepared.
+        How views are prepared, with the falloffs that are compensated.
     law
-        By which it falls off.
+        By which amplitude, or else colour, falls off.
     """
-    views = _Views(recording, prepare, replace(options, falloff=0.0, range_falloff=0.0))
+    views = _Views(recording, prepare, options)
     slopes: list[_Slope] = []
     for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
         # The initial exponent is the median so far: nearly compensated amplitude hardly biases.

@@ -52,6 +52,10 @@ _MAX_PLANE_SIGMAS = 3.0
 _MEDIAN_OF_NORMAL = 0.6745
 
 
+# Exponent of the range by which the amplitude of a time-of-flight camera falls off.
+RAW_RANGE_FALLOFF = 2.0
+
+
 @dataclass(frozen=True)
 class Smoothed:
     """Preparation of views that the camera has smoothed, at a finer scale.
@@ -103,8 +107,9 @@ class SurfaceOptions:
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.
     range_falloff
-        Exponent of the range by which colour gets darker, as if lit by a lamp on the camera; None
-        to estimate it from the recording.
+        Exponent of the range by which colour (as if lit by a lamp on the camera) or infrared
+        images of kind "ir" get darker; None to estimate it from the recording. A view alone is
+        taken for one in ambient light, or for that of a time-of-flight camera.
     smoothed
         Options for views with hardly any noise.
     """
@@ -441,7 +446,11 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         ),
         measures_range=frame.depth_kind == "range",
     )
-    return view if lit else view.with_range_falloff(options.range_falloff or 0.0)
+    if lit and frame.amplitude_kind != "ir":
+        return view
+    by_kind = RAW_RANGE_FALLOFF if lit else 0.0
+    exponent = by_kind if options.range_falloff is None else options.range_falloff
+    return view.with_range_falloff(exponent)
 
 
 @lru_cache(maxsize=16)
