@@ -96,10 +96,13 @@ def test_the_longest_loop_goes_by_neighbours_alone():
 
 def test_the_kinect_loop_raises_the_alarm(shared_data):
     """Its intrinsics are wrong by 5 %, as box corners of 87 degrees say as well."""
+    from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
     from tofuse.recordings.open import open_recording
 
-    result = reconstruct(open_recording(shared_data / "kinectv2_loop" / "recording"))
+    recording = open_recording(shared_data / "kinectv2_loop" / "recording")
+    config = changed(from_method("default"), {"self_calibration": False}, where="test")
+    result = reconstruct(recording, config)
     assert "calibration_alarm" in {r.code for r in result.diagnostics.reasons}
     refinement = result.diagnostics.refinement
     assert refinement is not None
@@ -112,3 +115,8 @@ def test_the_kinect_loop_raises_the_alarm(shared_data):
     # A proposal: nothing was changed by it.
     assert refinement.errors == {}
     assert se3.angle(result.trajectory[0]) == pytest.approx(0, abs=1e-12)
+    # The correction itself is kept.
+    calibrated = reconstruct(recording).diagnostics
+    assert calibrated.calibrated is not None
+    assert calibrated.calibrated.focal == pytest.approx(-0.05, abs=0.015)
+    assert calibrated.accuracy.position_m < 0.1 * result.diagnostics.accuracy.position_m
