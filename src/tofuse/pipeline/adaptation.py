@@ -88,17 +88,17 @@ def _with_falloffs(views: ViewOptions, recording: Recording, prepare: Prepare) -
     if views.falloff is not None and views.range_falloff is not None:
         return views
     frame = recording.first_readable()
-    amplitude = isinstance(frame, RangeFrame) and frame.amplitude_image is not None
-    color = isinstance(frame, RangeFrame) and frame.color_image is not None and not amplitude
-    infrared = isinstance(frame, RangeFrame) and amplitude and frame.amplitude_kind == "ir"
+    image = frame if isinstance(frame, RangeFrame) else None
+    amplitude = image is not None and image.amplitude_image is not None
     falloff, by_range = views.falloff, views.range_falloff
     if by_range is None:
-        # That of a time-of-flight camera, unless the recording shows otherwise.
+        # Infrared is that of a time-of-flight camera, unless the recording shows otherwise.
+        infrared = image is not None and amplitude and image.amplitude_kind == "ir"
+        color = image is not None and not amplitude and image.color_image is not None
         by_range = RAW_RANGE_FALLOFF if infrared else 0.0
-        if color or infrared:
+        if infrared or color:
             surface = replace(views.surface, falloff=falloff or 0.0, range_falloff=by_range)
-            by_range += estimate_falloff(recording, prepare, surface, RANGE)
-    by_range = max(by_range, 0.0)
+            by_range = max(by_range + estimate_falloff(recording, prepare, surface, RANGE), 0.0)
     if falloff is None:
         # Colour cameras compensate their vignetting.
         surface = replace(views.surface, falloff=0.0, range_falloff=by_range)

@@ -11,7 +11,8 @@ amplitude, compensated by the exponent that this shows, and aligned again until 
 exponents of pairs are pooled, weighted by their information, which grows with the motion.
 
 Colour in ambient light falls off with nothing. Where a lamp on the camera lights the scene, colour
-gets darker with range and incidence. The range stands for both: on a plane, which keeps its
+gets darker with range and incidence. Infrared images of a ToF camera fall off with the squared
+range, unless the camera compensates it. The range stands for both: on a plane, which keeps its
 distance to the camera as it moves along, the cosine of incidence is inverse to the range; and
 unlike the cosine it is nearly free of noise.
 """

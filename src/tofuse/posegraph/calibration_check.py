@@ -75,7 +75,10 @@ class Gap:
     @property
     def remaining_m(self) -> float:
         """Distance by which `after` moves points at the views' depth, m."""
-        return self.after[0] + self.depth * self.after[1]
+        return self._apparent_m(*self.after)
+
+    def _apparent_m(self, m: float, rad: float) -> float:
+        return m + self.depth * rad
 
     @property
     def closes(self) -> bool:
@@ -84,9 +87,9 @@ class Gap:
         Or points at the views' depth move by less than half the distance. A gap of less than a
         centimetre and half a degree has no significance, as not every error bends every path.
         """
-        seen = [m + self.depth * rad for m, rad in (self.after, self.before)]
-        least = _CLOSED[0] + self.depth * _CLOSED[1]
-        if self.depth and seen[0] < 0.5 * seen[1] and seen[1] > least:
+        seen = self._apparent_m(*self.before)
+        least = self._apparent_m(*_CLOSED)
+        if self.depth and self.remaining_m < 0.5 * seen and seen > least:
             return True
         parts = list(zip(self.before, self.after, _CLOSED, strict=True))
         if any(b > max(a, least) for a, b, least in parts):
@@ -309,7 +312,9 @@ class _Loop:
         first, last = (self.views[k].surface.index for k in (self.i, self.j))
         return Gap(first, last, _size(before), _size(after), self.depth)
 
-    def closing_error(self, poses: Float64, number: int, step: float) -> tuple[float, Float64]:
+    def closing_error(
+        self, poses: Float64, uncorrected: Float64, number: int, step: float
+    ) -> tuple[float, Float64]:
         """Return the error of the camera that closes the loop best, and `miss` with it.
 
         Gauss-Newton on the gap at the views' depth, with derivatives by secants.
@@ -318,6 +323,8 @@ class _Loop:
         ----------
         poses
             As for `miss`.
+        uncorrected
+            (4, 4) `miss` without errors of the camera.
         number
             Which error.
         step
@@ -325,7 +332,7 @@ class _Loop:
         """
         unit = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
         errors = np.zeros(kernels.ERRORS)
-        before, residual = 0.0, se3.log(self.miss(poses, errors)) * unit
+        before, residual = 0.0, se3.log(uncorrected) * unit
         error = step
         for _ in range(_SECANTS):
             errors[number] = error
@@ -369,13 +376,13 @@ def _check_by_loop(
     if loop is None:
         return none
     poses = refined.start
-    open_end = loop.miss(poses, np.zeros(kernels.ERRORS))
-    if not loop.gap(open_end, open_end).contradicts:
+    uncorrected = loop.miss(poses, np.zeros(kernels.ERRORS))
+    if not loop.gap(uncorrected, uncorrected).contradicts:
         return none
     found: dict[str, tuple[float, Gap]] = {}
     for name in sigmas:
-        error, end = loop.closing_error(poses, _NUMBERS[name], TOLERANCES[name])
-        gap = loop.gap(open_end, end)
+        error, corrected = loop.closing_error(poses, uncorrected, _NUMBERS[name], TOLERANCES[name])
+        gap = loop.gap(uncorrected, corrected)
         if gap.closes and _large(name, error, sigmas[name]):
             found[name] = error, gap
     if not found:

@@ -155,10 +155,10 @@ def _differ(here: Float32, there: Float32) -> Float64:
     apart = np.where(known, apart, 0)
     exposure = apart[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
     depth = np.minimum(np.abs(apart[:, 0]) / _MAX_DEPTH, 1)
-    shade = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
+    albedo = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
     cells = here[0].size
     far = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
     # Albedo is known for smooth surfaces only; other cells are ignored.
-    shade = np.where(known[:, 1], shade, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
+    shade = np.where(known[:, 1], albedo, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
     lit = count[:, 1] > _LIT * cells
     return np.asarray(np.where(lit, 0.5 * (far + shade), far), np.float64)
