@@ -27,11 +27,13 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "recordings")]
 
+import camera_files as cameras  # noqa: E402
+import ros_bags as bags  # noqa: E402
 import test_recordings_fuzz as folders  # noqa: E402
-import test_recordings_fuzz_cameras as cameras  # noqa: E402
-import test_recordings_ros as bags  # noqa: E402
+from damaged_files import damage  # noqa: E402
+from made_cwipc import make_cwipc  # noqa: E402
 
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
@@ -47,6 +49,7 @@ def makers() -> dict[str, tuple[Callable[[Path], None], str | None]]:
         name: (make, None) for name, make in folders.MAKERS.items()
     }
     found |= {name: (make, file) for name, (make, file, _) in cameras.MAKERS.items()}
+    found |= {"cwipc": (make_cwipc, None)}
     if importlib.util.find_spec("rosbags") is not None:
         found |= {"realsense": (make_realsense, "a.bag"), "orbbec": (make_orbbec, "a.bag")}
     return found
@@ -105,7 +108,7 @@ def fuzz(total: int, first: int, work: Path) -> int:
             shutil.copytree(original, copy)
             for _ in range(1 + int(rng.integers(3))):
                 if files := sorted(p for p in copy.rglob("*") if p.is_file()):
-                    folders.damage(files, rng)
+                    damage(files, rng)
             signal.alarm(LIMIT_S)
             try:
                 whole, told = read_through(copy / (file or "."))

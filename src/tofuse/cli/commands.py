@@ -63,14 +63,13 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.errors import InputError
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
-    from tofuse.recordings.open import is_rig_folder
-    from tofuse.recordings.rig import FILE_NAME, read_rig
+    from tofuse.recordings.rig_folder import recordings_of, rig_file_in
 
     options = run_options(arguments)
-    if arguments.rig is None and len(arguments.inputs) == 1 and is_rig_folder(arguments.inputs[0]):
-        folder = Path(arguments.inputs[0])
-        arguments.rig = folder / FILE_NAME
-        arguments.inputs = [str(folder / c.name) for c in read_rig(arguments.rig).cameras]
+    if arguments.rig is None and len(arguments.inputs) == 1:
+        arguments.rig = rig_file_in(arguments.inputs[0])
+        if arguments.rig is not None:
+            arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:
         return _run_rig(arguments, options)
     if arguments.into is not None:

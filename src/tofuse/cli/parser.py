@@ -224,7 +224,7 @@ def _run(commands: Any) -> None:
         "--rig",
         type=Path,
         metavar="FILE",
-        help="a rig.json; each INPUT is one of its cameras, in the same order",
+        help="a rig.json or cameraconfig.json; each INPUT is one of its cameras, in the same order",
     )
     _processing(p)
     p.add_argument(

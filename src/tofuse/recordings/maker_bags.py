@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera
@@ -129,6 +130,11 @@ class BagSource(FileSource):
         except InputError as error:
             self.warnings.append(f"colour is ignored: {error}")
             self.color = None
+
+    @property
+    def T_color_depth(self) -> Float64 | None:
+        """(4, 4) maps points from the depth to the colour camera's frame; None if unknown."""
+        return None if self.color_camera is None else self.color_camera.T_color_depth
 
     def message(self, track: Track, index: int) -> Any:
         """Return an image message of a track."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder
+from tofuse.files.reading import input_error, is_folder, list_folder
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, known, name_of
 from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
-from tofuse.recordings.rig import FILE_NAME, read_rig
+from tofuse.recordings.rig_folder import recordings_of, rig_file_in, rig_from
 from tofuse.recordings.rig_source import RigSource
 from tofuse.recordings.sources import JoinedSource, LimitedSource
 
@@ -55,8 +55,8 @@ def open_recording(
     ----------
     paths
         Files or folders; several are joined in the order given. A folder of native or SR4000
-        recordings is joined in name order; if it contains a rig.json, they are the cameras of a
-        rig, one image of each in turn.
+        recordings is joined in name order; if it contains a rig.json (or a cameraconfig.json of
+        cwipc), its recordings are the cameras of a rig, one image of each in turn.
     format
         Name of a reader, instead of detection.
     camera
@@ -76,8 +76,9 @@ def open_recording(
         raise InputError("no recording was given", remedy="give a path")
     _check_depths(min_depth, max_depth)
     options = ReaderOptions(None if camera is None else Path(camera), topic)
-    if len(paths) == 1 and is_rig_folder(paths[0]):
-        rig = _rig_source(Path(paths[0]), format, options)
+    rig_file = rig_file_in(paths[0]) if len(paths) == 1 else None
+    if rig_file is not None:
+        rig = _rig_source(rig_file, format, options)
         if min_depth is not None or max_depth is not None:
             raise InputError(
                 "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
@@ -99,27 +100,19 @@ def open_recording(
     return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
 
 
-def is_rig_folder(path: str | Path) -> bool:
-    """Whether a path is a folder with a rig.json and a recording of each camera of the rig."""
-    path = Path(path)
-    return is_folder(path) and is_file(path / FILE_NAME)
-
-
 def _rig_source(
-    folder: Path,
+    rig_file: Path,
     format: str | None,  # noqa: A002
     options: ReaderOptions,
 ) -> RigSource:
-    """The recordings in a rig's folder, each in a folder named after its camera."""
-    rig = read_rig(folder / FILE_NAME)
+    """The recordings of a rig's cameras, in the folder of its file."""
     recordings = []
-    for camera in rig.cameras:
-        path = folder / camera.name
+    for name, path in recordings_of(rig_file).items():
         if not path.exists():
             raise InputError(
-                f"has no recording of the camera {camera.name!r}",
-                where=folder,
-                remedy=f"put it into {path}, or remove the camera from {FILE_NAME}",
+                f"has no recording of the camera {name!r}",
+                where=rig_file.parent,
+                remedy=f"put it into {path}, or remove the camera from {rig_file.name}",
             )
         found = _resolve(path, format)
         if len(found) > 1:
@@ -127,7 +120,7 @@ def _rig_source(
         source = found[0].reader.open(found[0].path, options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(found[0].reader)))
-    return RigSource(rig, recordings)
+    return RigSource(rig_from(rig_file, recordings), recordings)
 
 
 @dataclass(frozen=True)

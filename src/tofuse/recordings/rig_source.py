@@ -61,6 +61,10 @@ class RigSource:
             for camera, recording in zip(rig.cameras, recordings, strict=True)
             for warning in recording.warnings
         ]
+        if not any(camera.covariance.any() for camera in rig.cameras[1:]):
+            self.warnings.append(
+                "the rig has no covariances: the accuracy leaves out errors of its cameras' poses"
+            )
         self.metadata: dict[str, Any] = {
             key: value
             for key, value in recordings[0].metadata.items()

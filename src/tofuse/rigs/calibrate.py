@@ -105,35 +105,32 @@ def check(
         If a recording can't be used, or their number differs from that of the cameras.
     """
     with using_threads(threads), threadpool_limits(1):
-        cameras = cameras_of(rig, recordings, format)
+        cameras = cameras_of([c.name for c in rig.cameras], recordings, format)
         found = calibrate_cameras(cameras, recordings, motion, progress or Silent())
     return found, compare(rig, found.rig)
 
 
 def cameras_of(
-    rig: Rig,
+    names: Sequence[str],
     recordings: Sequence[str | Path],
     format: str | None = None,  # noqa: A002
 ) -> list[Camera]:
-    """Open the recordings of a rig's cameras, given in the rig's order.
+    """Open the recordings of a rig's cameras, given in the order of their names.
 
     Raises
     ------
     InputError
         If their number differs from that of the cameras, or one can't be opened.
     """
-    if len(recordings) != len(rig.cameras):
-        names = ", ".join(camera.name for camera in rig.cameras)
+    if len(recordings) != len(names):
         raise InputError(
-            f"has {len(rig.cameras)} cameras ({names}), and {len(recordings)} recordings are given",
+            f"has {len(names)} cameras ({', '.join(names)}), "
+            f"and {len(recordings)} recordings are given",
             where="the rig",
             remedy="give one recording for each, in this order",
         )
     opened = open_cameras(recordings, format)
-    return [
-        replace(camera, name=stated.name)
-        for camera, stated in zip(opened, rig.cameras, strict=True)
-    ]
+    return [replace(camera, name=name) for camera, name in zip(opened, names, strict=True)]
 
 
 def moves(cameras: Sequence[Camera], motion: Motion) -> bool:

@@ -26,7 +26,8 @@ from tofuse.posegraph.refinement import Known, NoRefinement
 from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.rig import Disagreement, Rig, read_rig
+from tofuse.recordings.rig import Disagreement, Rig
+from tofuse.recordings.rig_folder import recordings_of, rig_from
 from tofuse.recordings.rig_source import RigSource
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
@@ -87,11 +88,13 @@ def run_rig(
         If the result can't be written.
     """
     progress = progress or Silent()
-    rig = read_rig(rig_file)
+    names = list(recordings_of(rig_file))
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        cameras = cameras_of(rig, inputs, options.format)
-        source = RigSource(rig, [camera.recording for camera in cameras])
+        cameras = cameras_of(names, inputs, options.format)
+        recordings = [camera.recording for camera in cameras]
+        rig = rig_from(rig_file, recordings)
+        source = RigSource(rig, recordings)
         whole = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(whole, source, options)
         config = resolve(options)
