@@ -14,6 +14,7 @@ import made_ifm
 import made_kinect
 import made_phones
 import made_sens
+import made_tof
 from tofuse.errors import TofuseError
 from tofuse.recordings.open import open_recording
 
@@ -36,6 +37,8 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "hololens2": (made_dumps.make_hololens, None, "hololens2"),
     "kinect2": (made_dumps.make_kinect2, None, "kinect2"),
     "depth16": (made_dumps.make_depth16, None, "depth16"),
+    "arducam": (made_tof.make_arducam, None, "arducam"),
+    "aditof": (made_tof.make_aditof, "a.bin", "aditof"),
 }
 
 

@@ -16,6 +16,7 @@ import made_ifm
 import made_kinect
 import made_phones
 import made_sens
+import made_tof
 from damaged_files import make_native, make_pcd, make_ply, make_slam6d, make_xyz
 from made_recordings import make_7scenes, make_redwood, make_sr4000, make_tum
 from ros_bags import COUNTS, TOPIC, Bag, orbbec, real_sense
@@ -83,6 +84,8 @@ TAKES: dict[str, tuple[str, Callable[[Path], Path], bool]] = {
     "orbbec-bag": ("orbbec-bag", lambda folder: orbbec(folder, (0.0,) * 8), True),
     "kinect2": ("kinect2", inside(made_dumps.make_kinect2), True),
     "depth16": ("depth16", inside(made_dumps.make_depth16), True),
+    "arducam": ("arducam", inside(made_tof.make_arducam), True),
+    "aditof": ("aditof", inside(made_tof.make_aditof, "a.bin"), True),
     "ros": ("ros", ros_counts, True),
     "ros-metres": ("ros", ros_metres, False),
 }

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tofuse.cli import main
 
 import ros_bags
 from camera_files import read_through
@@ -23,6 +22,7 @@ from made_cwipc import (
     make_cwipc,
     off_planes,
 )
+from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.se3 import inverse, transform
 from tofuse.recordings.frames import RangeFrame

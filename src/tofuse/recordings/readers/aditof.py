@@ -1,0 +1,313 @@
+"""Reader of frames saved by Analog Devices' ToF SDK (ADTF3175 and others)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.arrays import Float32, Float64, UInt16
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, input_error, is_file, is_folder
+from tofuse.geometry.cameras import Camera, RayTable
+from tofuse.parts import part
+from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.frames import DepthKind, RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource
+
+HEADER_BYTES = 128
+# Width, height, kind of output, bits of depth, of brightness and of confidence, 11 other bytes,
+# whether points follow, 16 other bytes, monotonic time in s and us, wall clock in s and us.
+_HEADER = struct.Struct("<2H4B11xB16x4Q")
+_SIDES = range(2, 4097)
+_MAX_BITS = 32
+DEPTH_UNIT_M = 0.001
+SENSOR = "Analog Devices (ToF)"
+# Number of frames whose points determine the rays, and degree in either axis of the polynomial of
+# the pixel's position that is fitted to them: it smooths the rounding of the points to whole mm.
+_SAMPLES = 16
+_DEGREE = 7
+_FITTED = 20_000  # pixels
+_ROUNDING_MM = 0.5  # the largest error of a coordinate from rounding
+_REMEDY = "give the lens by --camera camera.json, or save frames with XYZ"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A frame's metadata: its size, the bytes per pixel of its channels (0: none), and its time.
+
+    The channels follow the metadata in this order: depth (2 bytes), active brightness, confidence,
+    points. The time is in s; 0 if it is not recorded.
+    """
+
+    width: int
+    height: int
+    brightness: int
+    confidence: int
+    points: int
+    time: float
+
+    @property
+    def length(self) -> int:
+        """Bytes of the frame, including the metadata."""
+        channels = 2 + self.brightness + self.confidence + self.points
+        return HEADER_BYTES + channels * self.width * self.height
+
+    @classmethod
+    def of(cls, data: bytes) -> Layout | None:
+        """Read the metadata; None if there are none."""
+        if len(data) < HEADER_BYTES:
+            return None
+        width, height, _, depth, brightness, confidence, points, *clocks = _HEADER.unpack_from(data)
+        good = width in _SIDES and height in _SIDES and 0 < depth <= 16 and points in (0, 1)
+        if not good or max(brightness, confidence) > _MAX_BITS:
+            return None
+        times = [s + us / 1e6 for s, us in (clocks[2:], clocks[:2]) if 0 < s < 1 << 40]
+        return cls(
+            width,
+            height,
+            2 * (brightness > 0),
+            4 * (confidence > 0),
+            6 * points,
+            times[0] if times else 0.0,
+        )
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a frame is stored."""
+
+    path: Path
+    offset: int
+    layout: Layout
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """The channels (H, W) of a frame, and its points (H, W, 3) in mm; None if missing."""
+
+    depth: UInt16
+    brightness: UInt16 | None
+    points: NDArray[np.int16] | None
+
+
+@part("reader", "aditof", label="experimental")
+@dataclass(frozen=True)
+class AdiTof:
+    """A .bin file of frames of Analog Devices' ToF SDK, or a folder of them."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            files = _files(path)
+            places, whole = _places(files[0]) if files else ([], False)
+        except InputError:
+            return None
+        if len(places) > 1 or (places and whole):
+            return Sniff(1.0, "frames of Analog Devices' ToF SDK")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> AdiTofSource:
+        """See `Reader.open`."""
+        return AdiTofSource(path, options)
+
+
+class AdiTofSource(FileSource):
+    """Radial range in mm with active brightness; the rays are those of the stored points."""
+
+    concurrent = True
+
+    def __init__(self, path: Path, options: ReaderOptions) -> None:
+        self.places: list[_Place] = []
+        cut = []
+        for file in _files(path):
+            places, whole = _places(file)
+            self.places += places
+            cut += [] if whole else [file]
+        if not self.places:
+            raise InputError(
+                "contains no whole frame of Analog Devices' ToF SDK",
+                where=path,
+                remedy="give a .bin file that data_collect or FrameHandler saved",
+            )
+        first = self.places[0].layout
+        self.size = first.width, first.height
+        self.kind: DepthKind = "range"
+        self.unit, sensor, rate = DEPTH_UNIT_M, SENSOR, 1.0
+        self.camera: Camera
+        if options.camera is not None:
+            about, self.camera = load_camera(options.camera, self.size)
+            self.kind, self.unit = about.depth_kind, about.depth_unit_m
+            sensor, rate = about.sensor or sensor, about.frame_rate_hz or rate
+        else:
+            self.camera = self._own_camera(path)
+        times = np.array([place.layout.time for place in self.places])
+        super().__init__(times if times.all() else np.arange(len(times)) / rate)
+        self.metadata |= {
+            "sensor": sensor,
+            "depth_kind": self.kind,
+            "depth_unit_m": self.unit,
+            "amplitude_kind": "ir",
+        }
+        self.warnings += [f"{file} is cut off or damaged: its end is left out" for file in cut]
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        images = self._images(index)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth_from_counts(images.depth, self.unit),
+            self.kind,
+            None if images.brightness is None else images.brightness.astype(np.float32),
+            amplitude_kind="ir",
+        )
+
+    def _images(self, index: int) -> _Images:
+        place = self.places[index]
+        layout = place.layout
+        if (layout.width, layout.height) != self.size:
+            raise InputError(
+                f"is {layout.width} x {layout.height} pixels, the first frame "
+                f"{self.size[0]} x {self.size[1]}",
+                where=f"{place.path}: frame {index}",
+                remedy="give frames of one mode",
+            )
+        try:
+            with place.path.open("rb") as file:
+                file.seek(place.offset + HEADER_BYTES)
+                data = file.read(layout.length - HEADER_BYTES)
+        except OSError as error:
+            raise input_error(error, place.path) from error
+        if len(data) < layout.length - HEADER_BYTES:
+            raise InputError("is cut off", where=f"{place.path}: frame {index}")
+        shape, count = (layout.height, layout.width), layout.width * layout.height
+        at = 2 * count
+        depth = np.frombuffer(data, "<u2", count).reshape(shape)
+        brightness = points = None
+        if layout.brightness:
+            brightness = np.frombuffer(data, "<u2", count, at).reshape(shape)
+        if layout.points:
+            at += (layout.brightness + layout.confidence) * count
+            points = np.frombuffer(data, "<i2", 3 * count, at).reshape(*shape, 3)
+        return _Images(depth, brightness, points)
+
+    def _own_camera(self, path: Path) -> RayTable:
+        """The camera of the points in evenly spaced frames."""
+        samples = []
+        for k in np.unique(np.linspace(0, len(self.places) - 1, _SAMPLES).round()).astype(int):
+            try:
+                images = self._images(int(k))
+            except InputError:
+                continue  # reported when it is read
+            if images.points is not None:
+                samples.append((images.depth.astype(float), images.points.astype(float)))
+        if not samples:
+            raise InputError("has no points (XYZ), and so no lens", where=path, remedy=_REMEDY)
+        rays = _rays(samples)
+        if rays is None:
+            raise InputError(
+                "has points (XYZ) that are not at the depth along the rays of a camera",
+                where=path,
+                remedy=_REMEDY,
+            )
+        try:
+            return RayTable(rays)
+        except InputError as error:
+            raise InputError(error.problem, where=f"{path}: XYZ", remedy=_REMEDY) from error
+
+
+def _files(path: Path) -> list[Path]:
+    if is_folder(path):
+        return [file for file in files_with(path, ".bin") if is_file(file)]
+    return [path] if is_file(path) and path.suffix.lower() == ".bin" else []
+
+
+def _places(path: Path) -> tuple[list[_Place], bool]:
+    """The whole frames of a file, and whether it contains nothing else."""
+    places: list[_Place] = []
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            at = 0
+            while layout := _layout_at(file, at, size):
+                places.append(_Place(path, at, layout))
+                at += layout.length
+    except OSError as error:
+        raise input_error(error, path) from error
+    return places, at == size
+
+
+def _layout_at(file: BinaryIO, at: int, size: int) -> Layout | None:
+    """The layout of the frame at an offset of a file of `size` bytes; None if it is not whole.
+
+    SDKs before 6 store points without stating it: whether they do follows from where the next frame
+    begins.
+    """
+
+    def ends(layout: Layout) -> bool:
+        file.seek(at + layout.length)
+        after = Layout.of(file.read(HEADER_BYTES))
+        same = after is not None and (after.width, after.height) == (layout.width, layout.height)
+        return same or at + layout.length == size
+
+    file.seek(at)
+    layout = Layout.of(file.read(HEADER_BYTES))
+    if layout is None:
+        return None
+    with_points = replace(layout, points=6)
+    if not layout.points and ends(with_points) and not ends(layout):
+        layout = with_points
+    return layout if at + layout.length <= size else None
+
+
+def _rays(samples: Sequence[tuple[Float64, Float64]]) -> Float32 | None:
+    """Rays (H, W, 2) of the pixels with points in samples of depth (H, W) and points (H, W, 3), mm.
+
+    None if they are not those of the points, within the rounding to whole mm.
+    """
+    shape = samples[0][0].shape
+    weight, slopes = np.zeros(shape), np.zeros((*shape, 2))
+    masks = []
+    for depth, points in samples:
+        measured = (depth > 0) & (points[..., 2] > 0)
+        off = np.abs(np.linalg.norm(points, axis=-1) - depth)
+        consistent = measured & (off <= _ROUNDING_MM * np.sqrt(3))
+        if consistent.sum() < 0.5 * measured.sum():
+            return None
+        masks.append(consistent)
+        z = np.where(consistent, points[..., 2], 0.0)
+        weight += z**2
+        slopes += points[..., :2] * z[..., None]
+    known = weight > 0
+    row, column = np.nonzero(known)
+    few = slice(None, None, 1 + len(row) // _FITTED)
+    row, column = row[few], column[few]
+    y, x = (np.linspace(-1, 1, side) for side in shape)
+    terms = np.polynomial.legendre.legvander2d(y[row], x[column], [_DEGREE, _DEGREE])
+    if len(row) < 4 * terms.shape[-1]:
+        return None
+    root = np.sqrt(weight[row, column])[:, None]
+    fit = np.linalg.lstsq(root * terms, slopes[row, column] / root, rcond=None)[0]
+    coefficients = fit.reshape(_DEGREE + 1, _DEGREE + 1, 2)
+    rays = np.moveaxis(np.polynomial.legendre.leggrid2d(y, x, coefficients), 0, -1)
+    rays[~known] = np.nan
+    directions = np.concatenate([rays, np.ones((*shape, 1))], axis=-1)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    off = [
+        (points - directions * depth[..., None])[mask]
+        for (depth, points), mask in zip(samples, masks, strict=True)
+    ]
+    if np.sqrt(np.mean(np.concatenate(off) ** 2)) > _ROUNDING_MM:
+        return None
+    return rays.astype(np.float32)

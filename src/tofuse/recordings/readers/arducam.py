@@ -1,0 +1,149 @@
+"""Reader of depth saved by the examples of Arducam's ToF camera."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.arrays import Float32, UInt8
+from tofuse.errors import InputError
+from tofuse.files.reading import files_named, is_file, read_bytes
+from tofuse.parts import part
+from tofuse.recordings.camera_file import CameraFile, load_camera
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import FARTHEST_M, FileSource
+
+# Width and height in pixels, and the time at which the file was written in ms.
+_NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
+CONFIDENCE_MAX = 255.0
+
+
+@part("reader", "arducam", label="experimental")
+@dataclass(frozen=True)
+class Arducam:
+    """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        images = _images(path, "depth")
+        if not images:
+            return None
+        saw = f"{len(images)} depth images of Arducam's examples"
+        if is_file(path / "camera.json"):
+            return Sniff(1.0, f"{saw} and camera.json")
+        settle = "give --format arducam with --camera: lens and unit are not in such files"
+        return Sniff(UNSURE, saw, settle)
+
+    def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
+        """See `Reader.open`."""
+        if not _images(path, "depth"):
+            raise InputError(
+                "has no depth_*_f32_*.raw",
+                where=path,
+                remedy="save depth, not the sensor's raw phases",
+            )
+        camera = options.camera or path / "camera.json"
+        if not is_file(camera):
+            raise InputError(
+                "is missing: such files contain neither lens nor unit",
+                where=camera,
+                remedy="give a camera.json by --camera",
+            )
+        return ArducamSource(path, camera)
+
+
+@dataclass(frozen=True)
+class _Image:
+    path: Path
+    size: tuple[int, int]
+    time_ms: int
+
+
+class ArducamSource(FileSource):
+    """Depth, each with the confidence that was saved next, before the next depth."""
+
+    concurrent = True
+
+    def __init__(self, path: Path, camera: Path) -> None:
+        self.description: CameraFile
+        self.description, self.camera = load_camera(camera)
+        self.depth = _images(path, "depth")
+        super().__init__(np.array([image.time_ms for image in self.depth]) / 1000)
+        self.confidence = _next(self.depth, _images(path, "confidence"))
+        self.metadata |= {
+            "depth_kind": self.description.depth_kind,
+            "depth_unit_m": self.description.depth_unit_m,
+            "confidence_max": CONFIDENCE_MAX,
+        }
+        if self.description.sensor is not None:
+            self.metadata["sensor"] = self.description.sensor
+        without = sum(image is None for image in self.confidence)
+        if without > 0:
+            self.warnings.append(f"{without} of {len(self.depth)} frames have no confidence")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        values = self._floats(self.depth[index])
+        with np.errstate(over="ignore"):
+            depth = values * np.float32(self.description.depth_unit_m)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            np.where((depth > 0) & (depth < FARTHEST_M), depth, np.float32(0)),
+            self.description.depth_kind,
+            confidence_image=self._confidence(self.confidence[index]),
+        )
+
+    def _confidence(self, image: _Image | None) -> UInt8 | None:
+        if image is None:
+            return None
+        values = np.nan_to_num(self._floats(image), nan=0.0)
+        return values.clip(0, CONFIDENCE_MAX).astype(np.uint8)
+
+    def _floats(self, image: _Image) -> Float32:
+        """(H, W) values of a file."""
+        size = (self.camera.width, self.camera.height)
+        if image.size != size:
+            raise InputError(
+                f"is of {image.size[0]} x {image.size[1]} pixels, its camera {size[0]} x {size[1]}",
+                where=image.path,
+                remedy="give the camera of these images by --camera",
+            )
+        data = read_bytes(image.path, limit=1 << 26)
+        if len(data) != 4 * size[0] * size[1]:
+            raise InputError(
+                f"has {len(data)} bytes, not 4 for each of {size[0]} x {size[1]} pixels",
+                where=image.path,
+                remedy="save it again",
+            )
+        return np.frombuffer(data, "<f4").reshape(size[1], size[0]).astype(np.float32)
+
+
+def _images(path: Path, kind: str) -> list[_Image]:
+    """The images of a kind in a folder, in the order of time."""
+    found = []
+    for file in files_named(path, _NAME.fullmatch):
+        match = _NAME.fullmatch(file.name)
+        assert match is not None
+        if match[1] == kind:
+            found.append(_Image(file, (int(match[2]), int(match[3])), int(match[4])))
+    return sorted(found, key=lambda image: (image.time_ms, image.path.name))
+
+
+def _next(depth: list[_Image], others: list[_Image]) -> list[_Image | None]:
+    """The first of the others that is not older than each depth image, but than the next one."""
+    times = np.array([image.time_ms for image in depth])
+    found: list[_Image | None] = [None] * len(depth)
+    for image in reversed(others):
+        k = int(np.searchsorted(times, image.time_ms, side="right")) - 1
+        if k >= 0:
+            found[k] = image
+    return found

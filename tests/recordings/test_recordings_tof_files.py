@@ -1,0 +1,198 @@
+"""Files of Arducam's and Analog Devices' cameras, made by their published layouts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import made_tof
+from made_phones import DEPTH, HEIGHT, WIDTH
+from made_tof import ADI_LENS, adi_frame
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.geometry.cameras import Rational
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import open_recording
+
+
+def test_arducam(tmp_path: Path) -> None:
+    made_tof.make_arducam(tmp_path / "scan")
+    recording = open_recording(tmp_path / "scan")
+    assert recording.format == "arducam"
+    np.testing.assert_allclose(recording.timestamps, 1.7e9 + np.arange(3) / 10)
+    assert recording.metadata["confidence_max"] == 255
+    for k, frame in enumerate(recording):
+        assert isinstance(frame, RangeFrame)
+        expected = DEPTH[k].copy()
+        expected[0, :3] = 0
+        np.testing.assert_allclose(frame.depth, expected, atol=1e-6)
+        assert frame.confidence_image is not None
+        assert frame.confidence_image[1, :3].tolist() == [0, 255, 0]
+        assert (frame.confidence_image[2:] == 40 + k).all()
+    assert recording.warnings == []
+
+
+def test_arducam_in_metres_along_the_ray(tmp_path: Path) -> None:
+    """Unit and kind are those of camera.json: earlier SDKs gave metres."""
+    made_tof.make_arducam(tmp_path / "scan")
+    path = tmp_path / "scan" / "camera.json"
+    about = json.loads(path.read_text()) | {"depth_unit_m": 1.0, "depth_kind": "range"}
+    path.write_text(json.dumps(about))
+    frame = open_recording(tmp_path / "scan")[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.depth_kind == "range"
+    np.testing.assert_allclose(frame.depth[2:], 1000 * DEPTH[0][2:], rtol=1e-6)
+
+
+def test_arducam_that_lacks_something(tmp_path: Path) -> None:
+    folder = tmp_path / "scan"
+    made_tof.make_arducam(folder)
+    depth = sorted(folder.glob("depth_*.raw"))
+    depth[0].write_bytes(depth[0].read_bytes()[:-1])
+    confidence = sorted(folder.glob("confidence_*.raw"))
+    confidence[1].unlink()
+    confidence[2].write_bytes(b"")
+    other = f"depth_{WIDTH + 1}_{HEIGHT}_f32_1700000009000.raw"
+    (folder / other).write_bytes(bytes(4 * (WIDTH + 1) * HEIGHT))
+    recording = open_recording(folder)
+    items = list(recording.read_all())
+    for k, said in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is of 33 x 24")):
+        assert isinstance(items[k], UnreadableFrameError)
+        assert said in str(items[k])
+    assert isinstance(items[1], RangeFrame)
+    assert items[1].confidence_image is None
+    assert recording.warnings == ["2 of 4 frames have no confidence"]
+
+
+def test_arducam_without_a_camera(tmp_path: Path) -> None:
+    made_tof.make_arducam(tmp_path / "scan")
+    camera = tmp_path / "camera.json"
+    shutil.move(tmp_path / "scan" / "camera.json", camera)
+    with pytest.raises(InputError, match="give --format arducam with --camera: lens and unit"):
+        open_recording(tmp_path / "scan")
+    with pytest.raises(InputError, match="contain neither lens nor unit"):
+        open_recording(tmp_path / "scan", format="arducam")
+    assert len(open_recording(tmp_path / "scan", format="arducam", camera=camera)) == 3
+
+
+def test_arducam_of_raw_phases(tmp_path: Path) -> None:
+    (tmp_path / "raw_240_1800_u16_1700000000000.raw").write_bytes(bytes(100))
+    with pytest.raises(InputError, match="not the sensor's raw phases"):
+        open_recording(tmp_path, format="arducam")
+
+
+def test_arducam_links(tmp_path: Path) -> None:
+    folder = tmp_path / "scan"
+    made_tof.make_arducam(folder)
+    first = sorted(folder.glob("depth_*.raw"))[0]
+    first.rename(tmp_path / "elsewhere.raw")
+    first.symlink_to(tmp_path / "elsewhere.raw")
+    nowhere = folder / f"depth_{WIDTH}_{HEIGHT}_f32_1.raw"
+    nowhere.symlink_to("nothing")
+    assert len(open_recording(folder)) == 3
+
+
+def check_adi(frame: object, k: int) -> None:
+    assert isinstance(frame, RangeFrame)
+    assert frame.depth_kind == "range"
+    assert not frame.valid[2:5, 2:9].any()
+    assert frame.valid.sum() == 64 * 48 - 21
+    # The wall of `adi_frame`, within the rounding to mm.
+    x, y, z = frame.points.T
+    wall = (z + 0.3 * x + 0.1 * y - (1.8 + 0.1 * k)) / np.linalg.norm((1, 0.3, 0.1))
+    assert np.abs(wall).max() < 0.001
+    assert frame.amplitude_image is not None
+    ranges = np.rint(1000 * frame.depth)
+    np.testing.assert_array_equal(frame.amplitude_image, ranges // 3)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"confidence": False},  # the megapixel modes
+        {"stated": False},  # SDKs before 6
+        {"stated": False, "confidence": False},
+    ],
+)
+def test_aditof(tmp_path: Path, options: dict[str, bool]) -> None:
+    path = tmp_path / "frame2025_01_01_00_00_00_0.bin"
+    path.write_bytes(b"".join(adi_frame(k, **options) for k in range(3)))
+    for given in (path, tmp_path):
+        recording = open_recording(given)
+        assert (recording.format, len(recording)) == ("aditof", 3)
+        np.testing.assert_allclose(recording.timestamps, 1.7e9 + 0.25 * np.arange(3))
+        for k, frame in enumerate(recording):
+            check_adi(frame, k)
+    rays = recording[0].camera.rays()
+    known = np.isfinite(rays).all(-1)
+    assert not known[2:5, 2:9].any()
+    off = np.abs(rays - ADI_LENS.rays())[known] * (ADI_LENS.fx, ADI_LENS.fy)
+    assert np.sqrt((off**2).mean()) < 0.01  # pixels; rounding alone would be 0.02
+    assert off.max() < 0.05
+    assert recording.warnings == []
+
+
+def test_aditof_one_frame_a_file(tmp_path: Path) -> None:
+    for k in (0, 1, 10):
+        (tmp_path / f"frame2025_01_01_00_00_00_{k}.bin").write_bytes(adi_frame(k, clock=False))
+    recording = open_recording(tmp_path)
+    np.testing.assert_array_equal(recording.timestamps, [0, 1, 2])
+    for k, frame in zip((0, 1, 10), recording, strict=True):
+        check_adi(frame, k)
+
+
+def test_aditof_without_points(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"".join(adi_frame(k, points=False) for k in range(3)))
+    with pytest.raises(InputError, match=r"has no points .* give the lens by --camera") as error:
+        open_recording(path)
+    assert len(str(error.value).splitlines()) == 1
+    about = {"schema": 1, "model": "rational", "width": 64, "height": 48, "depth_unit_m": 0.001}
+    about |= {name: getattr(ADI_LENS, name) for name in ("fx", "fy", "cx", "cy")}
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    about |= {"distortion": [getattr(ADI_LENS, name) for name in names], "depth_kind": "range"}
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps(about | {"frame_rate_hz": 10}))
+    for k, frame in enumerate(open_recording(path, camera=camera)):
+        check_adi(frame, k)
+
+
+def test_aditof_whose_points_are_elsewhere(tmp_path: Path) -> None:
+    """Points of another lens are 4 % longer than the depth, so one of both is misread."""
+    data = bytearray(adi_frame(0))
+    at = len(data) - 6 * 64 * 48
+    data[at:] = (np.frombuffer(bytes(data[at:]), "<i2") * 1.04).astype("<i2").tobytes()
+    (tmp_path / "a.bin").write_bytes(data)
+    with pytest.raises(InputError, match="not at the depth along the rays"):
+        open_recording(tmp_path / "a.bin")
+
+
+def test_aditof_cut_off_and_of_another_size(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    small = Rational(32, 24, 23.0, 23.0, 15.5, 11.5)
+    frames = [adi_frame(0), adi_frame(1), adi_frame(2, lens=small), adi_frame(3)]
+    path.write_bytes(b"".join(frames)[:-5])
+    recording = open_recording(path)
+    items = list(recording.read_all())
+    assert len(items) == 3
+    assert isinstance(items[2], UnreadableFrameError)
+    assert "is 32 x 24 pixels, the first frame 64 x 48" in str(items[2])
+    assert recording.warnings == [f"{path} is cut off or damaged: its end is left out"]
+    for cut in (0, 1, 127, 128, 5000):
+        path.write_bytes(frames[0][:cut])
+        for name in (None, "aditof"):
+            with pytest.raises(InputError):
+                open_recording(path, format=name)
+
+
+def test_other_bin_files_are_not_taken_for_it(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    path = tmp_path / "a.bin"
+    for size in (100, 128, 10_000, 1 << 20):
+        path.write_bytes(rng.bytes(size))
+        with pytest.raises(InputError, match="not a recording of a known format"):
+            open_recording(path)
