@@ -8,8 +8,8 @@ import pytest
 from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.posegraph.calibration_check import Gap, check_calibration, longest_loop
-from tofuse.posegraph.joint_alignment import Priors, Refined, refine, response
+from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
+from tofuse.posegraph.joint_alignment import Priors, Refined, align_pairs, refine, response
 from tofuse.posegraph.view_store import KeptView
 
 
@@ -83,6 +83,35 @@ def test_what_does_not_close_a_loop_is_no_cure():
     assert Gap(0, 9, (0.047, 0.18), (0.063, 0.046), 2.5).closes
     assert not Gap(0, 9, (0.047, 0.18), (0.063, 0.16), 2.5).closes
     assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
+
+
+def test_an_error_that_only_closes_a_loop_is_none(monkeypatch):
+    """Drift of odometry leaves a gap, too: views whose camera is right don't keep the error."""
+    truth = path(24)[:8]
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    refined = refine(views, truth, OPTIONS)
+    drift = np.zeros(kernels.ERRORS)
+    drift[kernels.FOCAL] = -0.06
+
+    def drifting(views, pairs, T_i_j, options, errors):
+        right = align_pairs(views, pairs, T_i_j, options, errors)
+        drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
+        return np.concatenate([drifted[:-1], right[-1:]])  # the last one closes the loop
+
+    monkeypatch.setattr("tofuse.posegraph.calibration_check.align_pairs", drifting)
+    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
+    monkeypatch.setattr(_Loop, "kept_by_views", lambda *args: args[-1])
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert found.alarm
+    assert found.best == "focal"
+
+
+@pytest.mark.parametrize("true", [0.0, 0.06])
+def test_views_keep_a_true_error_of_a_loop_only(true):
+    views, refined = kept(true)
+    loop = _Loop.longest(views, refined, OPTIONS)
+    assert loop is not None
+    assert loop.kept_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
 
 
 def test_the_longest_loop_goes_by_neighbours_alone():

@@ -297,15 +297,39 @@ class _Loop:
         errors
             (ERRORS,) assumed errors of the camera.
         """
+        return self.chained(poses, errors)[0]
+
+    def chained(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
+        """Return `miss`, and the poses (j - i + 1, 4, 4) of the chain relative to its first."""
         i, j = self.i, self.j
         chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
         pairs = np.concatenate([chain, [[i, j]]])
         T = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
         T = align_pairs(self.views, pairs, T, self.options, errors)
-        chained = np.eye(4)
+        chained = [np.eye(4)]
         for step in T[:-1]:
-            chained = chained @ step
-        return np.asarray(se3.inverse(T[-1]) @ chained, np.float64)
+            chained.append(chained[-1] @ step)
+        return np.asarray(se3.inverse(T[-1]) @ chained[-1], np.float64), np.array(chained)
+
+    def kept_by_views(self, poses: Float64, number: int, error: float) -> float:
+        """Return an error of the camera as all views of the loop estimate it, starting from one.
+
+        They keep a true error, also if their residuals at a wrong one are small. One that only
+        closes the gap is far from what they measure.
+
+        Parameters
+        ----------
+        poses
+            As for `miss`.
+        number, error
+            Which error, and its initial value.
+        """
+        errors = np.zeros(kernels.ERRORS)
+        errors[number] = error
+        start = self.chained(poses, errors)[1]
+        options = replace(self.options, rounds=_ROUNDS)
+        views = self.views[self.i : self.j + 1]
+        return float(refine(views, start, options, calibrate=[number], errors=errors).errors[number])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""
@@ -360,7 +384,8 @@ def _check_by_loop(
     """Estimate the errors of the camera from the drift over the longest loop alone.
 
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
-    residuals show nothing. Pairwise alignments from the poses before it don't depend on it.
+    residuals show nothing. Pairwise alignments from the poses before it don't depend on it. But any
+    drift leaves a gap that some error of the camera nearly closes: the views must keep the error.
 
     Parameters
     ----------
@@ -383,7 +408,9 @@ def _check_by_loop(
     for name in sigmas:
         error, corrected = loop.closing_error(poses, uncorrected, _NUMBERS[name], TOLERANCES[name])
         gap = loop.gap(uncorrected, corrected)
-        if gap.closes and _large(name, error, sigmas[name]):
+        if not (gap.closes and _large(name, error, sigmas[name])):
+            continue
+        if _large(name, loop.kept_by_views(poses, _NUMBERS[name], error), sigmas[name]):
             found[name] = error, gap
     if not found:
         return none

@@ -227,6 +227,7 @@ def refine(
     options: RefineOptions,
     *,
     calibrate: Sequence[int] = (),
+    errors: Float64 | None = None,
     priors: Priors | None = None,
     pairs: Intp | None = None,
     bodies: Bodies | None = None,
@@ -243,6 +244,8 @@ def refine(
         See `RefineOptions`.
     calibrate
         Errors of the camera to estimate as well, by their number in `kernels.refinement`.
+    errors
+        (ERRORS,) their initial values; by default zero.
     priors
         Measurements by other sensors.
     pairs
@@ -255,7 +258,7 @@ def refine(
     if bodies is not None:
         start = poses = bodies.views(bodies.poses(poses))
     priors = priors or Priors.none()
-    errors = np.zeros(kernels.ERRORS)
+    errors = np.zeros(kernels.ERRORS) if errors is None else errors
     known = np.ones(kernels.ERRORS, np.int64)
     known[list(calibrate)] = 0
     moved: list[float] = []
