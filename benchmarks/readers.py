@@ -29,12 +29,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "recordings")]
 
+import test_recordings_fuzz as folders  # noqa: E402
+
 import camera_files as cameras  # noqa: E402
 import ros_bags as bags  # noqa: E402
-import test_recordings_fuzz as folders  # noqa: E402
 from damaged_files import damage  # noqa: E402
 from made_cwipc import make_cwipc  # noqa: E402
-
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
 from tofuse.recordings.frames import RangeFrame  # noqa: E402

@@ -1,0 +1,125 @@
+"""How far a surface moves when it is decimated, by vertex clustering and by collapsing edges.
+
+Each result folder's `mesh.ply` is reduced to the same number of triangles by `Mesh.decimated`, and,
+where they are installed, by fast-simplification (quadric edge collapse, with the aggressiveness at
+which its error is lowest) and by Open3D (the same, with a priority queue). Printed are the mean,
+99th percentile and maximum of the distances in mm between 400,000 points of one surface and the
+other, both ways; the share of the area that faces away from the normal of the nearest vertex of the
+whole surface; and the processor time.
+
+    pip install tofuse[bench] fast-simplification
+    tofuse demo --out room
+    python benchmarks/decimation.py room [another result...] [--faces 60000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.arrays import Float32, Float64
+from tofuse.evaluation.surface import Surface, distances
+from tofuse.files.ply import read_ply
+from tofuse.fusion.mesh import Mesh
+from tofuse.kernels.kdtree import KdTree
+
+_AGGRESSIVENESS = 3
+_POINTS = 400_000
+_SAMPLES = 4_000_000  # of a surface to which distances are measured
+
+Shape = tuple[NDArray[np.floating], NDArray[np.integer]]  # vertices and faces
+
+
+def clustering(mesh: Mesh, faces: int) -> Shape:
+    small = mesh.decimated(faces)
+    return small.vertices, small.faces
+
+
+def fast_simplification(mesh: Mesh, faces: int) -> Shape:
+    from fast_simplification import simplify
+
+    vertices, triangles = simplify(
+        mesh.vertices, mesh.faces, target_count=faces, agg=_AGGRESSIVENESS
+    )
+    return vertices, triangles
+
+
+def open3d(mesh: Mesh, faces: int) -> Shape:
+    small = mesh.to_open3d().simplify_quadric_decimation(faces)
+    return np.asarray(small.vertices), np.asarray(small.triangles)
+
+
+METHODS: dict[str, Callable[[Mesh, int], Shape]] = {
+    "clustering": clustering,
+    "fast_simplification": fast_simplification,
+    "open3d": open3d,
+}
+
+
+def opened(folder: Path) -> Mesh:
+    """The surface of a result."""
+    ply = read_ply(folder / "mesh.ply")
+    assert ply.faces is not None
+    assert ply.normals is not None
+    unknown = np.zeros(len(ply))
+    return Mesh(
+        ply.points.astype(np.float32), ply.faces, ply.normals, ply.color,
+        unknown.astype(np.float32), unknown.astype(np.int32), np.zeros(3),
+    )  # fmt: skip
+
+
+def turned_away(mesh: Mesh, shape: Shape) -> float:
+    """Share of the area of a shape that faces away from the surface."""
+    corners = shape[0][shape[1]].astype(float)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    nearest, _ = KdTree(mesh.vertices).neighbours(corners.mean(1).astype(np.float32), 1)
+    away = np.einsum("ni,ni->n", normals, mesh.normals[nearest[:, 0]]) < 0
+    return float(area[away].sum() / area.sum())
+
+
+def words(off: Float64 | Float32) -> str:
+    """Mean, 99th percentile and maximum in mm."""
+    mm = 1000 * off
+    return f"{mm.mean():.2f} / {np.percentile(mm, 99):.1f} / {mm.max():.0f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("results", nargs="+", type=Path)
+    parser.add_argument("--faces", type=int, default=60_000)
+    given = parser.parse_args()
+    for folder in given.results:
+        mesh = opened(folder)
+        whole = Surface(mesh.vertices.astype(float), mesh.faces)
+        print(f"{folder.name}: {len(mesh.faces)} triangles, reduced to {given.faces}\n")
+        print("| method | triangles | whole to reduced | reduced to whole | turned away | CPU s |")
+        print("|---|---|---|---|---|---|")
+        for name, reduce in METHODS.items():
+            if name != "clustering" and importlib.util.find_spec(name) is None:
+                print(f"| {name} | not installed | | | | |")
+                continue
+            if name == "clustering":
+                reduce(mesh, given.faces)  # compiles
+            start = time.process_time()
+            shape = reduce(mesh, given.faces)
+            seconds = time.process_time() - start
+            reduced = Surface(shape[0].astype(float), shape[1])
+            there = distances(whole.samples(_POINTS)[0], reduced, _SAMPLES)
+            back = distances(reduced.samples(_POINTS)[0], whole, _SAMPLES)
+            print(
+                f"| {name} | {len(shape[1])} | {words(there)} | {words(back)} "
+                f"| {turned_away(mesh, shape):.1%} | {seconds:.1f} |",
+                flush=True,
+            )
+        print()
+
+
+if __name__ == "__main__":
+    main()
