@@ -180,6 +180,23 @@ def test_a_recording_that_was_cut_off_keeps_its_whole_frames(tmp_path: Path) -> 
     assert [isinstance(item, UnreadableFrameError) for item in items] == [False, False, True]
 
 
+def test_a_header_that_ends_after_its_parent_is_cut_off(tmp_path: Path) -> None:
+    """The last byte of a tag is the beginning of an element whose size is in the next tag."""
+    depth = made.small_counts(2)
+    made.make_mkv(tmp_path / "a.mkv", depth)
+    data = (tmp_path / "a.mkv").read_bytes()
+    mode = made.tag("K4A_DEPTH_MODE", "NFOV_2X2BINNED")
+    name = bytes.fromhex("4487")  # of the tag's value
+    at = data.index(mode) + mode.rindex(name)
+    size = int.from_bytes(data[at + 2 : at + 10], "big") & 0xFFFFFF
+    broken = data[: at + 10 + size - 1] + b"\xae" + data[at + 10 + size :]
+    broken = broken[: at + 2] + (1 << 56 | size - 1).to_bytes(8, "big") + broken[at + 10 :]
+    (tmp_path / "a.mkv").write_bytes(broken)
+    recording = open_recording(tmp_path / "a.mkv")
+    np.testing.assert_allclose(recording[0].depth, depth[0] / 1000, atol=1e-6)
+    assert any("is cut off" in line for line in recording.warnings)
+
+
 def test_real_capture(shared_data: Path) -> None:
     folder = shared_data / "azure_kinect_mkv"
     recording = open_recording(folder)

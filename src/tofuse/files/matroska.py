@@ -137,6 +137,9 @@ class Matroska:
                 self.complete = False
                 return
             begin = at + second
+            if begin > end:  # a header that doesn't fit into its parent
+                self.complete = False
+                return
             sized = size != (1 << 7 * (second - first)) - 1
             stop = begin + size if sized else end
             if stop > end:
