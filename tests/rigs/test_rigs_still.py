@@ -16,6 +16,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.inputs import Camera
+from tofuse.rigs.still import minimum_cost_lag
 
 STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)]
 INTERVAL_S = 0.1
@@ -72,3 +73,34 @@ def test_clocks_are_aligned_by_what_moves_and_all_instants_count() -> None:
 def test_clocks_that_the_motion_does_not_align_are_refused() -> None:
     with pytest.raises(InputError, match="no motion that both see determines the offset"):
         calibrated(100.0, sideways)
+
+
+def costs_at(lags: np.ndarray, noise: float, motion: Callable[[np.ndarray], np.ndarray], seed: int):
+    """Distances between surfaces at lags, of ten instants with different fractions that move."""
+    rng = np.random.default_rng(seed)
+    still, moves = rng.normal(5, 0.5, (10, 1)), rng.uniform(0.3, 1.7, (10, 1))
+    return still + moves * motion(lags / INTERVAL_S) + rng.normal(0, noise, (10, len(lags)))
+
+
+LAGS = np.arange(-6, 7) * INTERVAL_S
+
+
+def test_noise_makes_no_lag() -> None:
+    found = [minimum_cost_lag(LAGS, costs_at(LAGS, 0.3, np.zeros_like, s)) for s in range(200)]
+    assert sum(lag is not None for lag in found) <= 1
+
+
+def test_the_lag_of_minimum_distance_is_interpolated() -> None:
+    for seed in range(20):
+        costs = costs_at(LAGS, 0.05, lambda x: np.minimum((x - 1.3) ** 2, 9), seed)
+        assert abs(minimum_cost_lag(LAGS, costs) - 1.3 * INTERVAL_S) < 0.1 * INTERVAL_S
+
+
+def test_of_a_periodic_motion_the_smallest_lag_is_taken() -> None:
+    for seed in range(20):
+        costs = costs_at(LAGS, 0.05, lambda x: 1 - np.cos(2 * np.pi * (x - 0.2) / 5), seed)
+        assert abs(minimum_cost_lag(LAGS, costs) - 0.2 * INTERVAL_S) < 0.1 * INTERVAL_S
+
+
+def test_a_lag_at_the_end_is_none() -> None:
+    assert minimum_cost_lag(LAGS, costs_at(LAGS, 0.05, lambda x: (x - 7) ** 2, 0)) is None

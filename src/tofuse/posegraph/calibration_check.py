@@ -329,7 +329,9 @@ class _Loop:
         start = self.chained(poses, errors)[1]
         options = replace(self.options, rounds=_ROUNDS)
         views = self.views[self.i : self.j + 1]
-        return float(refine(views, start, options, calibrate=[number], errors=errors).errors[number])
+        return float(
+            refine(views, start, options, calibrate=[number], errors=errors).errors[number]
+        )
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""

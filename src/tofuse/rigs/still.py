@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtr
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
@@ -40,6 +41,9 @@ _CLOCK = 0.3
 # Maximum lag to either side, in images; number of instants at which lags are compared; and the
 # truncation of distances, as a fraction of the depth.
 _LAGS, _COMPARED, _FAR = 6, 10, 0.03
+# Minimum number of instants that compare two lags, and the level of significance: about a dozen
+# lags are compared with the best one.
+_MIN_INSTANTS, _SIGNIFICANCE = 5, 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +159,7 @@ def _finer_offsets(
 
     The images of each camera are compared with those of the cameras before it at several lags, a
     frame apart; the distance between surfaces is minimal at the correct lag, and quadratic nearby.
+    A clock is corrected only if most instants agree on it (`minimum_cost_lag`).
     """
     out = offsets.copy()
     at = _common_times(cameras, offsets)
@@ -166,9 +171,9 @@ def _finer_offsets(
         times = cameras[c].recording.timestamps
         interval = float(np.median(np.diff(times)))
         rows: dict[int, KeptView | None] = {}
-        costs, lags = [], []
-        for shift in range(-_LAGS, _LAGS + 1):
-            found: list[Float64] = []
+        costs = np.full((len(at), 2 * _LAGS + 1), np.nan)
+        lags = np.full(2 * _LAGS + 1, np.nan)
+        for column, shift in enumerate(range(-_LAGS, _LAGS + 1)):
             apart: list[float] = []
             for m, t in enumerate(at):
                 row = int(np.abs(times + out[c] - t).argmin()) + shift
@@ -178,17 +183,20 @@ def _finer_offsets(
                     frame = cameras[c].image(row)
                     rows[row] = None if frame is None else _kept(cameras[c].surface(frame))
                 view = rows[row]
+                found = [np.zeros(0)]
                 for other, theirs in known.items():
                     target = theirs[m]
                     if view is not None and target is not None:
                         T = se3.inverse(placed.poses[other]) @ placed.poses[k]
                         far = distances_between(target, view, T)
                         found.append(np.minimum(far, _FAR * target.surface.depth))
-                        apart.append(float(times[row] + out[c] - t))
-            every = np.concatenate([np.zeros(0), *found])
-            costs.append(float(every.mean()) if len(every) >= _MIN_POINTS else np.nan)
-            lags.append(float(np.mean(apart)) if apart else np.nan)
-        lag = _minimum(np.array(lags), np.array(costs))
+                distances = np.concatenate(found)
+                if len(distances):
+                    costs[m, column] = distances.mean()
+                    apart.append(float(times[row] + out[c] - t))
+            if apart:
+                lags[column] = np.mean(apart)
+        lag = minimum_cost_lag(lags, costs)
         if lag is None:
             notes.append(f"{cameras[c].name}: its clock can't be estimated from what moves")
         elif abs(lag) > 0.02 * interval:
@@ -201,25 +209,49 @@ def _kept(surface: PreparedView | None) -> KeptView | None:
     return None if surface is None else KeptView.of(surface, _MIN_POINTS)
 
 
-def _minimum(lags: Float64, costs: Float64) -> float | None:
-    """Return the interpolated minimum of costs; None at an end, or if it is not distinct."""
-    good = np.isfinite(costs)
-    if good.sum() < 5:
+def minimum_cost_lag(lags: Float64, costs: Float64) -> float | None:
+    """Return the interpolated lag of minimum cost; None at an end, or if it is not distinct.
+
+    Of lags that are not significantly worse than the best one, as for a periodic motion, the
+    smallest is taken. It is distinct if lags two images away on both sides are worse. Costs are
+    compared instant by instant, as what stands still contributes alike to all lags of an instant.
+
+    Parameters
+    ----------
+    lags
+        (L,) s, ascending; NaN if unknown.
+    costs
+        (M, L) of M instants, NaN if unknown.
+    """
+    known = np.isfinite(lags) & (np.isfinite(costs).sum(0) >= _MIN_INSTANTS)
+    if known.sum() < 5:
         return None
-    lags, costs = lags[good], costs[good]
-    best = int(np.argmin(costs))
-    if not 1 <= best < len(costs) - 1:
+    lags, costs = lags[known], costs[:, known]
+    mean = np.nanmean(costs, axis=0)
+    least = int(np.argmin(mean))
+    alike = [k for k in range(len(lags)) if not _is_positive(costs[:, k] - costs[:, least])]
+    best = min(alike, key=lambda k: abs(lags[k]))
+    if not 2 <= best < len(lags) - 2:
         return None
-    near = slice(max(best - 2, 0), best + 3)
-    bend, slope, level = np.polyfit(lags[near] - lags[best], costs[near], 2)
-    left = costs[near] - np.polyval([bend, slope, level], lags[near] - lags[best])
-    deep = float(costs[near].max() - costs[best])
-    if bend <= 0 or deep < 4 * float(np.sqrt((left**2).mean())):
+    if not all(_is_positive(costs[:, best + k] - costs[:, best]) for k in (-2, 2)):
+        return None
+    near = slice(best - 2, best + 3)
+    bend, slope, _ = np.polyfit(lags[near] - lags[best], mean[near], 2)
+    if bend <= 0:
         return None
     step = float(
         np.clip(-0.5 * slope / bend, lags[best - 1] - lags[best], lags[best + 1] - lags[best])
     )
     return float(lags[best] + step)
+
+
+def _is_positive(differences: Float64) -> bool:
+    """Whether the mean of differences (M,) is significantly above 0 (Student's t-test)."""
+    d = differences[np.isfinite(differences)]
+    if len(d) < _MIN_INSTANTS:
+        return False
+    error = float(d.std(ddof=1)) / np.sqrt(len(d))
+    return bool(d.mean() > 0 and stdtr(len(d) - 1, -d.mean() / max(error, 1e-12)) < _SIGNIFICANCE)
 
 
 def _instants(
