@@ -17,7 +17,8 @@ def make_arducam(folder: Path) -> None:
     folder.mkdir(parents=True)
     for k in range(3):
         depth = (1000 * DEPTH[k]).astype("<f4")
-        depth[0, :3] = (np.nan, np.inf, -5)
+        depth[0, :4] = (np.nan, np.inf, -5, 1e38)
+        depth.view("<u4")[0, 0] = 0x7FA00000  # a signalling NaN
         time = 1_700_000_000_000 + 100 * k
         size = f"{WIDTH}_{HEIGHT}_f32"
         (folder / f"depth_{size}_{time}.raw").write_bytes(depth.tobytes())

@@ -27,7 +27,7 @@ def test_arducam(tmp_path: Path) -> None:
     for k, frame in enumerate(recording):
         assert isinstance(frame, RangeFrame)
         expected = DEPTH[k].copy()
-        expected[0, :3] = 0
+        expected[0, :4] = 0
         np.testing.assert_allclose(frame.depth, expected, atol=1e-6)
         assert frame.confidence_image is not None
         assert frame.confidence_image[1, :3].tolist() == [0, 255, 0]

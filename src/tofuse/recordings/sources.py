@@ -146,11 +146,10 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
 def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
     """Read a PLY cloud; non-finite points are dropped, and `shift` (3,) in m is subtracted."""
     ply = read_ply(path)
-    dtype: type[np.floating] = np.float32 if shift is None else np.float64
     return cloud_frame(
         index,
         timestamp,
-        ply.points.astype(dtype),
+        to_float32(ply.points) if shift is None else ply.points.astype(np.float64),
         ply.normals,
         amplitude=ply.amplitude,
         color=ply.color,

@@ -91,7 +91,7 @@ class ArducamSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         values = self._floats(self.depth[index])
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             depth = values * np.float32(self.description.depth_unit_m)
         return RangeFrame(
             index,
