@@ -357,6 +357,7 @@ def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
         "assessed": False,
         "worst": None,
         "unbounded": [],
+        "by_odometry": [],
     }
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
     assert len(read_ply(tmp_path / "out/cloud.ply")) > 500

@@ -282,6 +282,42 @@ def test_odometry_says_how_the_camera_turned_once_it_has_proved_right(drift, pro
         assert se3.angle(off) < 1e-9
 
 
+def test_odometry_predicts_the_position_where_no_direction_constrains_it() -> None:
+    """A slide along a wall that begins suddenly: the tracked motion is the predicted one."""
+    rng = np.random.default_rng(4)
+    poses = [
+        se3.exp(np.array([0.05 * max(k - 5, 0), *rng.normal(0, 0.001, 3), 0.01 * k, 0]))
+        for k in range(20)
+    ]
+    world = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
+    motion = MotionModel()
+    for k, T in enumerate(poses):
+        motion.set_odometry(world @ T)
+        slides = k > 5
+        predicted = motion.predicted_pose(counted(k)) if slides else T
+        motion.update(predicted, counted(k), degenerate=slides)
+    np.testing.assert_allclose(predicted, poses[-1], atol=1e-9)
+
+
+def test_odometry_that_predicts_worse_than_the_velocity_is_ignored() -> None:
+    """Frozen poses, of a device that lost itself; and the first motion, which nothing predicts."""
+    poses = walk(12)
+    motion = MotionModel()
+    for k, T in enumerate(poses[:11]):
+        motion.set_odometry(np.eye(4))
+        motion.update(T, counted(k))
+    motion.set_odometry(np.eye(4))
+    np.testing.assert_allclose(motion.predicted_pose(counted(11)), poses[11], atol=1e-9)
+    # Further than a hand moves a camera between two frames.
+    first = MotionModel()
+    for far, expected in ((0.1, True), (3.0, False)):
+        first.set_odometry(np.eye(4))
+        first.update(np.eye(4), timed(30.0)(0))
+        first.set_odometry(se3.exp(np.array([far, 0, 0, 0, 0, 0])))
+        assert (first.predicted_pose(timed(30.0)(1)) is not None) is expected
+        first.interrupt()
+
+
 def test_odometry_that_is_missing_for_a_frame_says_nothing() -> None:
     poses = walk(13)
     motion = MotionModel()

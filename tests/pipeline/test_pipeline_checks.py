@@ -186,6 +186,10 @@ CASES = {
     "unreadable_frames": evidence(("tracked",) * 4 + ("skipped",) + ("tracked",) * 4),
     "jumped": evidence(steps=[(0.05 * k + 0.4 * (k > 4), 0, 0, 0, 0, 0) for k in range(9)]),
     "unobserved_motion": evidence(unheld=(4,)),
+    "bounded_by_odometry": replace(
+        evidence(sigma=(0.0001, 0.0001)),
+        accuracy=Accuracy(0.001, 0.001, 0.001, True, by_odometry=(4, 5)),
+    ),
     "repeated_images": evidence(repeated=(4, 5)),
     "implausible_depth": evidence(depths=(25.0,) * 9),
     "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),
@@ -273,11 +277,11 @@ def test_a_few_directions_that_are_not_held_do_not_drift() -> None:
 @pytest.mark.parametrize(
     ("depths", "ambiguity_m", "words"),
     [
-        ((0.2, 0.25, 0.3), None, "is 0.25 m, nearer than"),
+        ((0.1, 0.12, 0.3), None, "is 0.12 m, nearer than"),
         ((13.0, 30.0, 14.0), None, "is 14 m, farther than"),
         ((6.0, 6.5, 7.0), 5.0, "is 6.5 m, but this camera's phase repeats after 5 m"),
         ((6.0, 6.5, 7.0), 7.5, ""),
-        ((0.35, 0.3, 11.0), None, ""),
+        ((0.25, 0.2, 11.0), None, ""),
     ],
 )
 def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) -> None:
@@ -285,6 +289,10 @@ def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) ->
     assert [r.code for r in reasons] == ["implausible_depth"] * bool(words)
     assert all(words in r.text for r in reasons)
     assert all(r.text.endswith("check the depth unit.") for r in reasons)
+    # Odometry of the same length verifies the unit, but not that the phase is unwrapped.
+    sensor = SensorRecord("odometry", 8, 8, 1.0, "", metric=True)
+    known = evidence(depths=depths, ambiguity_m=ambiguity_m, priors=(sensor,))
+    assert bool(judge(known)[1]) is ("phase" in words)
 
 
 def test_repeated_images_are_one_line() -> None:

@@ -11,11 +11,14 @@ import pytest
 from report_results import lonely
 from tofuse.cli import main
 from tofuse.errors import InputError
+from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.priors import with_prior
 from tofuse.pipeline.reconstruct import device_up, reconstruct
 from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording
@@ -31,7 +34,7 @@ def recording(room_recording: Path) -> Recording:
 def by_phone(recording: Recording, poses=None) -> Recording:
     """The recording as if a phone had found its reference poses, or others."""
     frames = list(recording)
-    found = recording.reference if poses is None else poses
+    found = recording.reference if poses is None else np.asarray(poses)
     source = ArraySource(frames, found, metadata={**recording.metadata, POSES_BY: "ARKit"})
     return Recording.of(source, recording.path, recording.format)
 
@@ -116,6 +119,49 @@ def test_poses_of_another_place_do_not_count(recording) -> None:
     [sensor] = result.diagnostics.priors
     assert sensor.scale is not None
     assert sensor.scale > 2
+
+
+CAMERA = Pinhole(160, 120, 150.0, 150.0, 79.5, 59.5)
+
+
+def past_a_corner() -> Recording:
+    """2 m along a bare wall and the floor, from a corner that is in view at first."""
+    a = np.linspace(0, 1, 40)
+    along = 1.6 * a - 1.3 + 0.2 * np.sin(10 * a)
+    twists = [along, 0.05 * np.sin(9 * a), 0.1 * np.sin(5 * a), 0.05 * np.sin(7 * a)]
+    poses = se3.exp(np.stack([*twists, 0.05 * np.sin(6 * a), 0.05 * np.sin(11 * a)], 1))
+    rays = np.concatenate([CAMERA.rays(), np.ones((120, 160, 1))], -1)
+    rng = np.random.default_rng(0)
+    frames = []
+    for k, T in enumerate(poses):
+        directions, p = rays @ T[:3, :3].T, T[:3, 3]
+        depth = np.full((120, 160), np.inf)
+        for axis, at in ((0, -1.6), (1, 0.6), (2, 2.0)):
+            z = (at - p[axis]) / directions[..., axis]
+            depth = np.minimum(depth, np.where(z > 0, z, np.inf))
+        noise = rng.normal(0, 0.002, depth.shape)
+        frames.append(RangeFrame(k, k / 30, CAMERA, (depth + noise).astype(np.float32)))
+    return Recording.of(ArraySource(frames, poses, metadata={}), "simulated", "native")
+
+
+def test_the_poses_of_a_phone_bound_a_slide_along_a_wall() -> None:
+    """Alone, the images leave the motion along it open."""
+    recording = past_a_corner()
+    right = recording.reference
+    alone = reconstruct(recording)
+    slide = alone.diagnostics.accuracy.unbounded
+    assert len(slide) > 10
+    rng = np.random.default_rng(1)
+    phone = [right[0]]
+    for step in se3.inverse(right[:-1]) @ right[1:]:
+        phone.append(phone[-1] @ step @ se3.exp(0.001 * rng.standard_normal(6)))
+    result = reconstruct(*with_prior(by_phone(recording, phone), from_method("default"), "auto"))
+    accuracy = result.diagnostics.accuracy
+    assert accuracy.unbounded == ()
+    assert set(accuracy.by_odometry) >= set(slide[3:])
+    assert "bounded_by_odometry" in [r.code for r in result.diagnostics.reasons]
+    assert displacement(right, result.trajectory)[0] < accuracy.position_m < 0.1
+    assert displacement(right, alone.trajectory)[0] > 0.1
 
 
 @pytest.mark.parametrize(

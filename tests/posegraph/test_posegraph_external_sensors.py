@@ -56,12 +56,17 @@ def tracked(
     return build_graph(range(N), np.stack(chain), steps)
 
 
-def sensed(odometry: np.ndarray | None = None, gravity: np.ndarray | None = None) -> SensorData:
+def sensed(
+    odometry: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+    degenerate: np.ndarray | None = None,
+) -> SensorData:
     return SensorData(
         np.arange(N),
         np.full((N, 4, 4), np.nan) if odometry is None else odometry,
         np.full((N, 4), np.nan) if gravity is None else gravity,
         np.zeros(N, np.intp),
+        np.zeros(N, bool) if degenerate is None else degenerate,
     )
 
 
@@ -178,6 +183,44 @@ def test_odometry_counts_with_the_errors_that_it_has():
     assert ate(solved(graph, told), right) < 1.1 * ate(graph.poses, right)
 
 
+def test_errors_of_odometry_are_measured_where_images_constrain_the_motion():
+    """Frames along a wall: what they state about the motion along it is extrapolated."""
+    right = truth()
+    graph = tracked(right, 0 * NODDING)
+    wall = (np.arange(N) >= 10) & (np.arange(N) < 48)
+    measurements = graph.measurements.copy()
+    slide = wall[graph.edges[:, 1]]
+    measurements[slide] = np.eye(4)
+    wrong = replace(graph, measurements=measurements)
+    told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), wrong)
+    assert told.verified
+    assert told.records[0].scale == 1
+    # Without knowing which frames are degenerate, their errors count as those of the odometry.
+    blind = measure_all((OdometryEdges(),), sensed(odometer(right)), wrong)
+    assert blind.records[0].scale is None or blind.records[0].scale > 1
+    # With degenerate frames only, nothing verifies it.
+    nearly_all = np.arange(N) >= 8
+    told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=nearly_all), graph)
+    assert told.steps
+    assert not told.verified
+
+
+@pytest.mark.parametrize(
+    ("factor", "motion", "metric"), [(1.0, 1.0, True), (0.5, 1.0, False), (1.0, 0.01, False)]
+)
+def test_odometry_verifies_the_unit_of_the_depths(factor, motion, metric):
+    """If the camera moved, and its tracked path is as long as that of the odometry."""
+    right = truth()
+    right[:, :3, 3] *= motion
+    shorter = right.copy()
+    shorter[:, :3, 3] *= factor
+    graph = tracked(shorter, 0 * NODDING)
+    lenient = OdometryEdges(min_m=0.004, relative=0.5, limit=100)
+    [record] = measure_all((lenient,), sensed(odometer(right)), graph).records
+    assert record.scale is not None
+    assert record.metric is metric
+
+
 def test_a_jump_of_the_odometry_is_left_out():
     right = truth()
     graph = tracked(right, 0 * NODDING)
@@ -248,6 +291,7 @@ def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
                 [np.einsum("kji,j->ki", poses[:, :3, :3], down), np.full((6, 1), 0.01)], 1
             ),
             np.zeros(6, np.intp),
+            np.zeros(6, bool),
         ),
         build_graph(range(6), rolled, []),
     ).gravity_of(range(6))

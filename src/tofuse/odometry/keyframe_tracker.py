@@ -80,7 +80,8 @@ class KeyframeTracker(Tracker):
         T = step.T_component_camera
         assert T is not None
         self._last = Keyframe(view, T, self._component, step.doubtful)
-        self._motion.update(T, now)
+        degenerate = step.registration is not None and len(step.registration.unobservable) > 0
+        self._motion.update(T, now, degenerate=degenerate)
         self._in_sequence = True
 
     def predicted_pose(self, now: Moment) -> Float64 | None:

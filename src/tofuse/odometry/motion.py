@@ -31,8 +31,8 @@ _DEVIATION_FACTOR, _RECENT = 2.0, 4
 _TRACKING_NOISE = np.array([0.003, np.radians(0.2)])
 # Weight of the newest motion in the exponential moving average of the velocity.
 _NEWEST_WEIGHT = 0.3
-# External odometry is compared with the velocity over this number of turns, at least half of them.
-_COMPARED_TURNS = 10
+# External odometry is compared with the velocity over this number of recent motions.
+_COMPARED = 10
 # After more frames without a pose than these, without timestamps, nothing is predicted.
 _MAX_UNTIMED_GAP = 3
 
@@ -78,11 +78,11 @@ class MotionModel:
         self._mean_velocity: Float64 | None = None  # (6,) its exponential moving average
         self._interval = 1.0  # between the last two frames with a pose
         self._deviations: deque[Float64] = deque(maxlen=_RECENT)
-        # (4, 4) poses of external odometry at the last frame and now; and the errors, in rad, of
-        # the recent turns as predicted by it and by the velocity.
+        # (4, 4) poses of external odometry at the last frame and now; and the errors (2,), m and
+        # rad, of recent motions as predicted by it and by the velocity.
         self._T_odometry_before: Float64 | None = None
         self._T_odometry_now: Float64 | None = None
-        self._turn_errors: deque[tuple[float, float]] = deque(maxlen=_COMPARED_TURNS)
+        self._compared: deque[tuple[Float64, Float64]] = deque(maxlen=_COMPARED)
 
     def set_odometry(self, T_odometry: Float64 | None) -> None:
         """Set the pose (4, 4) of the coming frame by external odometry, in any fixed frame."""
@@ -91,14 +91,10 @@ class MotionModel:
     def predicted_pose(self, now: Moment) -> Float64 | None:
         """Return the pose at constant velocity; None while the velocity is unknown.
 
-        The rotation is that of external odometry, if it has predicted recent turns better than the
-        velocity did.
+        Position and rotation are those of external odometry, each unless it has predicted recent
+        motions worse than the velocity did.
         """
-        T = self._extrapolated(self._velocity, now)
-        if not self._trusts_odometry():
-            return T
-        T_rotated = self._rotated_by_odometry(self._T_last if T is None else T)
-        return T if T_rotated is None else T_rotated
+        return self._by_odometry(self._extrapolated(self._velocity, now), now)
 
     def odometry_pose(self) -> Float64 | None:
         """Return the last pose moved as by external odometry; None without odometry."""
@@ -111,9 +107,10 @@ class MotionModel:
         """Return the pose at the mean velocity of recent frames; None while it is unknown.
 
         Where a direction is degenerate for many frames, only the prediction moves the camera
-        along it, and the noise of single motions would accumulate.
+        along it, and the noise of single motions would accumulate. With external odometry as in
+        `predicted_pose`.
         """
-        return self._extrapolated(self._mean_velocity, now)
+        return self._by_odometry(self._extrapolated(self._mean_velocity, now), now)
 
     def gate(self, now: Moment) -> Float64:
         """Return by how much a pose may deviate from the predicted one, (2,), m and rad.
@@ -169,33 +166,44 @@ class MotionModel:
         usual = np.maximum(np.max(self._deviations, axis=0), _TRACKING_NOISE)
         return float(np.max(_distance_and_angle(T_predicted, T) / usual))
 
-    def _rotated_by_odometry(self, T: Float64 | None) -> Float64 | None:
-        """Replace the rotation of a pose (4, 4) by that of external odometry; None without it."""
-        before, now = self._T_odometry_before, self._T_odometry_now
-        if T is None or self._T_last is None or before is None or now is None:
-            return None
+    def _by_odometry(self, T: Float64 | None, now: Moment) -> Float64 | None:
+        """Replace the parts of a pose (4, 4) that external odometry has not predicted worse."""
+        T_odometry = self.odometry_pose()
+        if T_odometry is None:
+            return T
+        if T is None:
+            return T_odometry if self.is_feasible(T_odometry, now) else None
+        by_odometry, by_velocity = np.median(self._compared or [np.zeros((2, 2))], axis=0)
+        position, rotation = by_odometry <= by_velocity
         out = T.copy()
-        out[:3, :3] = self._T_last[:3, :3] @ (before[:3, :3].T @ now[:3, :3])
+        if position:
+            out[:3, 3] = T_odometry[:3, 3]
+        if rotation:
+            out[:3, :3] = T_odometry[:3, :3]
         return out
 
-    def _trusts_odometry(self) -> bool:
-        if len(self._turn_errors) < _COMPARED_TURNS // 2:
-            return False
-        odometry, velocity = np.median(self._turn_errors, axis=0)
-        return bool(odometry < velocity)
-
-    def _record_turn_errors(self, T: Float64, now: Moment) -> None:
-        """Record how well odometry and velocity predicted a turn."""
-        T_odometry = self._rotated_by_odometry(T)
-        T_velocity = self._extrapolated(self._velocity, now)
+    def _compare_odometry(self, T: Float64, now: Moment) -> None:
+        """Record how well odometry and velocity predicted a pose (4, 4)."""
+        T_odometry, T_velocity = self.odometry_pose(), self._extrapolated(self._velocity, now)
         if T_odometry is not None and T_velocity is not None:
-            _, by_odometry = _distance_and_angle(T_odometry, T)
-            _, by_velocity = _distance_and_angle(T_velocity, T)
-            self._turn_errors.append((float(by_odometry), float(by_velocity)))
+            self._compared.append(
+                (_distance_and_angle(T_odometry, T), _distance_and_angle(T_velocity, T))
+            )
 
-    def update(self, T: Float64, now: Moment) -> None:
-        """Update the velocity with the pose of the next frame."""
-        self._record_turn_errors(T, now)
+    def update(self, T: Float64, now: Moment, *, degenerate: bool = False) -> None:
+        """Update the velocity with the pose of the next frame.
+
+        Parameters
+        ----------
+        T
+            (4, 4) T_world_camera.
+        now
+            When the frame was taken.
+        degenerate
+            Whether some direction of the motion is only predicted.
+        """
+        if not degenerate:
+            self._compare_odometry(T, now)
         self._update_velocity(T, now)
         self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
 

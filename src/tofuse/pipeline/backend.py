@@ -194,7 +194,7 @@ class BackEnd:
         # Without loops: with and without external sensors.
         sequential = guided = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
-        sensors = measure_all(self._config.priors, sensed, tracked)
+        sensors = measure_all(self._config.priors, sensed, self._measured(tracked))
         graph = with_sensors(graph, sensors)
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or sensors:
@@ -403,12 +403,12 @@ class BackEnd:
         if not self._kept.knows_errors:
             return Accuracy(), pose_covariances(closed.optimisation.graph)
         refinement = refined.refinement
-        graph = images_only = self._measured(refined.graph, refinement)
-        if closed.sensors:  # like the verdict, the accuracy rests on the images alone
+        graph = images_only = self._measured(refined.graph, refinement.stated)
+        if closed.sensors:  # the accuracy rests on the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
                 without_sensors = self.graph(closed.loops, refinement)
-            images_only = self._measured(without_sensors, refinement)
+            images_only = self._measured(without_sensors, refinement.stated)
         moved = 0.0, 0.0
         if self._tracks:  # the initial error of given poses says nothing of the final one
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
@@ -418,15 +418,29 @@ class BackEnd:
             gap = suspicion.gap.before
         shown = Shown(*moved, excess, *gap)
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
+        if accuracy.unbounded and closed.sensors.verified:
+            free = set(accuracy.unbounded)
+            bounded = with_sensors(images_only, self._where_degenerate(closed.sensors))
+            accuracy = accuracy_of(bounded, shown, model.cloud.diagonal_m)
+            by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
+            accuracy = replace(accuracy, by_odometry=by_odometry)
         return accuracy, covariances_of(graph, shown)
+
+    def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
+        """Return the steps of odometry from and to degenerate frames."""
+        ends = self._unobservable.keys()
+        return SensorPriors(tuple(s for s in sensors.steps if s.i in ends or s.j in ends))
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
         frames, at = self._checked_images(graph)
         return with_pose_errors(model, frames, graph.poses[at], covariances[at])
 
-    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
-        """Return the graph without edges and directions that are extrapolated motion only."""
+    def _measured(self, graph: PoseGraph, stated: Sequence[tuple[int, int]] = ()) -> PoseGraph:
+        """Return the graph without edges and directions that are extrapolated motion only.
+
+        See `degenerate_directions` for `stated`.
+        """
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
         own = {
             (e.step.reference, e.record.index)
@@ -434,9 +448,7 @@ class BackEnd:
             if e.step is not None and e.step.reference is not None
         }
         views = {v.index: v for v in self._kept.views.of(self._poses)}
-        directions = degenerate_directions(
-            graph, self._unobservable, own, views, frozenset(refinement.stated)
-        )
+        directions = degenerate_directions(graph, self._unobservable, own, views, frozenset(stated))
         return without_degenerate(graph, directions, bridges)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:

@@ -30,7 +30,7 @@ MAX_NOT_CONVERGED = 0.05
 # Largest fraction of degenerate registrations; more accumulate drift.
 MAX_DEGENERATE = 0.1
 # Range of plausible typical depths of ToF cameras, m.
-MIN_DEPTH_M, MAX_DEPTH_M = 0.3, 12.0
+MIN_DEPTH_M, MAX_DEPTH_M = 0.15, 12.0
 # Views are unordered if there are more jumps than this, and than this fraction of the poses.
 MIN_UNORDERED, UNORDERED_FRACTION = 3, 0.2
 # Largest motion of a camera that stands still.
@@ -290,10 +290,13 @@ def _component_changes(records: Sequence[FrameRecord], chosen: Sequence[bool]) -
 def _depths(e: Evidence) -> Iterator[Reason]:
     if not e.depths:
         return
+    unit_verified = any(sensor.metric for sensor in e.priors)
     typical = float(np.median(e.depths))
     what = f"The typical distance is {typical:.3g} m"
     if e.ambiguity_m is not None and typical > e.ambiguity_m:
         text = f"{what}, but this camera's phase repeats after {e.ambiguity_m:.3g} m"
+    elif unit_verified:
+        return
     elif typical > MAX_DEPTH_M:
         text = f"{what}, farther than ToF cameras see"
     elif typical < MIN_DEPTH_M:
@@ -421,7 +424,16 @@ def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[R
             "motion is extrapolated there, and its error is not bounded."
         )
         yield Reason("unobserved_motion", free, text)
-    elif a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
+    known = runs_of(frames, a.by_odometry)
+    if known:
+        text = (
+            f"{_poses_of(known)} not constrained by the images in some direction (degenerate "
+            "geometry): the recorded odometry bounds the error there."
+        )
+        yield Reason("bounded_by_odometry", known, text)
+    if free:
+        return
+    if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
         off, limit = _length(a.position_m), _length(tolerance_m)
         if a.position_m <= tolerance_m:
             off, limit = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)

@@ -193,7 +193,8 @@ class FrameLog:
             if entry.gravity is not None:
                 gravity[k] = entry.gravity
         parts = np.array([by_index[index].recording for index in ids], np.intp)
-        return SensorData(np.array(ids, np.intp), odometry, gravity, parts)
+        degenerate = np.array([len(by_index[index].record.unobservable) > 0 for index in ids], bool)
+        return SensorData(np.array(ids, np.intp), odometry, gravity, parts, degenerate)
 
 
 def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:

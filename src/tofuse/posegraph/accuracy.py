@@ -70,6 +70,8 @@ class Accuracy:
         The least certain frame; None if nothing was assessed.
     unbounded
         Indices of the frames whose pose is unbounded in some direction.
+    by_odometry
+        Indices of the frames whose pose would be unbounded without the recorded odometry.
     """
 
     position_m: float = np.inf
@@ -78,6 +80,7 @@ class Accuracy:
     assessed: bool = False
     worst: WorstFrame | None = None
     unbounded: tuple[int, ...] = ()
+    by_odometry: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

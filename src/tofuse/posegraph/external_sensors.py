@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 
-from tofuse.arrays import Float64, Intp
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
@@ -24,6 +24,8 @@ from tofuse.posegraph.graph import Gravity, PoseGraph
 
 # With fewer measured frames, a moving accelerometer can't be detected.
 _MIN_FRAMES = 3
+# Odometry that fewer fully constrained registrations were compared with is not verified.
+_MIN_COMPARED = 10
 _MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
 
 
@@ -42,19 +44,23 @@ class SensorData:
         is none.
     parts
         (N,) number of the recording, if several are joined: each has its own odometry.
+    degenerate
+        (N,) frames whose registration leaves some direction unconstrained.
     """
 
     ids: Intp
     odometry: Float64
     gravity: Float64
     parts: Intp
+    degenerate: Bool
 
 
 @dataclass(frozen=True)
 class SensorRecord:
     """Use of a sensor: numbers of its measurements and of those used, and a sentence on it.
 
-    `scale` is the factor on its stated errors, None where they are not scaled.
+    `scale` is the factor on its stated errors, None where they are not scaled; `metric` whether
+    tracked lengths agree with those that it measures.
     """
 
     sensor: str
@@ -62,6 +68,7 @@ class SensorRecord:
     used: int
     scale: float | None
     text: str
+    metric: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +79,9 @@ class SensorPriors:
     ----------
     steps
         Relative poses of consecutive frames, with their information.
+    verified
+        Whether the errors of the steps were measured on enough fully constrained registrations.
+        Then the steps bound the errors where images don't constrain the motion.
     ids
         Frames with a measured direction of gravity.
     gravity
@@ -87,6 +97,7 @@ class SensorPriors:
     gravity: Float64 | None = None
     gate: float = np.inf
     records: tuple[SensorRecord, ...] = ()
+    verified: bool = False
 
     def __bool__(self) -> bool:
         return bool(self.steps or self.ids)
@@ -100,6 +111,7 @@ class SensorPriors:
             mine.gravity,
             mine.gate,
             (*self.records, *other.records),
+            self.verified or other.verified,
         )
 
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:
@@ -229,7 +241,8 @@ class OdometryEdges(Bounded, ExternalSensor):
             return SensorPriors()
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         C = self._covariance(measured)
-        scale = self._scale(sensed, graph, C, first)
+        compared = self._compare(sensed, graph, C, first)
+        scale = 1.0 if compared is None else compared.scale(self.limit)
         if scale is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
@@ -252,8 +265,10 @@ class OdometryEdges(Bounded, ExternalSensor):
         )
         text = f"{len(keep)} of {len(first)} steps of the odometry are used, "
         text += "with the stated errors" if scale == 1 else f"with {scale:.1f} times its errors"
-        record = SensorRecord("odometry", len(first), len(keep), scale, text)
-        return SensorPriors(steps, records=(record,))
+        metric = compared is not None and compared.lengths_agree(scale)
+        record = SensorRecord("odometry", len(first), len(keep), scale, text, metric)
+        verified = compared is not None and compared.verified
+        return SensorPriors(steps, records=(record,), verified=verified)
 
     def _covariance(self, steps: Float64) -> Float64:
         """(K, 6, 6) of motions (K, 4, 4)."""
@@ -263,10 +278,12 @@ class OdometryEdges(Bounded, ExternalSensor):
         sigma[:, 3:] = (self.min_rad + self.relative_rad * angle)[:, None]
         return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
 
-    def _scale(self, sensed: SensorData, graph: PoseGraph, C: Float64, first: Intp) -> float | None:
-        """Factor on the stated errors that explains the misfit; None beyond the limit.
+    def _compare(
+        self, sensed: SensorData, graph: PoseGraph, C: Float64, first: Intp
+    ) -> _Comparison | None:
+        """Compare the motions from references to frames with the tracker's registrations.
 
-        The motions from a reference to a frame are compared, as the tracker measured them.
+        Only fully constrained registrations are compared, if there are enough. None without any.
         """
         i, j = graph.edges.T
         # Variances add up along the path; a step without odometry breaks it.
@@ -274,27 +291,76 @@ class OdometryEdges(Bounded, ExternalSensor):
         step[first + 1] = np.diagonal(C, axis1=1, axis2=2)
         whole = [bool(np.isfinite(step[a + 1 : b + 1]).all()) for a, b in graph.edges]
         known = np.array(whole, bool) & (i < j)
+        constrained = known & ~(sensed.degenerate[i] | sensed.degenerate[j])
+        verified = bool(constrained.sum() >= _MIN_COMPARED)
+        if verified:
+            known = constrained
         if not known.any():
-            return 1.0
+            return None
         i, j = i[known], j[known]
-        way = np.stack([step[a + 1 : b + 1].sum(0) for a, b in zip(i, j, strict=True)])
-        moved = se3.inverse(sensed.odometry[i]) @ sensed.odometry[j]
-        e = se3.log(se3.inverse(graph.measurements[known]) @ moved)
-        own = np.linalg.inv(graph.information[known])
+        return _Comparison(
+            graph.measurements[known],
+            np.asarray(np.linalg.inv(graph.information[known]), np.float64),
+            np.asarray(se3.inverse(sensed.odometry[i]) @ sensed.odometry[j], np.float64),
+            np.stack([step[a + 1 : b + 1].sum(0) for a, b in zip(i, j, strict=True)]),
+            verified,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """The same K motions by the tracker and by odometry.
+
+    Attributes
+    ----------
+    tracked, covariances
+        (K, 4, 4), and (K, 6, 6) as right perturbations.
+    odometry, variances
+        (K, 4, 4), and (K, 6) by the stated errors.
+    verified
+        See `SensorPriors`.
+    """
+
+    tracked: Float64
+    covariances: Float64
+    odometry: Float64
+    variances: Float64
+    verified: bool
+
+    def scale(self, limit: float) -> float | None:
+        """Factor on the stated errors that explains the misfit, from 1 to `limit`, or None."""
+        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
 
         def median(scale: float) -> float:
-            added = scale**2 * way[:, :, None] * np.eye(6)
-            return float(np.median(_squared(e, own + added)))
+            added = scale**2 * self.variances[:, :, None] * np.eye(6)
+            return float(np.median(_squared(misfit, self.covariances + added)))
 
         if median(1.0) <= _MEDIAN:
             return 1.0
-        if median(self.limit) > _MEDIAN:
+        if median(limit) > _MEDIAN:
             return None
-        low, high = 1.0, self.limit
+        low, high = 1.0, limit
         for _ in range(30):
             mid = 0.5 * (low + high)
             low, high = (mid, high) if median(mid) > _MEDIAN else (low, mid)
         return high
+
+    def lengths_agree(self, scale: float) -> bool:
+        """Whether tracked lengths differ from those of the odometry by less than half (95 %).
+
+        Parameters
+        ----------
+        scale
+            Factor on the stated errors.
+        """
+        t, o = self.tracked[:, :3, 3], self.odometry[:, :3, 3]
+        variance = np.trace(self.covariances[:, :3, :3], axis1=1, axis2=2)
+        weight = 3 / (variance + scale**2 * self.variances[:, :3].sum(1))
+        information = float((weight * (o * o).sum(1)).sum())
+        if information == 0:
+            return False
+        ratio = float((weight * (t * o).sum(1)).sum()) / information
+        return bool(abs(ratio - 1) + 2 / np.sqrt(information) < 0.5)
 
 
 def measure_all(

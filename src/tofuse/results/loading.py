@@ -134,6 +134,7 @@ def _accuracy(data: dict[str, Any]) -> Accuracy:
         worst
         and WorstFrame(worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])),
         tuple(data["unbounded"]),
+        tuple(data["by_odometry"]),
     )
 
 

@@ -343,6 +343,7 @@ def accuracy_json(a: Accuracy) -> dict[str, Any]:
         "assessed": a.assessed,
         "worst": worst,
         "unbounded": list(a.unbounded),
+        "by_odometry": list(a.by_odometry),
     }
 
 
