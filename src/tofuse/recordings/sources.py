@@ -146,10 +146,12 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
 def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
     """Read a PLY cloud; non-finite points are dropped, and `shift` (3,) in m is subtracted."""
     ply = read_ply(path)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        points = to_float32(ply.points) if shift is None else ply.points.astype(np.float64)
     return cloud_frame(
         index,
         timestamp,
-        to_float32(ply.points) if shift is None else ply.points.astype(np.float64),
+        points,
         ply.normals,
         amplitude=ply.amplitude,
         color=ply.color,
