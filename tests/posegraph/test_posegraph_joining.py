@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -79,7 +80,7 @@ def members(groups):
 def test_one_component_is_a_group(three) -> None:
     (group,) = Joining().join(three[:1], [])
     np.testing.assert_array_equal(group.T_group_component[0], np.eye(4))
-    assert (group.frames, group.joins, group.bridged) == (10, (), frozenset())
+    assert (group.frames, group.joins, group.bridged) == (10, (), {})
     assert group.joined(0) == "links"
 
 
@@ -300,7 +301,7 @@ def test_a_gap_in_a_steady_motion_is_bridged_and_says_so() -> None:
     path, parts = along_a_wall()
     (group,) = Joining(searches=0).join(parts, [])
     assert_joined(group, parts, path)
-    assert group.bridged == {1}
+    assert group.bridged == {1: "motion"}
     assert (group.joined(0), group.joined(1)) == ("links", "motion")
     (join,) = group.joins
     assert (join.how, join.needed) == ("motion", True)
@@ -317,6 +318,38 @@ def test_a_gap_is_not_bridged_where_the_motion_says_little() -> None:
     # Nor between recordings, nor over a long time.
     apart = [parts[0], replace(parts[1], recording=1)]
     assert members(Joining(searches=0).join(apart, [])) == [[1], [0]]
+
+
+def with_odometry(parts, path, sigma, seed=4):
+    """The stretches with poses of odometry whose steps have errors, m and rad."""
+    rng = np.random.default_rng(seed)
+    poses = [np.eye(4)]
+    for a, b in itertools.pairwise(path):
+        poses.append(poses[-1] @ se3.inverse(a) @ b @ se3.exp(sigma * rng.standard_normal(6)))
+    return [replace(p, odometry=np.stack(poses)[p.frames]) for p in parts]
+
+
+def test_a_gap_in_a_restless_motion_is_bridged_by_odometry() -> None:
+    path, parts = along_a_wall(shake=0.03)
+    (group,) = Joining(searches=0).join(with_odometry(parts, path, 0.002), [])
+    assert group.joined(1) == "odometry"
+    (join,) = group.joins
+    off = se3.log(se3.inverse(se3.inverse(path[9]) @ path[13]) @ join.link.T_i_j)
+    sigma = np.sqrt(np.diag(np.linalg.inv(join.link.information)))
+    assert (np.abs(off) < 3 * sigma).all()
+    assert np.linalg.norm(off) < 0.03
+
+
+def test_odometry_that_disagrees_with_the_tracked_motion_bridges_nothing() -> None:
+    path, parts = along_a_wall(shake=0.03)
+    for odometry in (with_odometry(parts, path, 0.2), [replace(p, odometry=None) for p in parts]):
+        assert members(Joining(searches=0).join(odometry, [])) == [[1], [0]]
+    # Nor does odometry that is missing at an end of the gap.
+    first, second = with_odometry(parts, path, 0.002)
+    unknown = second.odometry.copy()
+    unknown[0] = np.nan
+    missing = [first, replace(second, odometry=unknown)]
+    assert members(Joining(searches=0).join(missing, [])) == [[1], [0]]
 
 
 def test_links_to_frames_without_a_pose_are_left_out(three) -> None:

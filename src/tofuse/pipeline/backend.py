@@ -427,9 +427,11 @@ class BackEnd:
         return accuracy, covariances_of(graph, shown)
 
     def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
-        """Return the steps of odometry from and to degenerate frames."""
+        """Return the steps of odometry from and to degenerate frames, and over gaps."""
         ends = self._unobservable.keys()
-        return SensorPriors(tuple(s for s in sensors.steps if s.i in ends or s.j in ends))
+        gaps = {(j.link.i, j.link.j) for j in self._joins if j.how != "links"}
+        steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
+        return SensorPriors(tuple(steps))
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
@@ -441,7 +443,7 @@ class BackEnd:
 
         See `degenerate_directions` for `stated`.
         """
-        bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
+        bridges = {(j.link.i, j.link.j) for j in self._joins if j.how != "links"}
         own = {
             (e.step.reference, e.record.index)
             for e in self._posed

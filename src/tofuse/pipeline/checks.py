@@ -215,14 +215,15 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             f"The recording falls into {len(parts)} disconnected parts: {_listed(parts)}; no "
             "overlap found.",
         )
-    bridged = union(r for c in e.components if c.joined == "motion" for r in c.frames)
-    # If all poses are bounded, later measurements connect both sides.
-    if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
-        text = (
-            f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest by "
-            "extrapolated motion only."
-        )
-        yield Reason("bridged_gap", bridged, text)
+    for how, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
+        bridged = union(r for c in e.components if c.joined == how for r in c.frames)
+        # If all poses are bounded, later measurements connect both sides.
+        if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
+            text = (
+                f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest "
+                f"by {motion} only."
+            )
+            yield Reason("bridged_gap", bridged, text)
     hanging = e.runs_of(e.hanging)
     if hanging:
         text = (

@@ -178,6 +178,7 @@ class FrameLog:
                     np.array(poses),
                     tuple(v for v in views.views if v.component == component),
                     entries[0].recording,
+                    self.sensed([e.record.index for e in entries]).odometry,
                 )
             )
         return found

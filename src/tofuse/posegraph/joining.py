@@ -45,7 +45,7 @@ from tofuse.registration.view_descriptor import (
 )
 from tofuse.registration.view_pair import follow, register_pair
 
-How = Literal["links", "motion"]
+How = Literal["links", "motion", "odometry"]
 View = PosedView[PreparedView]
 
 # Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
@@ -68,6 +68,8 @@ _AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
 _HARDLY, _SAME_PLACE = 2.0, 0.3
 # Largest standard deviation of a gap that is bridged by motion alone: fraction of the depth, rad.
 _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
+# Minimum number of tracked motions that odometry is compared with.
+_MIN_COMPARED = 10
 # Largest weight of rival links, relative to the accepted ones.
 _RIVAL = 0.5
 _SHIFT = 0.35
@@ -97,6 +99,8 @@ class Stretch:
         The stored views of its frames.
     recording
         Number of its recording, if several are merged: no motion is known between these.
+    odometry
+        (N, 4, 4) T_odometry_camera by external odometry, NaN where there is none; None without any.
     """
 
     component: int
@@ -105,6 +109,7 @@ class Stretch:
     poses: Float64
     views: tuple[View, ...]
     recording: int = 0
+    odometry: Float64 | None = None
 
     @cached_property
     def depth(self) -> float:
@@ -121,7 +126,7 @@ class Join:
     link
         The measurement T_i_j between frames i and j.
     how
-        "links", or "motion" where the motion over a gap was extrapolated.
+        "links"; "odometry", or "motion" where the motion over a gap was extrapolated.
     needed
         Whether it defines the pose of the component; otherwise it confirms another one.
     probability
@@ -147,17 +152,17 @@ class Group:
     frames
         Number of their frames.
     bridged
-        Components that only extrapolated motion connects to the first one.
+        Components that only motion over a gap connects to the first one, and how it is known.
     """
 
     T_group_component: Mapping[int, Float64]
     joins: tuple[Join, ...]
     frames: int
-    bridged: frozenset[int] = frozenset()
+    bridged: Mapping[int, How] = field(default_factory=dict)
 
     def joined(self, component: int) -> How:
         """Return how a component is connected to the first one."""
-        return "motion" if component in self.bridged else "links"
+        return self.bridged.get(component, "links")
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ class Joining(Bounded):
     searches
         Maximum number of searches, in addition to one for each component and for every 50 frames.
     bridge
-        Whether short gaps may be bridged by motion alone.
+        Whether gaps may be bridged by motion alone, odometry or extrapolated.
     tries
         Largest number of view pairs that are tried between the same two components.
     min_probability
@@ -379,15 +384,20 @@ class _Joiner:
             self._islands.append(_Island(T, inside))
 
     def bridge_gaps(self) -> None:
-        """Connect components across short gaps by the motion before and after each gap."""
+        """Connect components across gaps by odometry, or by the motion before and after."""
         ordered = sorted(self._stretches.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
             a, b = self._island_of(before.component), self._island_of(after.component)
             if a is b or before.recording != after.recording:
                 continue
-            link = _bridged(before, after)
-            if link is not None and not self._contradicts(a, b, link):
-                self._merge(a, b, link, [Join(link, "motion", True)])
+            bridges: list[tuple[Link | None, How]] = [
+                (_by_odometry(before, after), "odometry"),
+                (_bridged(before, after), "motion"),
+            ]
+            for link, how in bridges:
+                if link is not None and not self._contradicts(a, b, link):
+                    self._merge(a, b, link, [Join(link, how, True)])
+                    break
 
     def groups(self) -> list[Group]:
         """Return the joined groups, the main one first, then by decreasing size."""
@@ -410,19 +420,26 @@ class _Joiner:
         order = sorted(range(len(found)), key=lambda k: (not main[k], -found[k].frames, began[k]))
         return [found[k] for k in order]
 
-    def _bridged_from(self, island: _Island, first: int) -> frozenset[int]:
-        """Components that no chain of links connects to the first one."""
-        reached, changed = {first}, True
-        linked = [
-            {self._component_of[j.link.i], self._component_of[j.link.j]}
-            for j in island.joins
-            if j.how == "links"
-        ]
-        while changed:
-            more = {c for ends in linked if ends & reached for c in ends}
-            changed = not more <= reached
-            reached |= more
-        return frozenset(island.T) - reached
+    def _bridged_from(self, island: _Island, first: int) -> dict[int, How]:
+        """Components that no chain of links connects to the first one, and what does."""
+
+        def reached(*ways: How) -> set[int]:
+            out, changed = {first}, True
+            joined = [
+                {self._component_of[j.link.i], self._component_of[j.link.j]}
+                for j in island.joins
+                if j.how in ways
+            ]
+            while changed:
+                more = {c for ends in joined if ends & out for c in ends}
+                changed = not more <= out
+                out |= more
+            return out
+
+        by_links, by_odometry = reached("links"), reached("links", "odometry")
+        bridged: dict[int, How] = dict.fromkeys(island.T.keys() - by_links, "motion")
+        bridged.update(dict.fromkeys(by_odometry - by_links, "odometry"))
+        return bridged
 
     def _learn_from_neighbours(self) -> None:
         """Learn the usual fit and contradiction from neighbouring views of one component."""
@@ -808,6 +825,50 @@ def _reach(before: Stretch, after: Stretch) -> Float64:
         return np.full(2, np.inf)
     elapsed = max(float(after.times[0] - before.times[-1]), 0.0)
     return np.asarray(np.maximum(_FASTER * speeds.max(0), HANDHELD) * elapsed)
+
+
+def _by_odometry(before: Stretch, after: Stretch) -> Link | None:
+    """The motion over a gap by odometry; None without any, or if it is too uncertain.
+
+    Its errors are those of the tracked motions on both sides, and grow as in a random walk.
+    """
+    elapsed = float(after.times[0] - before.times[-1])
+    if before.odometry is None or after.odometry is None or elapsed <= 0:
+        return None
+    T = np.asarray(se3.inverse(before.odometry[-1]) @ after.odometry[0], np.float64)
+    misfits, lengths, intervals = [], [], []
+    for side, odometry in ((before, before.odometry), (after, after.odometry)):
+        tracked = se3.inverse(side.poses[:-1]) @ side.poses[1:]
+        measured = se3.inverse(odometry[:-1]) @ odometry[1:]
+        misfits.append(se3.log(se3.inverse(tracked) @ measured))
+        lengths.append(_lengths(measured))
+        intervals.append(np.diff(side.times))
+    misfit = np.concatenate(misfits)
+    known = np.isfinite(misfit).all(1)
+    if known.sum() < _MIN_COMPARED or not np.isfinite(T).all():
+        return None
+    steps = max(elapsed / max(float(np.median(np.concatenate(intervals))), 1e-9), 1.0)
+    # Errors of odometry are in proportion to the motion.
+    usual = np.median(np.concatenate(lengths)[known], axis=0) * steps
+    more = np.maximum(_lengths(T[None])[0] / np.maximum(usual, 1e-9), 1.0)
+    sigma = 1.4826 * np.median(np.abs(misfit[known]), axis=0) * np.sqrt(steps) * np.repeat(more, 3)
+    limit = np.repeat([_MAX_ALIGNED * before.depth, _MAX_ALIGNED], 3)
+    if (sigma > limit).any():
+        return None
+    sigma = np.maximum(sigma, 0.1 * limit)
+    made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
+    return Link(
+        int(before.frames[-1]),
+        int(after.frames[0]),
+        made,
+        certain=False,
+        how="bridged by odometry",
+    )
+
+
+def _lengths(T: Float64) -> Float64:
+    """(K, 2) lengths, m, and angles, rad, of motions (K, 4, 4)."""
+    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(se3.angle(T))], 1)
 
 
 def _bridged(before: Stretch, after: Stretch) -> Link | None:

@@ -10,7 +10,11 @@ from tofuse.results.types import Component
 
 _COLORS = 6  # in the style sheet; further components reuse them
 
-_JOINED = {"links": "links between views", "motion": "extrapolated motion only"}
+_JOINED = {
+    "links": "links between views",
+    "motion": "extrapolated motion only",
+    "odometry": "recorded odometry only",
+}
 
 
 def color(component: int) -> int:

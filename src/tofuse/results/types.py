@@ -178,8 +178,9 @@ class Component:
     T_main_component
         (4, 4), the identity for component 0, the main one; None where it is not connected to it.
     joined
-        How it was connected: by "links" between its views and others, or by extrapolated "motion"
-        over the gap only; None for component 0 and where it is not connected.
+        How it was connected: by "links" between its views and others, or over the gap only by
+        recorded "odometry" or extrapolated "motion"; None for component 0 and where it is not
+        connected.
     result
         Its own model, where it is not part of the main one and has more than a few frames: that of
         its frames only, in its own world frame.
@@ -187,7 +188,7 @@ class Component:
 
     frames: tuple[Range, ...]
     T_main_component: Float64 | None
-    joined: Literal["links", "motion"] | None
+    joined: Literal["links", "motion", "odometry"] | None
     result: Reconstruction | None = None
 
     @property

@@ -14,7 +14,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "images_disagree": ("failed", "Most overlapping measurements contradict the poses."),
     "lost_frames": ("degraded", "Some readable frames have no pose."),
     "disconnected": ("degraded", "The recording consists of disconnected parts."),
-    "bridged_gap": ("degraded", "Parts are connected by extrapolated motion only."),
+    "bridged_gap": ("degraded", "Parts are connected over a gap without overlap."),
     "single_link": ("degraded", "Parts are connected by a single registration."),
     "images_differ": ("degraded", "Overlapping frames agree less than consecutive ones do."),
     "jumped": ("degraded", "A frame's pose jumps away from the predicted motion."),
