@@ -88,6 +88,28 @@ def test_what_the_recording_shows_is_added() -> None:
     assert np.trace(C[5, :3, :3]) > 0.05**2
 
 
+def test_halves_of_the_images_replace_a_covariance_that_is_too_small() -> None:
+    plain = accuracy_of(walk(), Shown(), 1.0)
+    stated = plain.position_m / accuracy._HIDDEN
+    assert accuracy_of(walk(), Shown(split_m=0.3 * stated), 1.0) == plain
+    one, more = (accuracy_of(walk(), Shown(split_m=k * stated), 1.0) for k in (2, 4))
+    # They are rms errors, and a bound on them is larger.
+    assert one.position_m > 2 * plain.position_m
+    assert more.position_m == pytest.approx(2 * one.position_m)
+    assert more.rotation_rad == plain.rotation_rad
+    C = [covariances_of(walk(), Shown(split_m=m))[5] for m in (0.0, 3 * stated)]
+    assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
+    np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
+
+
+def test_the_refinement_and_halves_of_the_images_show_the_same_errors() -> None:
+    """The larger one counts, as both stand for errors that pairs of views share."""
+    moved = accuracy_of(walk(), Shown(moved_m=0.5), 1.0)
+    assert accuracy_of(walk(), Shown(moved_m=0.5, split_m=0.1), 1.0) == moved
+    split = accuracy_of(walk(), Shown(split_m=0.5), 1.0)
+    assert accuracy_of(walk(), Shown(moved_m=0.1, split_m=0.5), 1.0) == split
+
+
 @pytest.mark.parametrize("direction", [X, TURN])
 def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
     """However much information noise has made of it; frames on both sides stay bounded."""

@@ -2,7 +2,8 @@
 
 The joint covariance of the poses covers noise and the errors that the patches of a view share.
 Three terms are added. The motion of the trajectory in the refinement measures the correlated errors
-of single registrations, and the remaining error is in proportion to it. If poses are wrong, views
+of single registrations, and the remaining error is in proportion to it; if halves of the images
+show more than the covariance and this together, that takes their place. If poses are wrong, views
 far apart in time that see the same surface disagree by more than consecutive ones. And a loop that
 another calibration would close shows that this one bends the path. The factor for errors that show
 in none of these is derived in `docs/uncertainty.md`.
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaincinv
 
-from tofuse.arrays import Bool, Float64
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph.covariances import joint_covariance, pose_covariances
 from tofuse.posegraph.graph import PoseGraph
@@ -95,6 +96,9 @@ class Shown:
         Rms by which views far apart in time disagree, beyond consecutive ones.
     gap_m, gap_rad
         Closure error of a loop that a better calibration would close; 0 without alarm.
+    split_m, split_rad
+        Rms errors by halves of the images, see `split_half`: those of the covariance and those that
+        `moved` stands for.
     """
 
     moved_m: float = 0.0
@@ -102,16 +106,63 @@ class Shown:
     excess_m: float = 0.0
     gap_m: float = 0.0
     gap_rad: float = 0.0
+    split_m: float = 0.0
+    split_rad: float = 0.0
 
-    @property
-    def position_m(self) -> float:
-        """Their combined rms in position, m."""
-        return float(np.linalg.norm([self.moved_m, self.excess_m, self.gap_m]))
+    def beyond(self, stated: _Stated | None) -> Float64:
+        """Return the combined errors (2,) in m and rad that are missing in the covariance.
 
-    @property
-    def rotation_rad(self) -> float:
-        """Their combined rms in rotation, rad."""
-        return float(np.hypot(self.moved_rad, self.gap_rad))
+        Parameters
+        ----------
+        stated
+            Errors by the covariance; None if it bounds nothing.
+        """
+        correlated = np.array([self.moved_m, self.moved_rad])
+        if stated is not None:
+            # As likely to be exceeded as the bounds are.
+            quantile = stated.bounds / np.maximum(stated.rms, 1e-12)
+            split = np.array([self.split_m, self.split_rad]) * quantile
+            missing = np.sqrt(np.maximum(split**2 - stated.bounds**2, 0.0))
+            correlated = np.maximum(correlated, missing)
+        excess, gap = np.array([self.excess_m, 0.0]), np.array([self.gap_m, self.gap_rad])
+        return np.asarray(np.sqrt(correlated**2 + excess**2 + gap**2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Stated:
+    """Errors by the covariance alone, in m and rad.
+
+    Attributes
+    ----------
+    positions
+        (m,) positions of the poses that were looked at.
+    bounds, rms
+        (2,) 95 % bounds on the rms errors of all poses, and expected rms.
+    single
+        (m, 2) 95 % bounds on the errors of these poses.
+    """
+
+    positions: Intp
+    bounds: Float64
+    rms: Float64
+    single: Float64
+
+    @classmethod
+    def by(cls, graph: PoseGraph, more: Intp | None = None) -> _Stated | None:
+        """Look at evenly spaced poses and `more`; None if the graph does not constrain all poses.
+
+        The rms is that of the evenly spaced ones.
+        """
+        n = len(graph.ids)
+        even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
+        positions = even if more is None else np.union1d(even, more)
+        C = joint_covariance(graph, positions) if n > 1 else None
+        if C is None:
+            return None
+        chosen = np.isin(positions, even)
+        found = [_bounds(part, chosen) for part in _aligned(C, graph.poses[positions], chosen)]
+        bounds, rms, single = zip(*found, strict=True)
+        return cls(positions, np.array(bounds), np.array(rms), np.stack(single, 1))
 
 
 def degenerate_directions(
@@ -220,23 +271,15 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
     limits = np.array([max(least_m, _UNMEASURED_FRACTION * diagonal_m), least_rad])
     covariances, unbounded = _single(graph, limits)
     free = tuple(graph.ids[unbounded.any(1)].tolist())
-    even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
     size = np.nan_to_num(np.trace(covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
-    loosest = np.argsort(-size, kind="stable")[:_WORST]
-    looked_at = np.union1d(even, loosest)
-    C = joint_covariance(graph, looked_at)
-    if C is None:
+    stated = _Stated.by(graph, np.argsort(-size, kind="stable")[:_WORST])
+    if stated is None:
         first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
         return Accuracy(assessed=True, worst=first, unbounded=free)
-    rms = np.isin(looked_at, even)
-    of_all: list[float] = []
-    single: list[Float64] = []
-    both = (shown.position_m, shown.rotation_rad)
-    for part, extra in zip(_aligned(C, graph.poses[looked_at], rms), both, strict=True):
-        overall, each = _bounds(part, rms)
-        of_all.append(_HIDDEN * float(np.hypot(overall, extra)))
-        single.append(_HIDDEN * np.hypot(each, extra))
-    of_each = np.where(unbounded[looked_at], np.inf, np.stack(single, 1))
+    extra = shown.beyond(stated)
+    of_all = _HIDDEN * np.hypot(stated.bounds, extra)
+    single = _HIDDEN * np.hypot(stated.single, extra)
+    of_each = np.where(unbounded[stated.positions], np.inf, single)
     worst = int(np.argmax((of_each / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
     return Accuracy(
@@ -244,7 +287,7 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
         rotation,
         position / diagonal_m if diagonal_m > 0 else np.inf,
         True,
-        WorstFrame(int(graph.ids[looked_at[worst]]), *of_each[worst].tolist()),
+        WorstFrame(int(graph.ids[stated.positions[worst]]), *of_each[worst].tolist()),
         free,
     )
 
@@ -255,7 +298,7 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
     metres.
     """
-    more = np.repeat([shown.position_m**2 / 3, shown.rotation_rad**2 / 3], 3)
+    more = np.repeat(shown.beyond(_Stated.by(graph)) ** 2 / 3, 3)
     C = pose_covariances(graph)
     C[1:] += np.diag(more)
     return _HIDDEN**2 * C
@@ -320,13 +363,17 @@ def _without(C: Float64, motion: Float64, rms: Bool) -> Float64:
     return np.asarray(left @ C @ left.T, np.float64)
 
 
-def _bounds(C: Float64, rms: Bool) -> tuple[float, Float64]:
-    """95 % bounds of the rms over the chosen ones, and of each one's length (m,)."""
-    m = len(rms)
+def _bounds(C: Float64, rms: Bool) -> tuple[float, float, Float64]:
+    """95 % bound of the rms over the chosen ones, its expectation, and bounds of each (m,)."""
+    m, count = len(rms), int(rms.sum())
     chosen = np.repeat(rms, 3)
-    overall = _quantile(C[np.ix_(chosen, chosen)]) / rms.sum()
+    own = C[np.ix_(chosen, chosen)]
     blocks = C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
-    return float(np.sqrt(overall)), np.sqrt([_quantile(block) for block in blocks])
+    return (
+        float(np.sqrt(_quantile(own) / count)),
+        float(np.sqrt(np.trace(own) / count)),
+        np.sqrt([_quantile(block) for block in blocks]),
+    )
 
 
 def _quantile(C: Float64) -> float:

@@ -24,6 +24,7 @@ from tofuse.posegraph.calibration_check import (
 )
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.joint_alignment import Priors, Refined, RefineOptions, refine
+from tofuse.posegraph.split_half import split_half_errors
 from tofuse.posegraph.submaps import RefinedSubmap, fell, refine_submaps
 from tofuse.posegraph.view_store import KeptView, Outline, PosedView, Spilled, ViewStore
 from tofuse.recordings.frames import Frame
@@ -68,6 +69,8 @@ class Refinement:
         Evidence for errors of the camera, if it was computed.
     stated
         Pairs (i, j) of edges that do not come from the overlap of the two views.
+    split_m, split_rad
+        Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
     """
 
     poses: Float64
@@ -81,6 +84,8 @@ class Refinement:
     edges: tuple[Measured, ...] = ()
     calibration_check: CalibrationCheck | None = None
     stated: tuple[tuple[int, int], ...] = ()
+    split_m: float = 0.0
+    split_rad: float = 0.0
 
 
 class Refiner(Protocol):
@@ -250,12 +255,36 @@ class _Joint(Refiner):
         if mean[1] < mean[0]:
             # The poses were at the optimum already; the measurements give their covariances.
             after = before
+        evidence = found()
         return replace(
             moved_to(unchanged, at, after),
-            calibration_check=found(),
+            calibration_check=evidence.calibration,
+            split_m=evidence.split[0],
+            split_rad=evidence.split[1],
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What refined views show: errors of the camera, and (m, rad) of the poses by halves."""
+
+    calibration: CalibrationCheck
+    split: tuple[float, float]
+
+    @classmethod
+    def of(cls, one: RefinedSubmap, options: Joint) -> _Evidence:
+        numbers = [_ERRORS[name] for name in options.calibrate]
+        split = split_half_errors(one.views, one.refined, options.alignment, one.priors, numbers)
+        return cls(_calibration_check(one, options), split)
+
+    @classmethod
+    def of_all(cls, parts: Sequence[_Evidence]) -> _Evidence:
+        """Combine the evidence of submaps."""
+        splits = np.array([p.split for p in parts]).reshape(-1, 2)
+        m, rad = np.sqrt((splits**2).sum(0) / max(len(parts), 1)).tolist()
+        return cls(of_submaps([p.calibration for p in parts]), (m, rad))
 
 
 def _together(
@@ -264,15 +293,14 @@ def _together(
     poses: Float64,
     measured: SensorPriors,
     _: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], CalibrationCheck]]:
-    """Refine all views at once; also returns a function that computes the calibration check."""
+) -> tuple[Refined, Callable[[], _Evidence]]:
+    """Refine all views at once; also returns a function that evaluates the result."""
     views = [_kept(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     numbers = [_ERRORS[name] for name in options.calibrate]
     refined = refine(views, poses, options.alignment, calibrate=numbers, priors=priors)
-    return refined, lambda: _calibration_check(
-        RefinedSubmap(views, np.arange(len(views)), refined, priors), options
-    )
+    whole = RefinedSubmap(views, np.arange(len(views)), refined, priors)
+    return refined, lambda: _Evidence.of(whole, options)
 
 
 def _in_submaps(
@@ -281,20 +309,20 @@ def _in_submaps(
     poses: Float64,
     measured: SensorPriors,
     store: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], CalibrationCheck]]:
-    """Refine submap by submap; also returns a function that computes the calibration check."""
+) -> tuple[Refined, Callable[[], _Evidence]]:
+    """Refine submap by submap; also returns a function that evaluates the result."""
     ids = [p.index for p in posed]
-    refined, checks = refine_submaps(
+    refined, parts = refine_submaps(
         [_Seen.of(_kept(p, options), store.outlines) for p in posed],
         poses,
         options.alignment,
         options.submap,
         lambda some: [_kept(posed[k], options) for k in some],
         lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
-        partial(_calibration_check, options=options),
+        partial(_Evidence.of, options=options),
         [_ERRORS[name] for name in options.calibrate],
     )
-    return refined, lambda: of_submaps(checks)
+    return refined, lambda: _Evidence.of_all(parts)
 
 
 @dataclass(frozen=True, eq=False)

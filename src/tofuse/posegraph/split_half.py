@@ -1,0 +1,85 @@
+"""Errors of refined poses, from halves of the images that are refined apart.
+
+The covariance of the poses assumes that errors are independent between pairs of views, and that
+those within a view have a given correlation length. Errors that depend on the position in the image
+(lens, multipath, smoothing by the camera), or that consecutive views share, are neither, and hardly
+leave residuals. But they differ between the left and the right half of the image, or between the
+upper and the lower half, so poses refined with one half differ from those refined with the other.
+
+With a and b the displacements of the poses when they are refined with either half alone, the mean
+of -a b is the variance of the poses. For halves with the same information this is the square of
+half their difference. If one half hardly constrains a direction, its poses move and those of the
+other half do not, and the product is small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tofuse.arrays import Bool, Float64
+from tofuse.geometry import se3
+from tofuse.posegraph.joint_alignment import Priors, Refined, RefineOptions, Round, refine
+from tofuse.posegraph.shared_error import ACROSS, DOWN
+from tofuse.posegraph.view_store import KeptView
+
+# The poses are near the solution of each half.
+_ROUNDS = (Round(5, 0.0, 0.0),)
+# Every n-th point of a half: what matters is errors that they share.
+_EVERY = 2
+
+
+def split_half_errors(
+    views: Sequence[KeptView],
+    refined: Refined,
+    options: RefineOptions,
+    priors: Priors,
+    calibrate: Sequence[int] = (),
+) -> tuple[float, float]:
+    """Rms errors (m, rad) of refined poses, after alignment, as halves of the images show them.
+
+    Parameters
+    ----------
+    views, options, priors, calibrate
+        As for `refine`, which returned `refined`.
+    """
+    quick = replace(options, rounds=_ROUNDS)
+
+    def displaced(first: bool, halves: Sequence[Bool]) -> tuple[Float64, Float64]:
+        part = [
+            KeptView(v.surface, np.ascontiguousarray(v.points[half == first][::_EVERY]))
+            for v, half in zip(views, halves, strict=True)
+        ]
+        alone = refine(
+            part,
+            refined.poses,
+            quick,
+            calibrate=calibrate,
+            errors=refined.errors,
+            priors=priors,
+            pairs=refined.pairs,
+        )
+        return _displacement(refined.poses, alone.poses)
+
+    variances = np.zeros(2)
+    left = [v.patches % ACROSS < ACROSS // 2 for v in views]
+    upper = [v.patches // ACROSS < DOWN // 2 for v in views]
+    for halves in (left, upper):
+        one, other = displaced(True, halves), displaced(False, halves)
+        product = [-(a * b).sum(1).mean() for a, b in zip(one, other, strict=True)]
+        variances += np.maximum(product, 0.0)
+    position, rotation = np.sqrt(variances).tolist()
+    return position, rotation
+
+
+def _displacement(before: Float64, after: Float64) -> tuple[Float64, Float64]:
+    """Small motions (N, 3) of positions and of rotations in the world, less one of all together."""
+    p = before[:, :3, 3]
+    moved = after[:, :3, 3] - p
+    turned = np.einsum("nij,nj->ni", before[:, :3, :3], se3.log(se3.inverse(before) @ after)[:, 3:])
+    motion = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), -se3.hat(p - p.mean(0))], 2)
+    motion = motion.reshape(-1, 6)
+    moved = moved - (motion @ (np.linalg.pinv(motion) @ moved.ravel())).reshape(-1, 3)
+    return moved, turned - turned.mean(0)
