@@ -150,6 +150,18 @@ def test_a_wrong_focal_length_of_a_camera_that_measures_range_is_corrected(recor
     assert error_of(wrong, result) < 1.1 * result.diagnostics.accuracy.position_m
 
 
+def test_without_a_loop_the_bound_includes_what_a_wrong_focal_length_changes(recording) -> None:
+    half = replace(recording, indices=recording.indices[:12])
+    wrong = seen_by(half, 1.05)
+    result = reconstruct(wrong)
+    assert result.diagnostics.calibrated is None
+    assert "unchecked_calibration" in {r.code for r in result.diagnostics.reasons}
+    assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
+    right = reconstruct(half)
+    assert right.diagnostics.accuracy.position_m < 0.5 * result.diagnostics.accuracy.position_m
+    assert error_of(half, right) < right.diagnostics.accuracy.position_m
+
+
 def test_a_right_one_is_left_as_it_is(recording) -> None:
     result = reconstruct(recording)
     assert result.diagnostics.calibrated is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from aligned_surfaces import OPTIONS, path, surfaces
+from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
@@ -34,6 +35,7 @@ def test_a_camera_that_errs_is_suspected(monkeypatch):
     assert (found.gap.i, found.gap.j) == (0, 11)
     # This path is not bent by it.
     assert found.gap.before[0] < 0.01
+    assert found.moved == pytest.approx(displacement(path(12), refined.poses), rel=0.3)
     assert found.gap.closes
     assert found.support is not None
     assert found.support[1] > found.support[0]

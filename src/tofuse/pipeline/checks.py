@@ -484,7 +484,7 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
 
 
 def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
-    """A calibration that the recording can't check, on which the bound of the poses relies."""
+    """A calibration that the recording can't check."""
     found = None if e.refinement is None else e.refinement.calibration_check
     if found is None or found.alarm:
         return
@@ -497,7 +497,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         cure = " or ".join(camera_in_words(found.unconfirmed))
         text = (
             f"Views agree better with {cure}, but no loop closure confirms it: the stated accuracy "
-            "assumes that the calibration is right."
+            "includes what it would change."
         )
     else:
         return

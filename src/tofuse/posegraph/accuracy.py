@@ -5,8 +5,8 @@ Three terms are added. The motion of the trajectory in the refinement measures t
 of single registrations, and the remaining error is in proportion to it; if halves of the images
 show more than the covariance and this together, that takes their place. If poses are wrong, views
 far apart in time that see the same surface disagree by more than consecutive ones. And a loop that
-another calibration would close shows that this one bends the path. The factor for errors that show
-in none of these is derived in `docs/uncertainty.md`.
+another calibration would close, or views that agree better with it, show that this one bends the
+path. The factor for errors that show in none of these is derived in `docs/uncertainty.md`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ class Shown:
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
     gap_m, gap_rad
-        Closure error of a loop that a better calibration would close; 0 without alarm.
+        Closure error of a loop that a better calibration would close, or the motion of the poses
+        by a calibration that views agree with better, if there is no loop; else 0.
     split_m, split_rad
         Rms errors by halves of the images, see `split_half`: those of the covariance and those that
         `moved` stands for.

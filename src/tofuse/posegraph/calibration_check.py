@@ -31,6 +31,7 @@ from tofuse.posegraph.joint_alignment import (
     response,
     spread_evenly,
 )
+from tofuse.posegraph.split_half import aligned_motion
 from tofuse.posegraph.view_store import KeptView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
@@ -125,6 +126,8 @@ class CalibrationCheck:
     focal_sigma
         Standard deviation of the focal length estimated from the views, as a fraction; None if
         there are too few views.
+    moved
+        Rms motion (m, rad) of the poses, after alignment, if `best` is corrected.
     """
 
     alarm: bool = False
@@ -134,6 +137,7 @@ class CalibrationCheck:
     gap: Gap | None = None
     best: str = ""
     focal_sigma: float | None = None
+    moved: tuple[float, float] = (0.0, 0.0)
 
     @property
     def undetermined(self) -> bool:
@@ -209,6 +213,7 @@ def check_calibration(
     elif (closed := by_loop()).alarm:
         return closed
     support = float(best.before.of_views(len(views)).mean())
+    position, rotation = aligned_motion(poses, best.poses)
     return CalibrationCheck(
         alarm,
         {name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found},
@@ -217,6 +222,7 @@ def check_calibration(
         gap,
         name_of_best,
         focal_sigma,
+        (_rms(position), _rms(rotation)),
     )
 
 
@@ -233,6 +239,10 @@ def of_submaps(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     # One submap that determines the camera speaks for all of them.
     quiet.sort(key=lambda s: (s.gap is None, s.undetermined))
     return quiet[0] if quiet else CalibrationCheck()
+
+
+def _rms(vectors: Float64) -> float:
+    return float(np.sqrt((vectors**2).sum(1).mean()))
 
 
 def _gain(found: Refined, views: Sequence[KeptView]) -> float:

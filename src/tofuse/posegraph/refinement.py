@@ -249,8 +249,10 @@ class _Joint(Refiner):
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
         gained = support[1] - support[0]
-        if not len(refined.pairs) or fell(gained):
+        if not len(refined.pairs):
             return unchanged
+        if fell(gained):  # the camera may be the cause
+            return replace(unchanged, calibration_check=found().calibration)
         after = without_losers(before, refined.poses, gained < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were at the optimum already; the measurements give their covariances.

@@ -61,7 +61,7 @@ def split_half_errors(
             priors=priors,
             pairs=refined.pairs,
         )
-        return _displacement(refined.poses, alone.poses)
+        return aligned_motion(refined.poses, alone.poses)
 
     variances = np.zeros(2)
     left = [v.patches % ACROSS < ACROSS // 2 for v in views]
@@ -74,8 +74,14 @@ def split_half_errors(
     return position, rotation
 
 
-def _displacement(before: Float64, after: Float64) -> tuple[Float64, Float64]:
-    """Small motions (N, 3) of positions and of rotations in the world, less one of all together."""
+def aligned_motion(before: Float64, after: Float64) -> tuple[Float64, Float64]:
+    """Return small motions of positions and of rotations (N, 3), less one of all poses together.
+
+    Parameters
+    ----------
+    before, after
+        (N, 4, 4) T_world_camera; motions are in the world, m and rad.
+    """
     p = before[:, :3, 3]
     moved = after[:, :3, 3] - p
     turned = np.einsum("nij,nj->ni", before[:, :3, :3], se3.log(se3.inverse(before) @ after)[:, 3:])
