@@ -14,12 +14,17 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.fusion import exchange
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
-from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
+from tofuse.fusion.edge_collapse import collapse_edges, with_distinct_corners
+from tofuse.kernels.clustering import flatten_groups, has_area, number_keys, plane_sums, union_faces
 
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
 # Triangles from which the mean size is estimated.
 _MAX_SAMPLED = 100_000
+# Triangles whose edges are collapsed at once: about 0.4 GB of memory, which the library keeps.
+_MAX_COLLAPSED = 1_000_000
+# Smallest height of a triangle relative to its longest edge: below it, float32 leaves no normal.
+_MIN_HEIGHT = 1e-6
 # Vertices with a smaller cosine between their normals are on different sides of a thin sheet.
 _BEHIND = -0.3
 
@@ -158,7 +163,35 @@ class Mesh:
         )
 
     def decimated(self, faces: int) -> Mesh:
-        """Return the mesh simplified to at most `faces` triangles, or nearly as many."""
+        """Return the mesh reduced to at most `faces` triangles by collapsing edges.
+
+        A vertex has the mean normal, known colour and variance of the vertices merged into it, and
+        the largest of their numbers of views. Very large meshes are first reduced by `clustered`,
+        which takes less memory; as are those of so many pieces that edges are not enough.
+        """
+        if len(self.faces) <= faces:
+            return self
+        mesh = self._without_degenerate()
+        if len(mesh.faces) > _MAX_COLLAPSED:
+            mesh = mesh.clustered(max(faces, _MAX_COLLAPSED))._without_degenerate()
+        if len(mesh.faces) <= faces:
+            return mesh
+        group, places = collapse_edges(mesh.vertices, mesh.faces, faces, mesh.spacing)
+        left = with_distinct_corners(group[mesh.faces])
+        if len(left) <= faces:
+            small = mesh._merged(group, np.bincount(group), left, places)
+        else:
+            small = mesh.clustered(faces)
+        return small._without_degenerate()
+
+    def _without_degenerate(self) -> Mesh:
+        """Return the mesh of the triangles that have an area and are finite."""
+        good = np.empty(len(self.faces), bool)
+        has_area(self.vertices, self.faces, _MIN_HEIGHT, good)
+        return self.rows(good)
+
+    def clustered(self, faces: int) -> Mesh:
+        """Return the mesh simplified to at most `faces` triangles: faster than `decimated`."""
         if len(self.faces) <= faces:
             return self
         some = self.faces[:: -(-len(self.faces) // _MAX_SAMPLED)]
@@ -168,9 +201,9 @@ class Mesh:
         cell = float(np.sqrt(2 * area / faces))  # two triangles a cell, if it is flat
         while True:
             group, count = self._groups(cell)
-            left = self._regrouped(group)
+            left = with_distinct_corners(group[self.faces])
             if len(left) <= faces:
-                return self._merged(group, count, left, cell)
+                return self._merged(group, count, left, self._places(group, count, cell))
             # A larger step than for a flat surface.
             cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
 
@@ -189,7 +222,8 @@ class Mesh:
         if len(self) == 0:
             return self
         group, count = self._groups(cell_m)
-        return self._merged(group, count, self._regrouped(group), cell_m)
+        left = with_distinct_corners(group[self.faces])
+        return self._merged(group, count, left, self._places(group, count, cell_m))
 
     def _groups(self, cell_m: float) -> tuple[Intp, Intp]:
         """Return the group of each vertex (N,), and the size of each group (G,)."""
@@ -209,31 +243,19 @@ class Mesh:
         count = np.bincount(side, minlength=2 * len(order))
         return (np.cumsum(count > 0) - 1)[side], count[count > 0]
 
-    def _regrouped(self, group: Intp) -> Int32:
-        """Return the faces between groups, without degenerate ones."""
-        a, b, c = (group[self.faces[:, k]] for k in range(3))
-        left = (a != b) & (b != c) & (c != a)
-        return np.stack([a[left], b[left], c[left]], -1).astype(np.int32)
-
-    def _merged(self, group: Intp, count: Intp, faces: Int32, cell_m: float) -> Mesh:
-        def mean(values: NDArray[np.generic]) -> Float64:
-            columns = values.reshape(len(values), -1).T
-            sums = [np.bincount(group, column.astype(float), len(count)) for column in columns]
-            return np.stack(sums, -1).reshape(-1, *values.shape[1:]) / count.reshape(
-                -1, *(1,) * (values.ndim - 1)
-            )
-
-        normals = mean(self.normals)
+    def _merged(self, group: Intp, count: Intp, faces: Int32, places: Float64) -> Mesh:
+        """Return the mesh of groups (N,) of vertices, of sizes (G,), at places (G, 3), m."""
+        normals = _means(self.normals, group, count)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
         most = np.zeros(len(count), np.int32)
         np.maximum.at(most, group, self.views)
         merged = Mesh(
-            self._near_planes(group, mean(self.vertices), cell_m).astype(np.float32),
+            places.astype(np.float32),
             faces,
             normals.astype(np.float32),
             self._mean_color(group, len(count)),
-            np.sqrt(mean(self.sigma.astype(float) ** 2)).astype(np.float32),
+            np.sqrt(_means(self.sigma.astype(float) ** 2, group, count)).astype(np.float32),
             most,
             self.offset,
         )
@@ -248,11 +270,12 @@ class Mesh:
         sums = [np.bincount(group[known], c[known].astype(float), groups) for c in self.color.T]
         return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
 
-    def _near_planes(self, group: Intp, middles: Float64, cell_m: float) -> Float64:
+    def _places(self, group: Intp, count: Intp, cell_m: float) -> Float64:
         """Return the place (G, 3) of each group by least squares on the planes of its triangles.
 
-        Unconstrained directions stay at the centroid (G, 3); the step is at most half a cell.
+        Unconstrained directions stay at the centroid; the step is at most half a cell.
         """
+        middles = _means(self.vertices, group, count)
         A = np.zeros((len(middles), 3, 3))
         b = np.zeros((len(middles), 3))
         plane_sums(self.vertices, self.faces, group, middles, A, b)
@@ -262,6 +285,15 @@ class Mesh:
             ..., 0
         ]
         return middles + step.clip(-0.5 * cell_m, 0.5 * cell_m)
+
+
+def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
+    """Return the means (G, ...) of values (N, ...) of groups of sizes (G,)."""
+    columns = values.reshape(len(values), -1).T
+    sums = [np.bincount(group, column.astype(float), len(count)) for column in columns]
+    return np.stack(sums, -1).reshape(-1, *values.shape[1:]) / count.reshape(
+        -1, *(1,) * (values.ndim - 1)
+    )
 
 
 def _loops(edges: Int64) -> list[Int64]:

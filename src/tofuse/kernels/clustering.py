@@ -1,10 +1,10 @@
-"""Vertex clustering: connected components, unique keys, and quadrics of the adjacent triangles."""
+"""Simplification: connected components, unique keys, quadrics and areas of triangles."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64, Int32, Int64
+from tofuse.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.kernels.blocks import EMPTY, slot_of
 from tofuse.kernels.jit import kernel
 
@@ -126,3 +126,29 @@ def plane_sums(
                 b[g, i] += area * n[i] * height
                 for j in range(i, 3):
                     A[g, i, j] += area * n[i] * n[j]
+
+
+@kernel
+def has_area(vertices: Float32, faces: Int32, min_height: float, out: Bool) -> None:
+    """Write which triangles are not degenerate to `out` (M,).
+
+    Parameters
+    ----------
+    vertices, faces
+        (N, 3) m, and (M, 3) rows of them. Triangles of vertices that are not finite have no area.
+    min_height
+        Smallest height, relative to the longest edge.
+    """
+    e = np.empty((3, 3))
+    for m in range(len(faces)):
+        longest2 = 0.0
+        for k in range(3):
+            length2 = 0.0
+            for i in range(3):
+                e[k, i] = float(vertices[faces[m, (k + 1) % 3], i]) - vertices[faces[m, k], i]
+                length2 += e[k, i] * e[k, i]
+            longest2 = max(longest2, length2)
+        x = e[0, 1] * e[1, 2] - e[0, 2] * e[1, 1]
+        y = e[0, 2] * e[1, 0] - e[0, 0] * e[1, 2]
+        z = e[0, 0] * e[1, 1] - e[0, 1] * e[1, 0]
+        out[m] = np.sqrt(x * x + y * y + z * z) > min_height * longest2

@@ -73,7 +73,7 @@ class Scene:
         """The surface, simplified for a browser on a phone; None without one."""
         if self.surface is None or len(self.surface.faces) == 0:
             return None
-        return self.surface.decimated(MAX_FACES)
+        return self.surface.clustered(MAX_FACES)
 
     @property
     def box(self) -> Float64:

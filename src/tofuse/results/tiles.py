@@ -99,7 +99,7 @@ def overview(mesh: Mesh) -> Mesh:
     faces = float(OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2))
     fitting = mesh
     while not _fits(fitting):
-        fitting = mesh.decimated(int(faces))
+        fitting = mesh.clustered(int(faces))
         faces *= 0.9
     return fitting
 

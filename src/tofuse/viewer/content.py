@@ -83,7 +83,7 @@ class Layer:
         small = Mesh(
             self.points, self.faces, self.normals, color, sigma.astype(np.float32),
             views.astype(np.int32), np.zeros(3),
-        ).decimated(faces)  # fmt: skip
+        ).clustered(faces)  # fmt: skip
         return Layer(
             small.vertices,
             small.normals,

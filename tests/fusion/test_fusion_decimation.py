@@ -1,0 +1,224 @@
+"""Decimation by collapsing edges: shape, orientation, attributes, and meshes that are unusual."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.surface import Surface, distances
+from tofuse.fusion import mesh as mesh_module
+from tofuse.fusion.edge_collapse import collapse_edges
+from tofuse.fusion.mesh import Mesh
+from tofuse.kernels.kdtree import KdTree
+
+
+def hills(count: int = 120, seed: int = 0) -> Mesh:
+    """A noisy, hilly surface of 2 m, with smooth colours, seen from above."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count))
+    z = 0.1 * np.sin(4 * u) * np.cos(5 * v) + 0.3 * np.abs(u)
+    points = np.stack([u, v, z + rng.normal(0, 5e-4, z.shape)], -1).reshape(-1, 3)
+    k = (np.arange(count - 1) + count * np.arange(count - 1)[:, None]).ravel()
+    faces = np.concatenate(
+        [np.stack([k, k + 1, k + count], 1), np.stack([k + 1, k + count + 1, k + count], 1)]
+    )
+    slope = np.stack(np.gradient(z, 2 / (count - 1)), -1).reshape(-1, 2)
+    normals = np.concatenate([-slope[:, ::-1], np.ones((len(points), 1))], 1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(
+        points.astype(np.float32),
+        faces.astype(np.int32),
+        normals.astype(np.float32),
+        np.round(128 + 100 * np.sin(2 * points)).astype(np.uint8),
+        rng.uniform(0.001, 0.01, len(points)).astype(np.float32),
+        rng.integers(1, 40, len(points)).astype(np.int32),
+        np.array([10.0, 20.0, 30.0]),
+    )
+
+
+def together(*meshes: Mesh) -> Mesh:
+    first = np.cumsum([0, *(len(each) for each in meshes)])
+    return Mesh(
+        np.concatenate([each.vertices for each in meshes]),
+        np.concatenate([each.faces + k for each, k in zip(meshes, first, strict=False)]),
+        np.concatenate([each.normals for each in meshes]),
+        np.concatenate([each.color for each in meshes]),
+        np.concatenate([each.sigma for each in meshes]),
+        np.concatenate([each.views for each in meshes]),
+        meshes[0].offset,
+    )
+
+
+def across(mesh: Mesh) -> np.ndarray:
+    """Twice the area of each triangle, along its normal."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(float), 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def off(whole: Mesh, small: Mesh) -> float:
+    """Mean distance of either surface from the other, m."""
+    one, other = (Surface(m.vertices.astype(float), m.faces) for m in (whole, small))
+    there = distances(one.samples(40_000)[0], other, 100_000)
+    back = distances(other.samples(40_000)[0], one, 100_000)
+    return float(there.mean() + back.mean()) / 2
+
+
+def turned_away(whole: Mesh, small: Mesh) -> float:
+    """Share of the area that faces away from the nearest normal of the whole surface."""
+    normals = across(small)
+    middles = small.vertices[small.faces].mean(1)
+    nearest, _ = KdTree(whole.vertices).neighbours(middles, 1)
+    area = np.linalg.norm(normals, axis=1)
+    away = np.einsum("ni,ni->n", normals, whole.normals[nearest[:, 0]]) < 0
+    return float(area[away].sum() / area.sum())
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_it_stays_nearer_to_the_surface_than_clustering(scale: float) -> None:
+    whole = hills()
+    whole = replace(whole, vertices=(scale * whole.vertices).astype(np.float32))
+    by_edges, by_cells = whole.decimated(1500), whole.clustered(1500)
+    assert 1400 < len(by_edges.faces) <= 1500
+    assert off(whole, by_edges) < 0.7 * off(whole, by_cells)
+    assert turned_away(whole, by_edges) < 0.001
+    assert np.linalg.norm(across(by_edges), axis=1).min() > 0
+    np.testing.assert_array_equal(by_edges.offset, whole.offset)
+
+
+def test_attributes_are_means_of_the_vertices_merged() -> None:
+    whole = hills()
+    small = whole.decimated(1500)
+    nearest = KdTree(whole.vertices).neighbours(small.vertices, 1)[0][:, 0]
+    np.testing.assert_allclose(np.linalg.norm(small.normals, axis=1), 1, atol=1e-5)
+    # Off ridges, whose normals on both sides are averaged.
+    smooth = np.abs(small.vertices[:, 0]) > 0.2
+    cosine = np.einsum("ni,ni->n", small.normals, whole.normals[nearest])
+    assert cosine[smooth].min() > 0.85
+    difference = np.abs(small.color.astype(int) - whole.color[nearest])
+    assert difference.mean() < 4
+    for name in ("color", "sigma", "views"):
+        given, kept = getattr(whole, name), getattr(small, name)
+        assert (kept.min(0) >= given.min(0)).all()
+        assert (kept.max(0) <= given.max(0)).all()
+    # What has no colour darkens nothing.
+    half = np.where(whole.vertices[:, :1] > 0, 0, [200, 100, 50]).astype(np.uint8)
+    colors = np.unique(replace(whole, color=half).decimated(1500).color, axis=0)
+    np.testing.assert_array_equal(colors, [[0, 0, 0], [200, 100, 50]])
+    assert replace(whole, color=None).decimated(1500).color is None
+
+
+def test_groups_are_the_collapsed_vertices() -> None:
+    """The library's own triangles are those between the groups."""
+    from fast_simplification import simplify
+
+    whole = hills(60)
+    group, places = collapse_edges(whole.vertices, whole.faces, 2000, whole.spacing)
+    assert len(places) == group.max() + 1
+    middle = whole.vertices.mean(0, dtype=float)
+    unit = 200 * whole.spacing
+    moved, left = simplify((whole.vertices - middle) / unit, whole.faces, target_count=2000, agg=3)
+    a, b, c = group[whole.faces].T
+    found = group[whole.faces][(a != b) & (b != c) & (c != a)]
+    np.testing.assert_allclose(places[found], moved[left] * unit + middle, atol=1e-9)
+
+
+def test_it_is_the_same_in_another_process() -> None:
+    code = (
+        "import hashlib, sys; sys.path.insert(0, sys.argv[1])\n"
+        "from test_fusion_decimation import digest, hills\n"
+        "print(digest(hills().decimated(700)))"
+    )
+    folder = __file__.rpartition("test_fusion_decimation")[0]
+    done = subprocess.run(
+        [sys.executable, "-c", code, folder], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == digest(hills().decimated(700))
+
+
+def digest(mesh: Mesh) -> str:
+    parts = (mesh.vertices, mesh.faces, mesh.normals, mesh.color, mesh.sigma, mesh.views)
+    return hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
+
+
+def test_small_and_empty_meshes_are_unchanged() -> None:
+    whole = hills(20)
+    assert whole.decimated(len(whole.faces)) is whole
+    empty = whole.rows(np.zeros(len(whole.faces), bool))
+    assert empty.decimated(10) is empty
+
+
+def test_several_pieces() -> None:
+    """Each is reduced; single triangles, which can't be reduced, leave the limit in force."""
+    left, right = hills(40), hills(40, seed=1)
+    right = replace(right, vertices=(right.vertices + np.array([3, 0, 0])).astype(np.float32))
+    small = together(left, right).decimated(600)
+    assert 550 < len(small.faces) <= 600
+    beyond = small.vertices[:, 0] > 1.5
+    assert len(set(map(tuple, beyond[small.faces].tolist()))) == 2  # no triangle between them
+    rng = np.random.default_rng(5)
+    n = 900
+    scraps = Mesh(
+        (rng.uniform(-1, 1, (n // 3, 1, 3)) + 0.01 * rng.normal(size=(n // 3, 3, 3)))
+        .reshape(-1, 3).astype(np.float32),
+        np.arange(n, dtype=np.int32).reshape(-1, 3),
+        np.tile(np.float32([0, 0, 1]), (n, 1)),
+        None, np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
+    )  # fmt: skip
+    assert len(scraps.decimated(100).faces) <= 100
+
+
+def test_where_edges_are_not_enough_vertices_are_clustered(monkeypatch) -> None:
+    whole = hills(30)
+    monkeypatch.setattr(
+        mesh_module,
+        "collapse_edges",
+        lambda vertices, *_: (np.arange(len(vertices)), vertices.astype(float)),
+    )
+    assert digest(whole.decimated(200)) == digest(whole.clustered(200))
+
+
+def test_large_meshes_are_clustered_first(monkeypatch) -> None:
+    whole = hills()
+    seen = []
+
+    def recorded(vertices, faces, count, spacing):
+        seen.append(len(faces))
+        return collapse_edges(vertices, faces, count, spacing)
+
+    monkeypatch.setattr(mesh_module, "collapse_edges", recorded)
+    monkeypatch.setattr(mesh_module, "_MAX_COLLAPSED", 10_000)
+    assert len(whole.decimated(1500).faces) <= 1500
+    assert digest(whole.decimated(12_000)) == digest(whole.clustered(12_000))
+    assert len(seen) == 1
+    assert 5000 < seen[0] <= 10_000
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_mesh_is_too_irregular(seed: int) -> None:
+    """Soups with non-manifold edges, duplicates, coincident and infinite vertices."""
+    rng = np.random.default_rng(seed)
+    n = 200
+    points = rng.normal(size=(n, 3))
+    if seed % 3 == 0:
+        points = np.round(points, 1)
+    if seed % 3 == 1:
+        points[:, 2] = 0
+    faces = rng.integers(0, n, (600, 3))
+    faces = np.concatenate([faces, faces[::3], faces[::4, ::-1]])
+    points[:3] = [[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf]]
+    soup = Mesh(
+        points.astype(np.float32), faces.astype(np.int32),
+        np.tile(np.float32([0, 0, 1]), (n, 1)), None,
+        np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
+    )  # fmt: skip
+    for count in (1, 40, 500):
+        small = soup.decimated(count)
+        assert len(small.faces) <= count
+        assert np.isfinite(small.vertices).all()
+        assert (np.linalg.norm(across(small), axis=1) > 0).all()
+        assert len(np.unique(small.faces)) == len(small)
