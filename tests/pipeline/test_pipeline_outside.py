@@ -67,7 +67,8 @@ def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, roo
     # How loosely the path is held is told with them, but the verdict is that of the images.
     assert both.diagnostics.verdict == alone.diagnostics.verdict
     stated, by_images = (r.diagnostics.accuracy for r in (both, alone))
-    assert stated.rotation_rad == pytest.approx(by_images.rotation_rad, rel=0.05)
+    # Tracking starts nearer to the solution, and the correction by the refinement is part of it.
+    assert 0.7 * by_images.rotation_rad < stated.rotation_rad < 1.05 * by_images.rotation_rad
     last = [r.diagnostics.frames[-1].covariance for r in (both, alone)]
     assert last[0] is not None
     assert last[1] is not None

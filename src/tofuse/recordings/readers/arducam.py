@@ -79,7 +79,6 @@ class ArducamSource(FileSource):
         self.confidence = _next(self.depth, _images(path, "confidence"))
         self.metadata |= {
             "depth_kind": self.description.depth_kind,
-            "depth_unit_m": self.description.depth_unit_m,
             "confidence_max": CONFIDENCE_MAX,
         }
         if self.description.sensor is not None:
