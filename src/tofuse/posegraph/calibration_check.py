@@ -28,6 +28,7 @@ from tofuse.posegraph.joint_alignment import (
     Round,
     align_pairs,
     refine,
+    refine_poses,
     response,
     spread_evenly,
 )
@@ -339,9 +340,8 @@ class _Loop:
         start = self.chained(poses, errors)[1]
         options = replace(self.options, rounds=_ROUNDS)
         views = self.views[self.i : self.j + 1]
-        return float(
-            refine(views, start, options, calibrate=[number], errors=errors).errors[number]
-        )
+        _, kept = refine_poses(views, start, options, calibrate=[number], errors=errors)
+        return float(kept[number])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""

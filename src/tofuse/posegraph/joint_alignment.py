@@ -254,9 +254,66 @@ def refine(
     bodies
         Views that move rigidly together, if any. `priors` then refers to the bodies.
     """
-    start = poses
     if bodies is not None:
-        start = poses = bodies.views(bodies.poses(poses))
+        poses = bodies.views(bodies.poses(poses))
+    start = poses
+    found = _iterate(views, poses, options, calibrate, errors, priors, pairs, bodies)
+    poses, errors, state, known = found.poses, found.errors, found.state, found.known
+    half = len(state.target) // 2
+    pairs = np.stack([state.target[:half], state.source[:half]], 1)
+    last = options.rounds[-1]
+    after = _support(views, poses, errors, known, state, last, options)
+    if not calibrate:
+        _allow_for_shared(views, poses, state, options)
+    measured = _pairwise_measurements(poses, pairs, state)
+    before = _support(views, start, np.zeros_like(errors), known, state, last, options)
+    scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
+    return Refined(poses, start, errors, pairs, found.moved, before, after, *measured, scales)
+
+
+def refine_poses(
+    views: Sequence[KeptView],
+    poses: Float64,
+    options: RefineOptions,
+    *,
+    calibrate: Sequence[int] = (),
+    errors: Float64 | None = None,
+    priors: Priors | None = None,
+    pairs: Intp | None = None,
+) -> tuple[Float64, Float64]:
+    """Return the `poses` and `errors` of `refine` alone, without what it derives from them.
+
+    Parameters
+    ----------
+    views, poses, options, calibrate, errors, priors, pairs
+        As for `refine`.
+    """
+    found = _iterate(views, poses, options, calibrate, errors, priors, pairs, None)
+    return found.poses, found.errors
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterated:
+    """Poses and errors of the camera after the last iteration, with its residuals and scales."""
+
+    poses: Float64
+    errors: Float64
+    state: _Pairs
+    known: Int64
+    moved: tuple[float, ...]
+
+
+def _iterate(
+    views: Sequence[KeptView],
+    poses: Float64,
+    options: RefineOptions,
+    calibrate: Sequence[int],
+    errors: Float64 | None,
+    priors: Priors | None,
+    pairs: Intp | None,
+    bodies: Bodies | None,
+) -> _Iterated:
+    """Gauss-Newton on all residuals, with correspondences found anew; see `refine`."""
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
     known = np.ones(kernels.ERRORS, np.int64)
@@ -285,16 +342,7 @@ def refine(
             since += moved[-1] if pairs is None else 0.0
             if moved[-1] < options.convergence:
                 break
-    half = len(state.target) // 2
-    pairs = np.stack([state.target[:half], state.source[:half]], 1)
-    last = options.rounds[-1]
-    after = _support(views, poses, errors, known, state, last, options)
-    if not calibrate:
-        _allow_for_shared(views, poses, state, options)
-    measured = _pairwise_measurements(poses, pairs, state)
-    before = _support(views, start, np.zeros_like(errors), known, state, last, options)
-    scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
-    return Refined(poses, start, errors, pairs, tuple(moved), before, after, *measured, scales)
+    return _Iterated(poses, errors, state, known, tuple(moved))
 
 
 def support_of(

@@ -244,7 +244,9 @@ class _Joint(Refiner):
             return Refinement(poses, views=len(posed))
         before = poses[at]
         together = _together if len(posed) <= options.submap else _in_submaps
-        refined, found = together(options, posed, before, measured or SensorPriors(), self._store)
+        refined, evidence = together(
+            options, posed, before, measured or SensorPriors(), self._store
+        )
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
@@ -252,17 +254,17 @@ class _Joint(Refiner):
         if not len(refined.pairs):
             return unchanged
         if fell(gained):  # the camera may be the cause
-            return replace(unchanged, calibration_check=found().calibration)
+            return replace(unchanged, calibration_check=evidence.calibration())
         after = without_losers(before, refined.poses, gained < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were at the optimum already; the measurements give their covariances.
             after = before
-        evidence = found()
+        split_m, split_rad = evidence.split()
         return replace(
             moved_to(unchanged, at, after),
-            calibration_check=evidence.calibration,
-            split_m=evidence.split[0],
-            split_rad=evidence.split[1],
+            calibration_check=evidence.calibration(),
+            split_m=split_m,
+            split_rad=split_rad,
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
@@ -272,21 +274,8 @@ class _Joint(Refiner):
 class _Evidence:
     """What refined views show: errors of the camera, and (m, rad) of the poses by halves."""
 
-    calibration: CalibrationCheck
-    split: tuple[float, float]
-
-    @classmethod
-    def of(cls, one: RefinedSubmap, options: Joint) -> _Evidence:
-        numbers = [_ERRORS[name] for name in options.calibrate]
-        split = split_half_errors(one.views, one.refined, options.alignment, one.priors, numbers)
-        return cls(_calibration_check(one, options), split)
-
-    @classmethod
-    def of_all(cls, parts: Sequence[_Evidence]) -> _Evidence:
-        """Combine the evidence of submaps."""
-        splits = np.array([p.split for p in parts]).reshape(-1, 2)
-        m, rad = np.sqrt((splits**2).sum(0) / max(len(parts), 1)).tolist()
-        return cls(of_submaps([p.calibration for p in parts]), (m, rad))
+    calibration: Callable[[], CalibrationCheck]
+    split: Callable[[], tuple[float, float]]
 
 
 def _together(
@@ -295,14 +284,16 @@ def _together(
     poses: Float64,
     measured: SensorPriors,
     _: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], _Evidence]]:
-    """Refine all views at once; also returns a function that evaluates the result."""
+) -> tuple[Refined, _Evidence]:
+    """Refine all views at once."""
     views = [_kept(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     numbers = [_ERRORS[name] for name in options.calibrate]
     refined = refine(views, poses, options.alignment, calibrate=numbers, priors=priors)
     whole = RefinedSubmap(views, np.arange(len(views)), refined, priors)
-    return refined, lambda: _Evidence.of(whole, options)
+    return refined, _Evidence(
+        lambda: _calibration_check(whole, options), lambda: _split_half_errors(whole, options)
+    )
 
 
 def _in_submaps(
@@ -311,8 +302,8 @@ def _in_submaps(
     poses: Float64,
     measured: SensorPriors,
     store: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], _Evidence]]:
-    """Refine submap by submap; also returns a function that evaluates the result."""
+) -> tuple[Refined, _Evidence]:
+    """Refine submap by submap."""
     ids = [p.index for p in posed]
     refined, parts = refine_submaps(
         [_Seen.of(_kept(p, options), store.outlines) for p in posed],
@@ -321,10 +312,29 @@ def _in_submaps(
         options.submap,
         lambda some: [_kept(posed[k], options) for k in some],
         lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
-        partial(_Evidence.of, options=options),
+        partial(_evaluated, options=options),
         [_ERRORS[name] for name in options.calibrate],
     )
-    return refined, lambda: _Evidence.of_all(parts)
+    checks, splits = [check for check, _ in parts], [split for _, split in parts]
+    return refined, _Evidence(lambda: of_submaps(checks), lambda: _mean_errors(splits))
+
+
+def _evaluated(
+    submap: RefinedSubmap, options: Joint
+) -> tuple[CalibrationCheck, tuple[float, float]]:
+    """Evaluate a submap while its views are in memory."""
+    return _calibration_check(submap, options), _split_half_errors(submap, options)
+
+
+def _split_half_errors(one: RefinedSubmap, options: Joint) -> tuple[float, float]:
+    numbers = [_ERRORS[name] for name in options.calibrate]
+    return split_half_errors(one.views, one.refined, options.alignment, one.priors, numbers)
+
+
+def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Root mean squares of errors (m, rad); 0 without any."""
+    m, rad = np.sqrt((np.reshape(errors, (-1, 2)) ** 2).sum(0) / max(len(errors), 1)).tolist()
+    return m, rad
 
 
 @dataclass(frozen=True, eq=False)
