@@ -626,8 +626,10 @@ def _amplitude(frame: RangeFrame) -> Float32 | None:
         )
     if frame.color_image is None or not frame.color_registered:
         return None
-    grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
-    seen = (grey >= _MIN_LEVEL) & (frame.color_image.max(-1) < _MAX_LEVEL)
+    color = np.ascontiguousarray(frame.color_image)
+    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    unsaturated = cv2.inRange(color, (0, 0, 0), (_MAX_LEVEL - 1,) * 3) > 0
+    seen = (grey >= _MIN_LEVEL) & unsaturated
     return np.where(seen, grey, 0).astype(np.float32)
 
 
