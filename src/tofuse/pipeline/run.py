@@ -41,7 +41,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.results.folder import (
     RECORDING,
     OutputFolder,
-    check_free,
+    check_output,
     component_number,
     is_result,
 )
@@ -108,7 +108,7 @@ def run(
     """
     progress = progress or Silent()
     if folder is None:
-        check_free(options.out)
+        check_output(options.out, overwrite=options.overwrite)
     watch = Stopwatch()
     with watch.timing("opening"):
         job = _open(inputs, options, progress)

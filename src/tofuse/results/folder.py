@@ -132,12 +132,13 @@ class OutputFolder:
         self._claim: Claim | None = None
         self._entered = False
         try:
-            self._check(overwrite)  # before anything is touched, and again under the lock
+            # Before anything is touched, and again under the lock.
+            _check_content(self.path, self._contract, overwrite)
             self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
             self._claim = Claim(self.path / LOCK, what=self.path)
             _recover(self.path, self._contract)
-            self._check(overwrite)
+            _check_content(self.path, self._contract, overwrite)
             if not clear(self._staging, self._names):
                 raise check_error(self._staging)
             self._staging.mkdir()
@@ -157,36 +158,6 @@ class OutputFolder:
     ) -> None:
         self._entered = False
         self.discard()
-
-    def _check(self, overwrite: bool) -> None:
-        if self.path.exists() and not self.path.is_dir():
-            raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
-        contract = self._contract
-        if is_interrupted(self._staging):
-            check_interrupted(self._staging, self._names, contract.marker)
-            if any(contract.is_ours(place) for place in places(self._staging, self.path)):
-                return
-        entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
-        entries -= {name for name in entries if name.startswith(UNFINISHED)}
-        if not entries:
-            return
-        if not contract.is_ours(self.path) and entries - {RECORDING}:
-            raise OutputError(
-                "is not empty and contains no earlier result of this command",
-                where=self.path,
-                remedy="pass a new or empty folder as --out",
-            )
-        if not overwrite:
-            raise OutputError(
-                "contains an earlier result"
-                if contract.marker in entries
-                else "contains a recording",
-                where=self.path,
-                remedy="pass --overwrite to replace it, or another --out",
-            )
-        for name in sorted(entries):
-            if self._names.folder(name) and not self._names.is_whole(self.path / name):
-                raise check_error(self.path / name)
 
     @contextmanager
     def staging(self) -> Iterator[Path]:
@@ -232,17 +203,61 @@ class OutputFolder:
                 folder.rmdir()
 
 
-def check_free(path: str | Path) -> None:
-    """Refuse a folder that another process writes into, before `OutputFolder` would.
+def check_output(path: str | Path, *, overwrite: bool) -> None:
+    """Check a folder as `OutputFolder` will, before work that it would be in vain for.
+
+    Parameters
+    ----------
+    path, overwrite
+        As for `OutputFolder`. A folder with checkpoints may be the same run's: its content is not
+        checked.
 
     Raises
     ------
     OutputError
-        If there is one; the message names its process id, host and start time.
+        If the folder can't be written into, or another process writes into it.
     """
-    lock = Path(path) / LOCK
+    path = Path(path)
+    lock = path / LOCK
     if os.path.lexists(lock):
         Claim(lock, what=path).release()
+    if not (path / CHECKPOINT).exists():
+        try:
+            _check_content(path, RESULT, overwrite)
+        except OSError as error:
+            raise _output_error(path, error) from error
+
+
+def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
+    """Refuse a folder with anything but a result that may be replaced."""
+    staging = path / STAGING
+    if path.exists() and not path.is_dir():
+        raise OutputError("is a file", where=path, remedy="pass a folder as --out")
+    if is_interrupted(staging):
+        check_interrupted(staging, contract.names, contract.marker)
+        if any(contract.is_ours(place) for place in places(staging, path)):
+            return
+    entries = {p.name for p in path.iterdir()} if path.exists() else set()
+    entries -= {name for name in entries if name.startswith(UNFINISHED)}
+    if not entries:
+        return
+    if not contract.is_ours(path) and entries - {RECORDING}:
+        raise OutputError(
+            "is not empty and contains no earlier result of this command",
+            where=path,
+            remedy="pass a new or empty folder as --out",
+        )
+    if not overwrite:
+        raise OutputError(
+            "contains an earlier result"
+            if contract.marker in entries
+            else "contains a recording",
+            where=path,
+            remedy="pass --overwrite to replace it, or another --out",
+        )
+    for name in sorted(entries):
+        if contract.names.folder(name) and not contract.names.is_whole(path / name):
+            raise check_error(path / name)
 
 
 def lock_folder(folder: Path) -> Path:
