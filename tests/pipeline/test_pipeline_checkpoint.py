@@ -397,7 +397,7 @@ from tofuse.cli import main
 from tofuse.cli.progress import QuietProgress
 from tofuse.pipeline import checkpoint, run
 run.write_report_files = lambda *a: (a[-1] / "report.html").write_text("report")
-checkpoint._EVERY_S, checkpoint._SHARE = 0.0, 1e9
+checkpoint._EVERY_S, checkpoint._TIME_FRACTION = 0.0, 1e9
 out, last_event, last_move = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 events = moves = 0
 def counted(function):

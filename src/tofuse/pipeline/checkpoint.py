@@ -30,7 +30,8 @@ from tofuse.files.stamps import Stamp, stamp, stamps_in
 from tofuse.pipeline.states import PIECE, StateError, decode, encode
 from tofuse.results.folder import CHECKPOINT
 
-# While frames are tracked, a state is saved at this interval, at most at this fraction of the time.
+# The state of tracking, which is large, is saved at this interval, and at most at this fraction of
+# the time.
 _EVERY_S, _TIME_FRACTION = 10.0, 0.03
 # Free space to leave for the result: a multiple of the state, and bytes.
 _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
@@ -55,7 +56,7 @@ class Stages(Protocol):
         ...
 
     def due(self) -> bool:
-        """Whether the state within a stage should be saved now."""
+        """Whether a large state, such as that within a stage, should be saved now."""
         ...
 
 

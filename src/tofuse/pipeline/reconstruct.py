@@ -129,7 +129,8 @@ def _track(
     if tracked.done < len(recording):
         push_frames(tracked, recording, config.window, stages)
         tracked.mapper.end()
-        _save(tracked, stages)
+        if stages.due():
+            _save(tracked, stages)
     if len(tracked.unreadable) == len(recording):
         raise InputError(
             f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
