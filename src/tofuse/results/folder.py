@@ -249,9 +249,7 @@ def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
         )
     if not overwrite:
         raise OutputError(
-            "contains an earlier result"
-            if contract.marker in entries
-            else "contains a recording",
+            "contains an earlier result" if contract.marker in entries else "contains a recording",
             where=path,
             remedy="pass --overwrite to replace it, or another --out",
         )
