@@ -812,10 +812,8 @@ def _speeds(stretch: Stretch, *, end: bool) -> Float64:
     poses, times = stretch.poses[some], stretch.times[some]
     if len(poses) < 2:
         return np.zeros((0, 2))
-    steps = se3.inverse(poses[:-1]) @ poses[1:]
     elapsed = np.maximum(np.diff(times), 1e-9)
-    far = np.linalg.norm(steps[:, :3, 3], axis=1), np.asarray(se3.angle(steps))
-    return np.stack(far, 1) / elapsed[:, None]
+    return _lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
 
 
 def _reach(before: Stretch, after: Stretch) -> Float64:
@@ -855,15 +853,8 @@ def _by_odometry(before: Stretch, after: Stretch) -> Link | None:
     limit = np.repeat([_MAX_ALIGNED * before.depth, _MAX_ALIGNED], 3)
     if (sigma > limit).any():
         return None
-    sigma = np.maximum(sigma, 0.1 * limit)
-    made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
-    return Link(
-        int(before.frames[-1]),
-        int(after.frames[0]),
-        made,
-        certain=False,
-        how="bridged by odometry",
-    )
+    how = "bridged by odometry"
+    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), how)
 
 
 def _lengths(T: Float64) -> Float64:
@@ -899,12 +890,11 @@ def _bridged(before: Stretch, after: Stretch) -> Link | None:
     if (sigma > limit).any():
         return None
     T = retract(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
-    sigma = np.maximum(sigma, 0.1 * limit)
+    how = "bridged by the motion before and after the gap"
+    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), how)
+
+
+def _link_over_gap(before: Stretch, after: Stretch, T: Float64, sigma: Float64, how: str) -> Link:
+    """Return the link, given T (4, 4) from the frame after to the one before, and (6,) sigmas."""
     made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
-    return Link(
-        int(before.frames[-1]),
-        int(after.frames[0]),
-        made,
-        certain=False,
-        how="bridged by the motion before and after the gap",
-    )
+    return Link(int(before.frames[-1]), int(after.frames[0]), made, certain=False, how=how)
