@@ -95,6 +95,12 @@ class CameraFile:
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
 
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What a recording's metadata state of its depth and sensor."""
+        sensor = {} if self.sensor is None else {"sensor": self.sensor}
+        return {"depth_kind": self.depth_kind, **sensor}
+
 
 def read_json(path: str | Path) -> dict[str, Any]:
     """Read a JSON object.
@@ -251,6 +257,31 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
             remedy="use the table of this camera",
         )
     return description, camera
+
+
+def camera_file_of(folder: Path, given: Path | None, lacking: str) -> Path:
+    """Return the camera.json that is given, or else that of a recording's folder.
+
+    Parameters
+    ----------
+    folder, given
+        The recording, and the file that the user gave, if any.
+    lacking
+        What files of this format don't contain, such as "neither size nor lens".
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    path = given or folder / "camera.json"
+    if not is_file(path):
+        raise InputError(
+            f"is missing: such files contain {lacking}",
+            where=path,
+            remedy="give a camera.json by --camera",
+        )
+    return path
 
 
 def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:

@@ -13,7 +13,7 @@ from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.reading import files_named, is_file, read_bytes
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, load_camera
+from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 from tofuse.recordings.sources import FARTHEST_M, FileSource
@@ -49,13 +49,7 @@ class Arducam:
                 where=path,
                 remedy="save depth, not the sensor's raw phases",
             )
-        camera = options.camera or path / "camera.json"
-        if not is_file(camera):
-            raise InputError(
-                "is missing: such files contain neither lens nor unit",
-                where=camera,
-                remedy="give a camera.json by --camera",
-            )
+        camera = camera_file_of(path, options.camera, "neither lens nor unit")
         return ArducamSource(path, camera)
 
 
@@ -77,12 +71,7 @@ class ArducamSource(FileSource):
         self.depth = _images(path, "depth")
         super().__init__(np.array([image.time_ms for image in self.depth]) / 1000)
         self.confidence = _next(self.depth, _images(path, "confidence"))
-        self.metadata |= {
-            "depth_kind": self.description.depth_kind,
-            "confidence_max": CONFIDENCE_MAX,
-        }
-        if self.description.sensor is not None:
-            self.metadata["sensor"] = self.description.sensor
+        self.metadata |= {**self.description.metadata, "confidence_max": CONFIDENCE_MAX}
         without = sum(image is None for image in self.confidence)
         if without > 0:
             self.warnings.append(f"{without} of {len(self.depth)} frames have no confidence")

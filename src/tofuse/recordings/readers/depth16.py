@@ -12,7 +12,7 @@ from tofuse.errors import InputError
 from tofuse.files.images import read_color
 from tofuse.files.reading import files_named, if_file, is_file, read_bytes
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, load_camera
+from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
@@ -46,13 +46,7 @@ class Depth16:
         files = _files(path)
         if not files:
             raise InputError("has no *_depth16.bin or *.depth16", where=path, remedy="check it")
-        camera = options.camera or path / "camera.json"
-        if not is_file(camera):
-            raise InputError(
-                "is missing: such files contain neither size nor lens",
-                where=camera,
-                remedy="give a camera.json by --camera",
-            )
+        camera = camera_file_of(path, options.camera, "neither size nor lens")
         return Depth16Source(files, camera)
 
 
@@ -69,12 +63,10 @@ class Depth16Source(FileSource):
         self.files = files
         self.color = [_color(file) for file in files]
         self.metadata |= {
-            "depth_kind": self.description.depth_kind,
+            **self.description.metadata,
             "depth_unit_m": self.description.depth_unit_m,
             "confidence_max": CONFIDENCE_MAX,
         }
-        if self.description.sensor is not None:
-            self.metadata["sensor"] = self.description.sensor
         colored = sum(path is not None for path in self.color)
         if 0 < colored < len(files):
             self.warnings.append(f"only {colored} of {len(files)} frames have colour")
