@@ -37,7 +37,7 @@ class Kept(Stages):
         self.states[stage] = json.dumps(nodes), {k: v.copy() for k, v in arrays.items()}
 
     def due(self) -> bool:
-        return False
+        return True
 
     def again(self, stage: str) -> Any:
         nodes, arrays = self.states[stage]

@@ -193,8 +193,10 @@ class BackEnd:
             graph = self.graph(loops)
         # Without loops: with and without external sensors.
         sequential = guided = graph.poses
-        sensed = self._log.sensed(graph.ids.tolist())
-        sensors = measure_all(self._config.priors, sensed, self._measured(tracked))
+        sensors = SensorPriors()
+        if self._config.priors:
+            sensed = self._log.sensed(graph.ids.tolist())
+            sensors = measure_all(self._config.priors, sensed, self._measured(tracked))
         graph = with_sensors(graph, sensors)
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or sensors:
@@ -431,9 +433,13 @@ class BackEnd:
     def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
         """Return the steps of odometry from and to degenerate frames, and over gaps."""
         ends = self._unobservable.keys()
-        gaps = {(j.link.i, j.link.j) for j in self._joins if j.how != "links"}
+        gaps = self._gaps()
         steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
         return SensorPriors(tuple(steps))
+
+    def _gaps(self) -> set[tuple[int, int]]:
+        """Return the frames before and after the gaps that no registration closes."""
+        return {(j.link.i, j.link.j) for j in self._joins if j.how != "links"}
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
@@ -445,7 +451,6 @@ class BackEnd:
 
         See `degenerate_directions` for `stated`.
         """
-        bridges = {(j.link.i, j.link.j) for j in self._joins if j.how != "links"}
         own = {
             (e.step.reference, e.record.index)
             for e in self._posed
@@ -453,7 +458,7 @@ class BackEnd:
         }
         views = {v.index: v for v in self._kept.views.of(self._poses)}
         directions = degenerate_directions(graph, self._unobservable, own, views, frozenset(stated))
-        return without_degenerate(graph, directions, bridges)
+        return without_degenerate(graph, directions, self._gaps())
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
         """Return the records with the covariances (P, 6, 6) of the frames with a pose here."""

@@ -178,7 +178,7 @@ class FrameLog:
                     np.array(poses),
                     tuple(v for v in views.views if v.component == component),
                     entries[0].recording,
-                    self.sensed([e.record.index for e in entries]).odometry,
+                    _odometry(entries),
                 )
             )
         return found
@@ -186,16 +186,23 @@ class FrameLog:
     def sensed(self, ids: Sequence[int]) -> SensorData:
         """Return the measurements of external sensors for some frame indices."""
         by_index = {e.record.index: e for e in self.entries}
-        odometry, gravity = np.full((len(ids), 4, 4), np.nan), np.full((len(ids), 4), np.nan)
-        for k, index in enumerate(ids):
-            entry = by_index[index]
-            if entry.T_odometry is not None:
-                odometry[k] = entry.T_odometry
+        entries = [by_index[index] for index in ids]
+        gravity = np.full((len(ids), 4), np.nan)
+        for row, entry in zip(gravity, entries, strict=True):
             if entry.gravity is not None:
-                gravity[k] = entry.gravity
-        parts = np.array([by_index[index].recording for index in ids], np.intp)
-        degenerate = np.array([len(by_index[index].record.unobservable) > 0 for index in ids], bool)
-        return SensorData(np.array(ids, np.intp), odometry, gravity, parts, degenerate)
+                row[:] = entry.gravity
+        parts = np.array([e.recording for e in entries], np.intp)
+        degenerate = np.array([len(e.record.unobservable) > 0 for e in entries], bool)
+        return SensorData(np.array(ids, np.intp), _odometry(entries), gravity, parts, degenerate)
+
+
+def _odometry(entries: Sequence[Entry]) -> Float64:
+    """Return the poses (P, 4, 4) of odometry, NaN where there are none."""
+    poses = np.full((len(entries), 4, 4), np.nan)
+    for pose, entry in zip(poses, entries, strict=True):
+        if entry.T_odometry is not None:
+            pose[:] = entry.T_odometry
+    return poses
 
 
 def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:
