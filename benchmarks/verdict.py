@@ -3,13 +3,16 @@
 Many runs, each judged without the truth and then against it. Of each are printed the true rms
 error of the poses after alignment and the 95 % bound that was stated; at the end, by family, how
 many true errors are within the bound, the median ratio of bound and error, and how often right and
-wrong runs were called good. A run is right if its error is within the tolerance (0.5 % of the
-model's diagonal, at least 1 cm) and at least 95 % of its frames have a pose; for real recordings,
-what their reference itself may be off is added.
+wrong runs were called good; and by what is wrong with the recording, how often a reason names it.
+A run is right if its error is within the tolerance (0.5 % of the model's diagonal, at least 1 cm)
+and at least 95 % of its frames have a pose; for real recordings, what their reference itself may be
+off is added.
 
 Simulated scenes are recorded by cameras of several kinds, with and without multipath; from each
 recording others are made: with every second or fourth frame, a wrong focal length, a depth offset,
-or a gap. Real ones are whole, and every fourth frame.
+or a gap. The family `incidents` are cases of `stress.py`: somebody passes through the view, the
+lens is covered, the camera comes close to a bare wall, or goes on in another place. Real recordings
+are whole, and every fourth frame.
 
     python benchmarks/verdict.py [--seeds 10 11] [--families room] [--real] [--json FILE]
 """
@@ -25,8 +28,8 @@ from pathlib import Path
 import numpy as np
 
 import sequences
+import stress
 from recorded import RECORDED
-from stress import farther
 from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import displacement
@@ -46,6 +49,23 @@ FRAMES = 60
 CAMERAS = ("sr4000", "ifm-o3r", "pico-flexx")
 POSED = 0.95
 FOCAL, OFFSET_M = 1.05, 0.03
+INCIDENTS = "incidents"
+# What is wrong with a recording, by the end of a run's name, and the reasons that name it.
+CALIBRATION = frozenset({"calibration_alarm", "self_calibrated"})
+INCIDENT_CAUSES = {
+    "passes over 25%": frozenset({"moving_objects"}),
+    "passes over 40%": frozenset({"moving_objects"}),
+    "by a lid, 1 s": frozenset({"lost_frames"}),
+    "by a hand, 1 s": frozenset({"lost_frames"}),
+    "close-up of a bare wall": frozenset({"unobserved_motion"}),
+    "two places": frozenset({"disconnected"}),
+}
+CAUSES = {
+    "focal 5 % off": CALIBRATION,
+    "depth 3 cm off": CALIBRATION,
+    "gap": frozenset({"bridged_gap", "disconnected"}),
+    **INCIDENT_CAUSES,
+}
 
 
 @dataclass(frozen=True)
@@ -124,7 +144,7 @@ def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     frames = [f for f in recording if isinstance(f, RangeFrame)]
     changed = {
         "focal 5 % off": [wrong_focal(f) for f in frames],
-        "depth 3 cm off": [farther(f, OFFSET_M) for f in frames],
+        "depth 3 cm off": [stress.farther(f, OFFSET_M) for f in frames],
     }
     for name, made in changed.items():
         source = ArraySource(made, recording.reference, metadata=dict(recording.metadata))
@@ -198,6 +218,17 @@ def real(data: Path) -> Iterator[Run]:
                 yield judged("real", name, part, references, one.reference_m, turning=one.object)
 
 
+def incidents(seeds: Sequence[int]) -> Iterator[Run]:
+    """Give the runs of recordings to which something happens."""
+    for seed in seeds:
+        for scene in stress.SCENES.values():
+            for name in INCIDENT_CAUSES:
+                for case in stress.cases(scene, seed, containing=name):
+                    assert case.recording.reference is not None
+                    title = f"{scene.name}, seed {seed}, {case.name}"
+                    yield judged(INCIDENTS, title, case.recording, [case.recording.reference])
+
+
 def line(run: Run) -> str:
     """One run in a line."""
     bound = f"{1e3 * run.bound_m:8.1f}" if np.isfinite(run.bound_m) else "    none"
@@ -231,13 +262,29 @@ def table(runs: Sequence[Run]) -> Iterator[str]:
         )
 
 
+def named(runs: Sequence[Run]) -> Iterator[str]:
+    """What is wrong with recordings, and whether it is named where it has an effect."""
+    yield "| what is wrong | runs | right and good | of the others, named |"
+    yield "|---|---|---|---|"
+    for cause, codes in CAUSES.items():
+        own = [run for run in runs if run.name.endswith(cause)]
+        if own:
+            affected = [run for run in own if not (run.right and run.verdict == "good")]
+            count = sum(bool(codes.intersection(run.codes)) for run in affected)
+            yield (
+                f"| {cause} | {len(own)} | {len(own) - len(affected)} |"
+                f" {count} of {len(affected)} |"
+            )
+
+
 def main() -> None:
     """Run them, print a line for each, and the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--seeds", nargs="*", type=int, default=[10, 11], help="of the simulation")
-    parser.add_argument("--families", nargs="+", default=list(SCENES), choices=list(SCENES))
+    families = [*SCENES, INCIDENTS]
+    parser.add_argument("--families", nargs="*", default=families, choices=families)
     parser.add_argument("--real", action="store_true", help="the real recordings too")
     parser.add_argument("--data", type=Path, default=sequences.DATA, help="real recordings")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all runs there")
@@ -247,12 +294,13 @@ def main() -> None:
     runs = []
     for run in [
         *([real(options.data)] if options.real else []),
-        simulated(options.seeds, options.families),
+        simulated(options.seeds, [name for name in options.families if name in SCENES]),
+        incidents(options.seeds if INCIDENTS in options.families else ()),
     ]:
         for one in run:
             runs.append(one)
             print(line(one), flush=True)
-    for text in table(runs):
+    for text in [*table(runs), "", *named(runs)]:
         print(text)
     if options.json is not None:
         options.json.write_text(json.dumps([asdict(run) for run in runs], indent=1))
