@@ -541,7 +541,9 @@ def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
     assert "does not determine the camera's focal length" in text
     small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
     assert said(replace(found, gap=small)) == said(found)
-    gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02))
+    gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02), 1.0, (0.03, 0.02))  # changed, not closed
+    short = Gap(2, 4, (0.03, 0.02), (0.03, 0.02), 1.0, (0.003, 0.002))  # hardly changed
+    assert said(replace(found, gap=short)) == said(found)
     for quiet in (
         CalibrationCheck(focal_sigma=0.001),  # determined, and as stated
         CalibrationCheck(),  # not asked: too few views

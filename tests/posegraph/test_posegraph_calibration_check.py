@@ -87,6 +87,16 @@ def test_what_does_not_close_a_loop_is_no_cure():
     assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
 
 
+def test_a_gap_contradicts_errors_that_change_it_in_vain() -> None:
+    changed, hardly = (0.12, 0.05), (0.02, 0.01)
+    assert Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, changed).contradicts
+    assert not Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, (0.12, 0.01)).contradicts
+    assert not Gap(0, 9, (0.2, 0.05), (0.19, 0.05), 1.5, hardly).contradicts
+    assert Gap(0, 9, (0.2, 0.05), (0.23, 0.05), 1.5, hardly).contradicts  # wider
+    assert not Gap(0, 9, (0.2, 0.05), (0.08, 0.02), 1.5, changed).contradicts  # closed
+    assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
+
+
 def test_an_error_that_only_closes_a_loop_is_none(monkeypatch):
     """Drift of odometry leaves a gap, too: views whose camera is right don't keep the error."""
     truth = path(24)[:8]

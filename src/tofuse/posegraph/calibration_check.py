@@ -65,7 +65,8 @@ class Gap:
     """A loop of views of which consecutive ones overlap, and the two ends too.
 
     `before` and `after` are its closure errors (m, rad) by pairwise alignments, without and with
-    the estimated errors of the camera. `depth` is that of the views, m.
+    the estimated errors of the camera, and `change` is the motion from one to the other. `depth` is
+    that of the views, m.
     """
 
     i: int
@@ -73,6 +74,7 @@ class Gap:
     before: tuple[float, float]
     after: tuple[float, float]
     depth: float = 0.0
+    change: tuple[float, float] = (0.0, 0.0)
 
     @property
     def remaining_m(self) -> float:
@@ -99,10 +101,20 @@ class Gap:
         return all(a < least for a, _, least in parts) or any(b < 0.5 * a for a, b, _ in parts)
 
     @property
+    def significant(self) -> bool:
+        """Whether it is more than noise."""
+        return any(a >= least for a, least in zip(self.before, _CLOSED, strict=True))
+
+    @property
     def contradicts(self) -> bool:
-        """Whether it is significant, and the estimated errors do not explain it."""
-        wide = any(a >= least for a, least in zip(self.before, _CLOSED, strict=True))
-        return wide and not self.closes
+        """Whether the estimated errors change it much without closing it, or widen it.
+
+        Errors of the camera hardly change the gap of a short loop, which shows nothing of them.
+        """
+        before = self._apparent_m(*self.before)
+        changes = self._apparent_m(*self.change) > 0.5 * before
+        widens = self.remaining_m > before + self._apparent_m(*_CLOSED)
+        return self.significant and not self.closes and (changes or widens)
 
 
 @dataclass(frozen=True)
@@ -118,12 +130,12 @@ class CalibrationCheck:
         from the spread between views. They are proposals and change nothing. Only significant
         ones; in case of an alarm, all that the views determine.
     support
-        Mean support of the views without and with the significant error that raises it most, see
-        `joint_alignment.Support`.
+        Mean support of the views without and with the error `best`, see `joint_alignment.Support`.
     gap
         Closure error of the longest loop; None if there is none, or no error is significant.
     best
-        Name of the error that raises the support most; empty if no error is significant.
+        Name of the largest error when all significant ones are estimated together, relative to
+        its tolerance; empty if no error is significant.
     focal_sigma
         Standard deviation of the focal length estimated from the views, as a fraction; None if
         there are too few views.
@@ -195,13 +207,15 @@ def check_calibration(
         some = spread_evenly(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
     patient = replace(options, rounds=_ROUNDS)
 
-    def estimated(name: str) -> Refined:
+    def estimated(*names: str) -> Refined:
         # The overlaps are known; the poses only follow.
-        number = [_NUMBERS[name]]
-        return refine(few, poses, patient, calibrate=number, priors=priors, pairs=some)
+        numbers = [_NUMBERS[name] for name in names]
+        return refine(few, poses, patient, calibrate=numbers, priors=priors, pairs=some)
 
     found = {name: estimated(name) for name in likely}
-    name_of_best = max(found, key=lambda name: _gain(found[name], views))
+    # One error resembles another. Estimated together, the true one remains.
+    together = estimated(*likely).errors if len(likely) > 1 else found[likely[0]].errors
+    name_of_best = max(likely, key=lambda name: abs(together[_NUMBERS[name]]) / TOLERANCES[name])
     best = found[name_of_best]
     large = any(
         _large(name, one.errors[_NUMBERS[name]], sigma[_NUMBERS[name]])
@@ -346,7 +360,8 @@ class _Loop:
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""
         first, last = (self.views[k].surface.index for k in (self.i, self.j))
-        return Gap(first, last, _size(before), _size(after), self.depth)
+        change = se3.inverse(before) @ after
+        return Gap(first, last, _size(before), _size(after), self.depth, _size(change))
 
     def closing_error(
         self, poses: Float64, uncorrected: Float64, number: int, step: float
@@ -414,7 +429,7 @@ def _check_by_loop(
         return none
     poses = refined.start
     uncorrected = loop.miss(poses, np.zeros(kernels.ERRORS))
-    if not loop.gap(uncorrected, uncorrected).contradicts:
+    if not loop.gap(uncorrected, uncorrected).significant:
         return none
     found: dict[str, tuple[float, Gap]] = {}
     for name in sigmas:
