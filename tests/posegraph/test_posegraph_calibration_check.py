@@ -69,6 +69,17 @@ def test_a_focal_length_that_nothing_holds_is_not_known():
     assert sigma(turned, path(12)) < 0.02
 
 
+def test_without_rotation_a_percent_of_focal_length_is_one_of_sideways_motion() -> None:
+    truth = path(12)
+    truth[:, :3, :3] = np.eye(3)
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
+    assert found.undetermined
+    sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
+    expected = 0.01 * np.sqrt((sideways**2).sum(1).mean())
+    assert found.focal_motion_m == pytest.approx(expected, rel=0.05)
+
+
 def test_few_views_suspect_nothing():
     views, refined = kept(0.06, views=5)
     found = check_calibration(views, refined, OPTIONS, Priors.none())

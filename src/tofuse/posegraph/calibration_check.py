@@ -139,6 +139,8 @@ class CalibrationCheck:
     focal_sigma
         Standard deviation of the focal length estimated from the views, as a fraction; None if
         there are too few views.
+    focal_motion_m
+        Rms motion of the positions, after alignment, that a focal length error of 1 % causes.
     moved
         Rms motion (m, rad) of the poses, after alignment, if `best` is corrected.
     """
@@ -150,6 +152,7 @@ class CalibrationCheck:
     gap: Gap | None = None
     best: str = ""
     focal_sigma: float | None = None
+    focal_motion_m: float = 0.0
     moved: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -190,7 +193,11 @@ def check_calibration(
     sensitivity = response(views, poses, pairs, options, priors=priors)
     estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
     determined = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
-    focal_sigma = float(sigma[kernels.FOCAL])
+    percent = se3.exp(0.01 * sensitivity.motion[kernels.FOCAL])
+    without_error = CalibrationCheck(
+        focal_sigma=float(sigma[kernels.FOCAL]),
+        focal_motion_m=_rms(aligned_motion(poses, poses @ percent)[0]),
+    )
     likely = [
         name
         for name in determined
@@ -198,7 +205,7 @@ def check_calibration(
         > max(_LIKELY * sigma[_NUMBERS[name]], _MIN_FIRST_STEP * TOLERANCES[name])
     ]
     sigmas = {name: float(sigma[_NUMBERS[name]]) for name in determined}
-    by_loop = partial(_check_by_loop, views, refined, sigmas, focal_sigma, options)
+    by_loop = partial(_check_by_loop, views, refined, sigmas, without_error, options)
     if not likely:
         return by_loop()
     few, some = list(views), pairs
@@ -229,15 +236,17 @@ def check_calibration(
         return closed
     support = float(best.before.of_views(len(views)).mean())
     position, rotation = aligned_motion(poses, best.poses)
-    return CalibrationCheck(
-        alarm,
-        {name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found},
-        {name: sigmas[name] for name in _NUMBERS if name in found},
-        (support, support + _gain(best, views)),
-        gap,
-        name_of_best,
-        focal_sigma,
-        (_rms(position), _rms(rotation)),
+    return replace(
+        without_error,
+        alarm=alarm,
+        errors={
+            name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found
+        },
+        sigmas={name: sigmas[name] for name in _NUMBERS if name in found},
+        support=(support, support + _gain(best, views)),
+        gap=gap,
+        best=name_of_best,
+        moved=(_rms(position), _rms(rotation)),
     )
 
 
@@ -405,7 +414,7 @@ def _check_by_loop(
     views: Sequence[KeptView],
     refined: Refined,
     sigmas: Mapping[str, float],
-    focal_sigma: float,
+    none: CalibrationCheck,
     options: RefineOptions,
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from the drift over the longest loop alone.
@@ -420,10 +429,9 @@ def _check_by_loop(
         As for `check_calibration`.
     sigmas
         Standard deviations of the errors that the views determine.
-    focal_sigma
-        See `CalibrationCheck`.
+    none
+        The result if there is no error.
     """
-    none = CalibrationCheck(focal_sigma=focal_sigma)
     loop = _Loop.longest(views, refined, options)
     if loop is None:
         return none

@@ -364,10 +364,13 @@ class Response:
     gradient, information
         (M, ERRORS) of each pair i < j, both directions together: first derivative of half its
         squared residuals at zero error, and half the second.
+    motion
+        (ERRORS, N, 6) twist by which each pose follows, per unit of the error.
     """
 
     gradient: Float64
     information: Float64
+    motion: Float64
 
     def estimate(self) -> Float64:
         """(ERRORS,) least-squares estimate of each error alone, by one Gauss-Newton step."""
@@ -445,15 +448,17 @@ def response(
     rest = relative(_finite(factor.step()))
     slope = g[:, :6] + (H[:, :6, :6] @ rest[..., None])[..., 0]
     first, second = np.empty((len(H), kernels.ERRORS)), np.empty((len(H), kernels.ERRORS))
+    motion = np.empty((kernels.ERRORS, n, 6))
     for k in range(kernels.ERRORS):
         mixed = H[:, :6, 6 + k]
         column = state.system.gradient(np.concatenate([mixed, np.zeros((m, 6))]), T_i_j)
-        follow = relative(_finite(factor.solve(column)))
+        motion[k] = _finite(factor.solve(column))
+        follow = relative(motion[k])
         first[:, k] = g[:, 6 + k] + (mixed * rest).sum(1) + (slope * follow).sum(1)
         second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * follow).sum(1)
         second[:, k] += np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
     half = len(pairs)
-    return Response(first[:half] + first[half:], second[:half] + second[half:])
+    return Response(first[:half] + first[half:], second[:half] + second[half:], motion)
 
 
 def align_pairs(
