@@ -53,8 +53,12 @@ class Intake:
         if not isinstance(frame, RangeFrame):
             return False
         before, self._before = self._before, frame
-        if before is None or not np.array_equal(before.depth[0], frame.depth[0]):
-            return False  # most differ there already
+        if before is None:
+            return False
+        # Most differ there already; the first rows of some cameras have no pixels.
+        middle = len(frame.depth) // 2
+        if not np.array_equal(before.depth[middle : middle + 1], frame.depth[middle : middle + 1]):
+            return False
         return np.array_equal(before.depth, frame.depth) and len(frame) > 0
 
     def end(self) -> None:
