@@ -418,7 +418,7 @@ class BackEnd:
         suspicion, gap = refinement.calibration_check, (0.0, 0.0)
         if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
             gap = suspicion.gap.before
-        elif suspicion is not None and suspicion.best in suspicion.unconfirmed:
+        elif suspicion is not None and suspicion.unconfirmed:
             gap = suspicion.moved
         shown = Shown(*moved, excess, *gap, refinement.split_m, refinement.split_rad)
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)

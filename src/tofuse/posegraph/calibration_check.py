@@ -162,11 +162,13 @@ class CalibrationCheck:
 
     @property
     def unconfirmed(self) -> dict[str, float]:
-        """Errors that raise the support and that no loop confirms or contradicts."""
+        """Significant errors of which one is large, and that no loop confirms or contradicts."""
         if self.alarm or (self.gap is not None and self.gap.contradicts):
             return {}
-        sigmas = self.sigmas
-        return {n: e for n, e in self.errors.items() if n in sigmas and _large(n, e, sigmas[n])}
+        known = {n: (e, self.sigmas[n]) for n, e in self.errors.items() if n in self.sigmas}
+        if not any(_large(n, e, sigma) for n, (e, sigma) in known.items()):
+            return {}
+        return {n: e for n, (e, sigma) in known.items() if abs(e) > _SIGNIFICANT * sigma}
 
 
 def _determined(name: str, sigma: float) -> bool:
