@@ -50,8 +50,9 @@ CAMERAS = ("sr4000", "ifm-o3r", "pico-flexx")
 POSED = 0.95
 FOCAL, OFFSET_M = 1.05, 0.03
 INCIDENTS = "incidents"
+UNCHANGED = "as it is"
 # What is wrong with a recording, by the end of a run's name, and the reasons that name it.
-CALIBRATION = frozenset({"calibration_alarm", "self_calibrated"})
+CALIBRATION = frozenset({"calibration_alarm", "self_calibrated", "unchecked_calibration"})
 INCIDENT_CAUSES = {
     "passes over 25%": frozenset({"moving_objects"}),
     "passes over 40%": frozenset({"moving_objects"}),
@@ -136,7 +137,7 @@ def wrong_focal(frame: RangeFrame) -> RangeFrame:
 
 def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     """Give recordings that are made of one."""
-    yield "as it is", recording
+    yield UNCHANGED, recording
     yield "every 2nd", recording.select(every=2)
     n = len(recording)
     kept = np.r_[: n // 2 - n // 10, n // 2 + n // 10 : n]
@@ -263,14 +264,22 @@ def table(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def named(runs: Sequence[Run]) -> Iterator[str]:
-    """What is wrong with recordings, and whether it is named where it has an effect."""
+    """What is wrong with recordings, and whether it is named where it has an effect.
+
+    Runs count whose recording is right and good without it, as far as that was run.
+    """
     yield "| what is wrong | runs | right and good | of the others, named |"
     yield "|---|---|---|---|"
+    fine = {run.name: run.right and run.verdict == "good" for run in runs}
     for cause, codes in CAUSES.items():
-        own = [run for run in runs if run.name.endswith(cause)]
+        own = [
+            run
+            for run in runs
+            if run.name.endswith(cause) and fine.get(run.name.replace(cause, UNCHANGED), True)
+        ]
+        affected = [run for run in own if not fine[run.name]]
+        count = sum(bool(codes.intersection(run.codes)) for run in affected)
         if own:
-            affected = [run for run in own if not (run.right and run.verdict == "good")]
-            count = sum(bool(codes.intersection(run.codes)) for run in affected)
             yield (
                 f"| {cause} | {len(own)} | {len(own) - len(affected)} |"
                 f" {count} of {len(affected)} |"
