@@ -80,7 +80,7 @@ def test_what_the_recording_shows_is_added() -> None:
         np.hypot(plain.position_m, accuracy._HIDDEN * 0.05), rel=1e-6
     )
     assert more.rotation_rad > plain.rotation_rad
-    bent = accuracy_of(walk(), Shown(gap_m=0.2, gap_rad=0.1), 1.0)
+    bent = accuracy_of(walk(), Shown(calibration_m=0.2, calibration_rad=0.1), 1.0)
     assert bent.position_m > 0.2
     assert bent.rotation_rad > 0.1
     C = covariances_of(walk(), Shown(0.03, 0.02, 0.04))

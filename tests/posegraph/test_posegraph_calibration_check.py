@@ -77,7 +77,7 @@ def test_without_rotation_a_percent_of_focal_length_is_one_of_sideways_motion() 
     assert found.undetermined
     sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
     expected = 0.01 * np.sqrt((sideways**2).sum(1).mean())
-    assert found.focal_motion_m == pytest.approx(expected, rel=0.05)
+    assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
 
 
 def test_few_views_suspect_nothing():

@@ -30,10 +30,14 @@ class CameraErrors(Bounded, Correction):
         stated one.
     offset_m
         Added to all ranges, m.
+    focal_sigma, offset_sigma_m
+        Standard deviations of both, which the stated accuracy of poses includes.
     """
 
     focal: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
+    focal_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    offset_sigma_m: Annotated[float, Bounds(0, 1)] = 0.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self) -> Corrector:
@@ -41,9 +45,21 @@ class CameraErrors(Bounded, Correction):
         return _Corrector(self)
 
     def and_then(self, other: CameraErrors) -> CameraErrors:
-        """Return the composition of this correction with `other`, applied after it."""
-        focal = self.focal + other.focal + self.focal * other.focal
-        return CameraErrors(focal, self.offset_m + other.offset_m)
+        """Return the composition of this correction with `other`, applied after it.
+
+        The standard deviations are those of the last estimate of each error.
+        """
+        return CameraErrors(
+            self.focal + other.focal + self.focal * other.focal,
+            self.offset_m + other.offset_m,
+            other.focal_sigma if other.focal else self.focal_sigma,
+            other.offset_sigma_m if other.offset_m else self.offset_sigma_m,
+        )
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """The standard deviations of "focal" and "offset"."""
+        return {"focal": self.focal_sigma, "offset": self.offset_sigma_m}
 
     @classmethod
     def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:

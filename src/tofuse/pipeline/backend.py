@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.evaluation.cross_view import CrossViewConsistency, cross_view_consistency
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
@@ -31,6 +32,7 @@ from tofuse.posegraph.accuracy import (
     without_degenerate,
 )
 from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.covariances import MIN_WEIGHT, accepted_only, pose_covariances
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
@@ -46,6 +48,7 @@ from tofuse.results.verdict import ranked
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
+_QUANTILE = 1.96  # of a normal distribution, 95 %
 
 T = TypeVar("T")
 
@@ -415,12 +418,8 @@ class BackEnd:
         if self._tracks:  # the initial error of given poses says nothing of the final one
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if cross_view is None else cross_view.excess_m()
-        suspicion, gap = refinement.calibration_check, (0.0, 0.0)
-        if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
-            gap = suspicion.gap.before
-        elif suspicion is not None and suspicion.unconfirmed:
-            gap = suspicion.moved
-        shown = Shown(*moved, excess, *gap, refinement.split_m, refinement.split_rad)
+        calibration = self._by_calibration(refinement.calibration_check)
+        shown = Shown(*moved, excess, *calibration, refinement.split_m, refinement.split_rad)
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
         if accuracy.unbounded and closed.sensors.verified:
             free = set(accuracy.unbounded)
@@ -429,6 +428,29 @@ class BackEnd:
             by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
             accuracy = replace(accuracy, by_odometry=by_odometry)
         return accuracy, covariances_of(graph, shown)
+
+    def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
+        """Return how far (m, rad) the poses may be off by the calibration (95 %).
+
+        That is the gap of a loop that a better calibration would close, or the motion by one with
+        which views agree better, unless a loop contradicts; and the uncertainty of a correction.
+        """
+        if check is None:
+            return 0.0, 0.0
+        errors = [np.zeros(2)]
+        if check.alarm and check.gap is not None:
+            errors.append(np.array(check.gap.before))
+        elif check.unconfirmed:
+            errors.append(np.array(check.moved))
+        for part in self._config.corrections:
+            if isinstance(part, CameraErrors):
+                sigmas = part.sigmas
+                errors += [
+                    _QUANTILE * sigmas[name] * np.array(motion)
+                    for name, motion in check.motion.items()
+                ]
+        m, rad = np.linalg.norm(errors, axis=0).tolist()
+        return m, rad
 
     def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
         """Return the steps of odometry from and to degenerate frames, and over gaps."""

@@ -492,7 +492,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
             "assumes that the calibration is right. An error of 1% would move the poses by "
-            f"{_length(found.focal_motion_m)}."
+            f"{_length(0.01 * found.motion['focal'][0])}."
         )
     elif found.unconfirmed:
         cure = " or ".join(camera_in_words(found.unconfirmed))

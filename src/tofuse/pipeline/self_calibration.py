@@ -3,8 +3,9 @@
 Refined views show whether an error of the focal length or the depth offset distorts the trajectory:
 corrected, they support each other better, and the drift over a loop is smaller
 (`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
-which stays only if the stated bound of the poses is smaller (`posegraph.accuracy`). If neither
-trajectory is bounded, views must fit better before refinement.
+which stays only if the stated bound of the poses is smaller (`posegraph.accuracy`), although it
+includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
+before refinement.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from tofuse.results.verdict import ranked
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
-# Options of `CameraErrors` by the names of the errors.
+# Options of `CameraErrors` by the names of the errors; their standard deviations.
 _FIELDS = {"focal": "focal", "offset": "offset_m"}
+_SIGMAS = {"focal": "focal_sigma", "offset": "offset_sigma_m"}
 
 Once = Callable[[Config], Reconstruction]
 
@@ -82,9 +84,10 @@ def _shown(result: Reconstruction) -> tuple[CalibrationCheck, CameraErrors] | No
     found = None if refinement is None else refinement.calibration_check
     if found is None or not found.alarm:
         return None
-    value = found.errors[found.best]
+    best = found.best
+    values = {_FIELDS[best]: found.errors[best], _SIGMAS[best]: found.sigmas[best]}
     try:
-        return found, CameraErrors(**{_FIELDS[found.best]: value})
+        return found, CameraErrors(**values)
     except ValueError:
         return None  # implausibly large
 

@@ -94,9 +94,8 @@ class Shown:
         Rms by which the refinement moved the poses, after alignment.
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
-    gap_m, gap_rad
-        Closure error of a loop that a better calibration would close, or the motion of the poses
-        by a calibration that views agree with better, if there is no loop; else 0.
+    calibration_m, calibration_rad
+        By the calibration of the camera, 95 %.
     split_m, split_rad
         Rms errors by halves of the images, see `split_half`: those of the covariance and those that
         `moved` stands for.
@@ -105,8 +104,8 @@ class Shown:
     moved_m: float = 0.0
     moved_rad: float = 0.0
     excess_m: float = 0.0
-    gap_m: float = 0.0
-    gap_rad: float = 0.0
+    calibration_m: float = 0.0
+    calibration_rad: float = 0.0
     split_m: float = 0.0
     split_rad: float = 0.0
 
@@ -125,8 +124,9 @@ class Shown:
             split = np.array([self.split_m, self.split_rad]) * quantile
             missing = np.sqrt(np.maximum(split**2 - stated.bounds**2, 0.0))
             correlated = np.maximum(correlated, missing)
-        excess, gap = np.array([self.excess_m, 0.0]), np.array([self.gap_m, self.gap_rad])
-        return np.asarray(np.sqrt(correlated**2 + excess**2 + gap**2))
+        excess = np.array([self.excess_m, 0.0])
+        calibration = np.array([self.calibration_m, self.calibration_rad])
+        return np.asarray(np.sqrt(correlated**2 + excess**2 + calibration**2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,7 @@ _CHANCE = 0.003
 _SECANTS, _CONVERGED, _IMPLAUSIBLE = 4, 0.05, 10.0
 # The spread between views is not known from fewer.
 _MIN_VIEWS = 8
+_SMALL = 1e-3  # error of the camera, to differentiate by
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The solution may be far from the start.
 _ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
@@ -139,8 +140,8 @@ class CalibrationCheck:
     focal_sigma
         Standard deviation of the focal length estimated from the views, as a fraction; None if
         there are too few views.
-    focal_motion_m
-        Rms motion of the positions, after alignment, that a focal length error of 1 % causes.
+    motion
+        Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
         Rms motion (m, rad) of the poses, after alignment, if `best` is corrected.
     """
@@ -152,7 +153,7 @@ class CalibrationCheck:
     gap: Gap | None = None
     best: str = ""
     focal_sigma: float | None = None
-    focal_motion_m: float = 0.0
+    motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -195,10 +196,9 @@ def check_calibration(
     sensitivity = response(views, poses, pairs, options, priors=priors)
     estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
     determined = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
-    percent = se3.exp(0.01 * sensitivity.motion[kernels.FOCAL])
     without_error = CalibrationCheck(
         focal_sigma=float(sigma[kernels.FOCAL]),
-        focal_motion_m=_rms(aligned_motion(poses, poses @ percent)[0]),
+        motion={name: _motion(poses, sensitivity.motion[k]) for name, k in _NUMBERS.items()},
     )
     likely = [
         name
@@ -269,6 +269,12 @@ def of_submaps(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
 
 def _rms(vectors: Float64) -> float:
     return float(np.sqrt((vectors**2).sum(1).mean()))
+
+
+def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
+    """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
+    position, rotation = aligned_motion(poses, poses @ se3.exp(_SMALL * twists))
+    return _rms(position) / _SMALL, _rms(rotation) / _SMALL
 
 
 def _gain(found: Refined, views: Sequence[KeptView]) -> float:

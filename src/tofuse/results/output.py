@@ -408,7 +408,7 @@ def _suspicion(s: CalibrationCheck | None) -> dict[str, Any] | None:
         "camera": s.errors,
         "sigma": s.sigmas,
         "focal_sigma": s.focal_sigma,
-        "focal_motion_m": s.focal_motion_m,
+        "focal_motion_m": 0.01 * s.motion["focal"][0] if s.motion else None,
         "support": s.support,
         "loop": None
         if gap is None
