@@ -203,6 +203,19 @@ def test_without_an_alarm_nothing_is_done(any_result) -> None:
     assert self_calibrated(first, from_method("default"), never, Silent()) is first
 
 
+def test_a_correction_that_views_undo_is_dropped(any_result) -> None:
+    first = said(any_result, 0.1, 0.2)
+    for left, kept in ((-0.05, False), (-0.005, True), (0.05, True)):
+        undone = said(any_result, left, 0.05)
+        check = undone.diagnostics.refinement.calibration_check
+        refinement = replace(
+            undone.diagnostics.refinement, calibration_check=replace(check, alarm=False)
+        )
+        undone = replace(undone, diagnostics=replace(undone.diagnostics, refinement=refinement))
+        result = self_calibrated(first, from_method("default"), lambda _, r=undone: r, Silent())
+        assert (result.diagnostics.calibrated is not None) == kept
+
+
 @pytest.mark.parametrize(
     ("again", "kept"),
     [

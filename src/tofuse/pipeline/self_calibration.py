@@ -5,7 +5,8 @@ corrected, they support each other better, and the drift over a loop is smaller
 (`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
 which stays only if the stated bound of the poses is smaller (`posegraph.accuracy`), although it
 includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
-before refinement.
+before refinement. And the views must keep it: a drift that some error of the camera happens to
+explain is no error of the camera, and views that are corrected for it undo much of the correction.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def self_calibrated(
         wrong = corrected.and_then(error)
         progress.note(f"views agree better with {in_words(wrong)}: reconstructing again with it")
         again = once(replace(config, corrections=(wrong, *config.corrections)))
-        if not _is_better(again, best):
+        if not (_is_better(again, best) and _is_kept(again, check)):
             progress.note("views do not agree better with it: the calibration stays")
             break
         calibration = SelfCalibration(
@@ -99,6 +100,14 @@ def _is_better(again: Reconstruction, before: Reconstruction) -> bool:
     new, old = _bound(again), _bound(before)
     # If neither is bounded, the support of the views decides.
     return new < old if np.isfinite([new, old]).any() else _support(again) > _support(before)
+
+
+def _is_kept(again: Reconstruction, check: CalibrationCheck) -> bool:
+    """Whether the views do not significantly undo the correction that a check proposed."""
+    refinement = again.diagnostics.refinement
+    found = None if refinement is None else refinement.calibration_check
+    left = 0.0 if found is None else found.large.get(check.best, 0.0)
+    return left * check.errors[check.best] >= 0
 
 
 def _bound(result: Reconstruction) -> float:

@@ -166,10 +166,17 @@ class CalibrationCheck:
         """Significant errors of which one is large, and that no loop confirms or contradicts."""
         if self.alarm or (self.gap is not None and self.gap.contradicts):
             return {}
-        known = {n: (e, self.sigmas[n]) for n, e in self.errors.items() if n in self.sigmas}
-        if not any(_large(n, e, sigma) for n, (e, sigma) in known.items()):
+        if not self.large:
             return {}
-        return {n: e for n, (e, sigma) in known.items() if abs(e) > _SIGNIFICANT * sigma}
+        return {n: e for n, e in self.errors.items() if abs(e) > _SIGNIFICANT * self._sigma(n)}
+
+    @property
+    def large(self) -> dict[str, float]:
+        """Significant errors that exceed the calibration error of usual cameras."""
+        return {n: e for n, e in self.errors.items() if _large(n, e, self._sigma(n))}
+
+    def _sigma(self, name: str) -> float:
+        return self.sigmas.get(name, np.inf)
 
 
 def _determined(name: str, sigma: float) -> bool:
