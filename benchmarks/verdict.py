@@ -57,7 +57,7 @@ INCIDENT_CAUSES = {
     "passes over 25%": frozenset({"moving_objects"}),
     "passes over 40%": frozenset({"moving_objects"}),
     "by a lid, 1 s": frozenset({"lost_frames"}),
-    "by a hand, 1 s": frozenset({"lost_frames"}),
+    "by a hand, 1 s": frozenset({"lost_frames", "disconnected"}),
     "close-up of a bare wall": frozenset({"unobserved_motion"}),
     "two places": frozenset({"disconnected"}),
 }
