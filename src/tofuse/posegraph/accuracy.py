@@ -34,7 +34,7 @@ _OPEN = np.array([30.0] * 3 + [10.0] * 3)
 _UNMEASURED_FRACTION = 0.05
 # Ratio of the total error to that in which views differ: errors of the sensor that all views of a
 # place share are invisible.
-_HIDDEN = 1.3
+_HIDDEN = 1.6
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
