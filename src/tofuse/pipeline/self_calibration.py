@@ -81,8 +81,7 @@ def in_words(wrong: CameraErrors) -> str:
 
 def _shown(result: Reconstruction) -> tuple[CalibrationCheck, CameraErrors] | None:
     """Return the calibration error that explains the views best; None without an alarm."""
-    refinement = result.diagnostics.refinement
-    found = None if refinement is None else refinement.calibration_check
+    found = _check_of(result)
     if found is None or not found.alarm:
         return None
     best = found.best
@@ -104,10 +103,14 @@ def _is_better(again: Reconstruction, before: Reconstruction) -> bool:
 
 def _is_kept(again: Reconstruction, check: CalibrationCheck) -> bool:
     """Whether the views do not significantly undo the correction that a check proposed."""
-    refinement = again.diagnostics.refinement
-    found = None if refinement is None else refinement.calibration_check
+    found = _check_of(again)
     left = 0.0 if found is None else found.large.get(check.best, 0.0)
     return left * check.errors[check.best] >= 0
+
+
+def _check_of(result: Reconstruction) -> CalibrationCheck | None:
+    refinement = result.diagnostics.refinement
+    return None if refinement is None else refinement.calibration_check
 
 
 def _bound(result: Reconstruction) -> float:

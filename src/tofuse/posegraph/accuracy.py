@@ -95,7 +95,7 @@ class Shown:
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
     calibration_m, calibration_rad
-        By the calibration of the camera, 95 %.
+        Error of the poses due to the calibration of the camera, 95 %.
     split_m, split_rad
         Rms errors by halves of the images, see `split_half`: those of the covariance and those that
         `moved` stands for.

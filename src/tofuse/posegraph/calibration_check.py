@@ -27,8 +27,8 @@ from tofuse.posegraph.joint_alignment import (
     RefineOptions,
     Round,
     align_pairs,
+    align_views,
     refine,
-    refine_poses,
     response,
     spread_evenly,
 )
@@ -223,14 +223,18 @@ def check_calibration(
         some = spread_evenly(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
     patient = replace(options, rounds=_ROUNDS)
 
-    def estimated(*names: str) -> Refined:
+    def estimated(name: str) -> Refined:
         # The overlaps are known; the poses only follow.
-        numbers = [_NUMBERS[name] for name in names]
-        return refine(few, poses, patient, calibrate=numbers, priors=priors, pairs=some)
+        number = [_NUMBERS[name]]
+        return refine(few, poses, patient, calibrate=number, priors=priors, pairs=some)
 
     found = {name: estimated(name) for name in likely}
-    # One error resembles another. Estimated together, the true one remains.
-    together = estimated(*likely).errors if len(likely) > 1 else found[likely[0]].errors
+    together = found[likely[0]].errors
+    if len(likely) > 1:  # one error resembles another: estimated together, the true one remains
+        numbers = [_NUMBERS[name] for name in likely]
+        together = align_views(
+            few, poses, patient, calibrate=numbers, priors=priors, pairs=some
+        ).errors
     name_of_best = max(likely, key=lambda name: abs(together[_NUMBERS[name]]) / TOLERANCES[name])
     best = found[name_of_best]
     large = any(
@@ -378,8 +382,8 @@ class _Loop:
         start = self.chained(poses, errors)[1]
         options = replace(self.options, rounds=_ROUNDS)
         views = self.views[self.i : self.j + 1]
-        _, kept = refine_poses(views, start, options, calibrate=[number], errors=errors)
-        return float(kept[number])
+        kept = align_views(views, start, options, calibrate=[number], errors=errors)
+        return float(kept.errors[number])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""

@@ -257,7 +257,16 @@ def refine(
     if bodies is not None:
         poses = bodies.views(bodies.poses(poses))
     start = poses
-    found = _iterate(views, poses, options, calibrate, errors, priors, pairs, bodies)
+    found = align_views(
+        views,
+        poses,
+        options,
+        calibrate=calibrate,
+        errors=errors,
+        priors=priors,
+        pairs=pairs,
+        bodies=bodies,
+    )
     poses, errors, state, known = found.poses, found.errors, found.state, found.known
     half = len(state.target) // 2
     pairs = np.stack([state.target[:half], state.source[:half]], 1)
@@ -271,30 +280,21 @@ def refine(
     return Refined(poses, start, errors, pairs, found.moved, before, after, *measured, scales)
 
 
-def refine_poses(
-    views: Sequence[KeptView],
-    poses: Float64,
-    options: RefineOptions,
-    *,
-    calibrate: Sequence[int] = (),
-    errors: Float64 | None = None,
-    priors: Priors | None = None,
-    pairs: Intp | None = None,
-) -> tuple[Float64, Float64]:
-    """Return the `poses` and `errors` of `refine` alone, without what it derives from them.
-
-    Parameters
-    ----------
-    views, poses, options, calibrate, errors, priors, pairs
-        As for `refine`.
-    """
-    found = _iterate(views, poses, options, calibrate, errors, priors, pairs, None)
-    return found.poses, found.errors
-
-
 @dataclass(frozen=True, eq=False)
-class _Iterated:
-    """Poses and errors of the camera after the last iteration, with its residuals and scales."""
+class AlignedViews:
+    """Result of the last iteration.
+
+    Attributes
+    ----------
+    poses, errors
+        (N, 4, 4) T_world_camera and (ERRORS,) errors of the camera.
+    state
+        Residuals and scales of the pairs.
+    known
+        (ERRORS,) 0 for the errors that were estimated, else 1.
+    moved
+        Largest motion of a view in each iteration, in units of 1 cm and 1 degree.
+    """
 
     poses: Float64
     errors: Float64
@@ -303,17 +303,22 @@ class _Iterated:
     moved: tuple[float, ...]
 
 
-def _iterate(
+def align_views(
     views: Sequence[KeptView],
     poses: Float64,
     options: RefineOptions,
-    calibrate: Sequence[int],
-    errors: Float64 | None,
-    priors: Priors | None,
-    pairs: Intp | None,
-    bodies: Bodies | None,
-) -> _Iterated:
-    """Gauss-Newton on all residuals, with correspondences found anew; see `refine`."""
+    *,
+    calibrate: Sequence[int] = (),
+    errors: Float64 | None = None,
+    priors: Priors | None = None,
+    pairs: Intp | None = None,
+    bodies: Bodies | None = None,
+) -> AlignedViews:
+    """Do as `refine` does, without measuring the support and the pairs of the result.
+
+    Gauss-Newton on all residuals, with correspondences found anew. The parameters are those of
+    `refine`.
+    """
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
     known = np.ones(kernels.ERRORS, np.int64)
@@ -342,7 +347,7 @@ def _iterate(
             since += moved[-1] if pairs is None else 0.0
             if moved[-1] < options.convergence:
                 break
-    return _Iterated(poses, errors, state, known, tuple(moved))
+    return AlignedViews(poses, errors, state, known, tuple(moved))
 
 
 def support_of(

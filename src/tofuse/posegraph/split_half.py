@@ -21,7 +21,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
-from tofuse.posegraph.joint_alignment import Priors, Refined, RefineOptions, Round, refine_poses
+from tofuse.posegraph.joint_alignment import Priors, Refined, RefineOptions, Round, align_views
 from tofuse.posegraph.shared_error import ACROSS, DOWN
 from tofuse.posegraph.view_store import KeptView
 
@@ -52,7 +52,7 @@ def split_half_errors(
             KeptView(v.surface, np.ascontiguousarray(v.points[half == first][::_EVERY]))
             for v, half in zip(views, halves, strict=True)
         ]
-        alone, _ = refine_poses(
+        alone = align_views(
             part,
             refined.poses,
             quick,
@@ -61,7 +61,7 @@ def split_half_errors(
             priors=priors,
             pairs=refined.pairs,
         )
-        return aligned_motion(refined.poses, alone)
+        return aligned_motion(refined.poses, alone.poses)
 
     variances = np.zeros(2)
     left = [v.patches % ACROSS < ACROSS // 2 for v in views]

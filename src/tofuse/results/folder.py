@@ -204,13 +204,13 @@ class OutputFolder:
 
 
 def check_output(path: str | Path, *, overwrite: bool) -> None:
-    """Check a folder as `OutputFolder` will, before work that it would be in vain for.
+    """Check early whether `OutputFolder` will accept a folder, before long work.
 
     Parameters
     ----------
     path, overwrite
-        As for `OutputFolder`. A folder with checkpoints may be the same run's: its content is not
-        checked.
+        As for `OutputFolder`. Checkpoints in the folder may be from an interruption of the same
+        run, which may then replace its content: that is left to `OutputFolder`.
 
     Raises
     ------
