@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import tofuse
+from kept_stages import Kept
 from made_rooms import at, seen
 from tofuse.files.spill import Scratch, Spill
 from tofuse.fusion.mesh import Mesh
 from tofuse.pipeline import reconstruct
-from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.state_checks import check_tracked
 from tofuse.pipeline.states import StateError, decode, encode
@@ -23,25 +23,6 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.prepared_view import PreparedView
-
-
-class Kept(Stages):
-    def __init__(self) -> None:
-        self.states: dict[str, tuple[str, dict[str, np.ndarray]]] = {}
-
-    def load(self, stage: str) -> object:
-        return None
-
-    def save(self, stage: str, state: object) -> None:
-        nodes, arrays = encode(state)
-        self.states[stage] = json.dumps(nodes), {k: v.copy() for k, v in arrays.items()}
-
-    def due(self) -> bool:
-        return True
-
-    def again(self, stage: str) -> Any:
-        nodes, arrays = self.states[stage]
-        return decode(json.loads(nodes), arrays)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +33,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def kept(recording: Recording) -> Kept:
-    stages = Kept()
+    stages = Kept(stop_at=0)
     config = changed(from_method("default"), {"self_calibration": False}, where="test")
     reconstruct.reconstruct(recording, config, stages=stages)
     return stages
@@ -113,7 +94,7 @@ FORGED: dict[str, tuple[str, Callable[[Any], None], str]] = {
 @pytest.mark.parametrize("name", FORGED)
 def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
     stage, forge, says = FORGED[name]
-    state = kept.again(stage)
+    state = kept.load(stage)
     through(state)
     forge(state)
     with pytest.raises(StateError) as caught:
@@ -123,7 +104,7 @@ def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
 
 
 def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
-    view = kept.again("tracking").mapper.views[0].view
+    view = kept.load("tracking").mapper.views[0].view
     assert isinstance(through(view), PreparedView)
     for name in ("rays", "z", "sigma", "planes", "plane_variance", "albedo"):
         array = getattr(view, name)
@@ -134,7 +115,7 @@ def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
 
 def test_what_was_put_away_is_looked_at_too(kept: Kept) -> None:
     """Views that memory can't hold are bytes in a file, and their shapes lie beside."""
-    view = kept.again("tracking").mapper.views[0].view
+    view = kept.load("tracking").mapper.views[0].view
     spill: Spill[PreparedView] = Scratch(0).part(1.0)
     for _ in range(2):
         spill.put(view)
@@ -168,7 +149,7 @@ def test_what_is_of_another_recording_is_refused(
     kept: Kept, recording: Recording, name: str
 ) -> None:
     forge, says = FOREIGN[name]
-    tracked = kept.again("tracking")
+    tracked = kept.load("tracking")
     check_tracked(tracked, recording)
     forge(tracked)
     with pytest.raises(ValueError, match=says):
@@ -191,6 +172,6 @@ def test_all_that_is_listed_takes_part_in_a_run(kept: Kept) -> None:
 
 
 def test_replace_is_refused_where_a_constructor_would(kept: Kept) -> None:
-    graph = kept.again("refinement")[0].graph
+    graph = kept.load("refinement")[0].graph
     with pytest.raises(tofuse.InputError):
         replace(graph, poses=graph.poses[:-1])
