@@ -10,7 +10,7 @@ finds out, does not count. The browser paints at most 60 frames per second.
     tofuse run RECORDING --out RESULT --voxel 0.008
     python benchmarks/report_frames.py RESULT [--seconds 4]
 
-Needs Chromium, and `pip install tofuse[dev]` for Playwright.
+Needs Chromium and Playwright.
 """
 
 from __future__ import annotations
