@@ -33,11 +33,12 @@ from recorded import RECORDED
 from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import displacement
+from tofuse.inspection.inspect import inspect_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.checks import tolerance_of
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.pipeline.run import Options, resolve
+from tofuse.pipeline.run import Options, resolve, with_findings
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -64,7 +65,7 @@ INCIDENT_CAUSES = {
 CAUSES = {
     "focal 5 % off": CALIBRATION,
     "depth 3 cm off": CALIBRATION,
-    "gap": frozenset({"bridged_gap", "disconnected"}),
+    "gap": frozenset({"bridged_gap", "disconnected", "frames_missing"}),
     **INCIDENT_CAUSES,
 }
 
@@ -161,10 +162,11 @@ def judged(
     *,
     turning: bool = False,
 ) -> Run:
-    """Run the default method, and compare what it states with the reference that fits best."""
+    """Inspect and reconstruct as `tofuse run` does; compare with the reference that fits best."""
     config = resolve(Options(out=Path("unused"), object=turning))
     try:
-        result = reconstruct(recording, config)
+        findings = inspect_recording(recording, turning=turning, quick=True).findings
+        result = with_findings(reconstruct(recording, config), findings, turning=turning)
     except TofuseError as error:
         code = (type(error).__name__,)
         return Run(family, name, "failed", code, np.inf, np.inf, np.inf, np.inf, 0.0, 0.0)
@@ -180,7 +182,7 @@ def judged(
         family,
         name,
         d.verdict,
-        tuple(r.code for r in d.reasons),
+        (*(r.code for r in d.reasons), *(f.code for f in findings)),
         *error,
         d.accuracy.position_m,
         d.accuracy.rotation_rad,

@@ -41,6 +41,8 @@ class Step:
         Registrations of this frame to frames of other components, which may join them.
     doubtful
         Whether it fits worse than views of this camera usually do.
+    inflation
+        Factor by which it enlarged the standard deviations of the registration for that reason.
     moving
         (H, W) mask of the frame's pixels on moving objects; None without any.
     """
@@ -54,6 +56,7 @@ class Step:
     component: int = 0
     links: tuple[Link, ...] = ()
     doubtful: bool = False
+    inflation: float = 1.0
     moving: Bool | None = None
 
 

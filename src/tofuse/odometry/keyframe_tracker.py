@@ -186,8 +186,9 @@ class KeyframeTracker(Tracker):
             view,
             self._component,
             links,
-            not accepted.assessment.usual,
-            mask,
+            doubtful=not accepted.assessment.usual,
+            inflation=_inflation(accepted),
+            moving=mask,
         )
 
     def _insert_keyframe(self, view: PreparedView, accepted: Hypothesis) -> tuple[Link, ...]:
@@ -211,9 +212,12 @@ class KeyframeTracker(Tracker):
     def _registration(self, accepted: Hypothesis) -> Registration:
         a, targets = accepted.aligned, [accepted.reference.target]
         C = covariance(accepted.view, targets, a, self._options.views.alignment)
-        # Odds that are twice as high as usual double the standard deviation.
-        C = C * np.exp(2 * min(accepted.assessment.excess, 5.0))
-        return registration_of(a, accepted.T_keyframe_camera, C)
+        return registration_of(a, accepted.T_keyframe_camera, C * _inflation(accepted) ** 2)
+
+
+def _inflation(accepted: Hypothesis) -> float:
+    """Odds that are twice as high as usual double the standard deviation."""
+    return float(np.exp(min(accepted.assessment.excess, 5.0)))
 
 
 def _status_of(accepted: Hypothesis, frame: RangeFrame) -> tuple[Status, str]:

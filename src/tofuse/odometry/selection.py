@@ -11,14 +11,12 @@ from tofuse.odometry.hypotheses import Hypotheses, Hypothesis
 from tofuse.odometry.motion import Moment, MotionModel, is_small
 from tofuse.odometry.motion_segmentation import MotionSegmentation
 from tofuse.odometry.relocalization import Relocalizer
-from tofuse.registration.agreement import AgreementOptions, agreement
+from tofuse.registration.agreement import MIN_LEAD, AgreementOptions, agreement
 from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
 
 # Weight of the deviation from the predicted motion, as a fraction of the points: small, as a wrong
 # pose loses more where the scene constrains it.
 _MOTION_WEIGHT = 0.05
-# Smallest difference of the scores of different poses, as a fraction of the points.
-_MIN_LEAD = 0.03
 # Degenerate directions of a view of a plane: two translations and a rotation.
 _PLANE = 3
 
@@ -96,7 +94,7 @@ class HypothesisSelector:
                 continue
             if (
                 np.isfinite(rival)
-                and self._explanation_score(hypothesis, hypotheses, now) < rival - _MIN_LEAD
+                and self._explanation_score(hypothesis, hypotheses, now) < rival - MIN_LEAD
             ):
                 continue
             if (usual and self._usual.is_known) or self._agreement(hypothesis) > 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -39,6 +39,7 @@ from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_se
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
 from tofuse.posegraph.joining import Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop, Loops
+from tofuse.posegraph.neighbour_check import worse_neighbours
 from tofuse.posegraph.refinement import Refinement, Refiner
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import RangeFrame
@@ -66,13 +67,17 @@ class VisualEvidence:
 
 @dataclass(frozen=True, eq=False)
 class Optimised:
-    """The result of closing loops and optimising."""
+    """The result of closing loops and optimising.
+
+    `confirmed` are frames whose registrations fit unusually but that the loops show to be right.
+    """
 
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
     sensors: SensorPriors
     visual: VisualEvidence
+    confirmed: frozenset[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +205,12 @@ class BackEnd:
         if self._config.priors:
             sensed = self._log.sensed(graph.ids.tolist())
             sensors = measure_all(self._config.priors, sensed, self._measured(tracked))
-        graph = with_sensors(graph, sensors)
-        optimisation = Optimisation(graph, (), True)
+        optimisation = Optimisation(with_sensors(graph, sensors), (), True)
+        confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
-                optimisation = self._config.optimiser.optimise(graph)
+                optimisation, confirmed = self._optimise(loops, sensors, sequential)
                 if sensors and graph.loop.any():  # the poses that loops are compared with
                     without_loops = with_sensors(tracked, sensors)
                     guided = self._config.optimiser.optimise(without_loops).graph.poses
@@ -215,9 +220,35 @@ class BackEnd:
         visual = VisualEvidence(guided, optimisation)
         if sensors:
             # The verdict rests on the images alone: external sensors can't improve it.
-            images_only = self.graph(loops).with_poses(graph.poses)
+            images_only = self.graph(loops, confirmed=confirmed).with_poses(graph.poses)
             visual = VisualEvidence(guided, replace(optimisation, graph=images_only))
-        return Optimised(loops, sequential, optimisation, sensors, visual)
+        return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)
+
+    def _optimise(
+        self, loops: Sequence[ClosedLoop], sensors: SensorPriors, sequential: Float64
+    ) -> tuple[Optimisation, frozenset[int]]:
+        """Optimise the poses; again if neighbouring views no longer agree.
+
+        The registrations between those get their usual uncertainty: see `worse_neighbours`.
+        Returns the frames of these registrations as well.
+        """
+        suspects = frozenset(
+            e.record.index for e in self._posed if e.step is not None and e.step.inflation > 1
+        )
+        confirmed: frozenset[int] = frozenset()
+        while True:
+            graph = with_sensors(self.graph(loops, confirmed=confirmed), sensors)
+            optimisation = self._config.optimiser.optimise(graph)
+            row = {int(index): k for k, index in enumerate(graph.ids)}
+            views = self._kept.views.of(row) if suspects else []
+            at = [row[v.index] for v in views]
+            poses = optimisation.graph.poses
+            worse = worse_neighbours(views, sequential[at], poses[at], suspects)
+            between = {k for i, j in worse for k in range(i + 1, j + 1)}
+            if not between & suspects:
+                return optimisation, confirmed
+            confirmed |= between & suspects
+            suspects -= between
 
     def _search_loops_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
         """Search loops again once those found have corrected the poses in between.
@@ -243,7 +274,8 @@ class BackEnd:
         with self._watch.timing("refinement"):
             refinement = self._kept.refiner.finish(graph.ids.tolist(), graph.poses, closed.sensors)
             if refinement.kept:
-                graph = with_sensors(self.graph(closed.loops, refinement), closed.sensors)
+                graph = self.graph(closed.loops, refinement, confirmed=closed.confirmed)
+                graph = with_sensors(graph, closed.sensors)
         return Refined(graph, refinement)
 
     def _fuse(self, closed: Optimised, refined: Refined) -> Fused:
@@ -338,6 +370,7 @@ class BackEnd:
         loops: Sequence[ClosedLoop],
         refined: Refinement | None = None,
         *,
+        confirmed: Collection[int] = (),
         cautious: bool = False,
     ) -> PoseGraph:
         """Return the pose graph as tracked and joined, or with the edges of the refinement.
@@ -348,6 +381,8 @@ class BackEnd:
             Closed loops to include.
         refined
             Replaces poses and edges of the views that it refined.
+        confirmed
+            Frames whose registrations get their uncertainty without `Step.inflation`.
         cautious
             Whether the error of predicted motion grows at the largest rate (`at_worst`).
         """
@@ -377,6 +412,8 @@ class BackEnd:
             elapsed = abs(times[index] - times[step.reference])
             longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
             information = r.information
+            if index in confirmed:
+                information = information * step.inflation**2
             if prediction is not None:
                 sigma = prediction.error(int(run[place[index]]), frames)
                 predicted = (sigma[0] * longer**2, sigma[1] * longer**2)
@@ -412,7 +449,9 @@ class BackEnd:
         if closed.sensors:  # the accuracy rests on the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
-                without_sensors = self.graph(closed.loops, refinement)
+                without_sensors = self.graph(
+                    closed.loops, refinement, confirmed=closed.confirmed
+                )
             images_only = self._measured(without_sensors, refinement.stated)
         moved = 0.0, 0.0
         if self._tracks:  # the initial error of given poses says nothing of the final one

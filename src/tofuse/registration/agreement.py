@@ -15,6 +15,8 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints
 
+# Smallest difference between the scores of different poses, as a fraction of the points.
+MIN_LEAD = 0.03
 _CHUNK_POINTS = 6000
 _CLASH = 2.0  # times the difference that counts neither way
 _NEIGHBOURS = np.ones((5, 5), np.uint8)

@@ -1,0 +1,115 @@
+"""Neighbouring views must agree after loops were closed as they did before."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.geometry import se3
+from tofuse.odometry.base import Step
+from tofuse.pipeline.backend import BackEnd
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.progress import Stopwatch
+from tofuse.posegraph.external_sensors import SensorPriors
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.loops import ClosedLoop
+from tofuse.posegraph.neighbour_check import worse_neighbours
+from tofuse.posegraph.view_store import PosedView
+from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+
+SIGMA = np.array([0.003] * 3 + [0.002] * 3)
+SIDEWAYS = se3.exp(np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def views(room_recording):
+    recording = tofuse.open(room_recording)
+    prepared = [prepare_view(frame, SurfaceOptions()) for frame in recording]
+    truth = recording.reference
+    return [PosedView(v, T) for v, T in zip(prepared, truth, strict=True)], truth
+
+
+def displaced_from(truth, k):
+    return np.concatenate([truth[:k], truth[k:] @ SIDEWAYS])
+
+
+def test_neighbours_pulled_apart_are_found_where_registrations_are_uncertain(views) -> None:
+    posed, truth = views
+    pulled = displaced_from(truth, 3)
+    everywhere = frozenset(range(len(truth)))
+    assert list(worse_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
+    assert list(worse_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
+    assert not list(worse_neighbours(posed, truth, pulled, everywhere - {3}))
+    # A loop that mends a pair is right, and so is one that changes nothing.
+    assert not list(worse_neighbours(posed, pulled, truth, everywhere))
+    assert not list(worse_neighbours(posed, truth, truth, everywhere))
+
+
+def chain(posed, truth, inflation, wrong):
+    """A back end whose registrations are true, but for that of the frame `wrong`."""
+    entries, poses = [], {}
+    information = np.diag(SIGMA**-2)
+    T = np.eye(4)
+    for k in range(len(truth)):
+        step = Step("tracked", "", T)
+        if k:
+            T_before = se3.inverse(truth[k - 1]) @ truth[k]
+            T_before = T_before @ SIDEWAYS if k == wrong else T_before
+            T = T @ T_before
+            own = information / inflation.get(k, 1.0) ** 2
+            found = Registration(T_before, True, 5, 100, 100, 0.1, 0.01, own)
+            factor = inflation.get(k, 1.0)
+            step = Step("tracked", "", T, k - 1, found, doubtful=factor > 1, inflation=factor)
+        record = SimpleNamespace(index=k, timestamp=0.1 * k, unobservable=np.zeros((0, 6)))
+        entries.append(SimpleNamespace(record=record, step=step))
+        poses[k] = T
+    log = SimpleNamespace(posed=entries, entries=entries)
+    kept = SimpleNamespace(views=SimpleNamespace(of=lambda row: posed))
+    progress = SimpleNamespace(stage=lambda *_: None)
+    return BackEnd(from_method("default"), log, poses, (), (), kept, progress, Stopwatch())
+
+
+def test_the_gap_of_a_loop_does_not_go_where_the_images_fit(views) -> None:
+    posed, truth = views
+    n = len(truth)
+    wrong, unusual = 2, n - 2
+    loop = ClosedLoop(
+        LoopRecord(0, n - 1, True, "made"),
+        se3.inverse(truth[0]) @ truth[-1],
+        np.diag(SIGMA**-2),
+    )
+    end = chain(posed, truth, {unusual: 100.0}, wrong)
+    sequential = end.graph(()).poses
+
+    def moved(graph, k):
+        T = se3.inverse(graph.poses[k - 1]) @ graph.poses[k]
+        return np.linalg.norm((se3.inverse(T) @ se3.inverse(truth[k - 1]) @ truth[k])[:3, 3])
+
+    # Least squares alone pulls the uncertain pair apart, which was right.
+    plain = end._config.optimiser.optimise(end.graph([loop])).graph
+    assert moved(plain, unusual) > 0.07
+    optimisation, confirmed = end._optimise([loop], SensorPriors(), sequential)
+    assert confirmed == {unusual}
+    assert moved(optimisation.graph, unusual) < 0.04
+    assert moved(optimisation.graph, wrong) < moved(plain, wrong)
+
+
+def test_a_registration_that_the_images_contradict_stays_uncertain(views) -> None:
+    posed, truth = views
+    n, wrong = len(truth), 3
+    loop = ClosedLoop(
+        LoopRecord(0, n - 1, True, "made"),
+        se3.inverse(truth[0]) @ truth[-1],
+        np.diag(SIGMA**-2),
+    )
+    end = chain(posed, truth, {wrong: 100.0}, wrong)
+    optimisation, confirmed = end._optimise([loop], SensorPriors(), end.graph(()).poses)
+    assert not confirmed
+    relative = se3.inverse(se3.inverse(truth[2]) @ truth[3]) @ (
+        se3.inverse(optimisation.graph.poses[2]) @ optimisation.graph.poses[3]
+    )
+    assert np.linalg.norm(relative[:3, 3]) < 0.005
