@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from tofuse.odometry.motion import Moment, MotionModel, is_small
 from tofuse.odometry.motion_segmentation import MotionSegmentation
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.agreement import MIN_LEAD, AgreementOptions, agreement
+from tofuse.registration.projective import UNITS
+from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD
 from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
 
 # Weight of the deviation from the predicted motion, as a fraction of the points: small, as a wrong
@@ -19,6 +22,8 @@ from tofuse.registration.verification import UsualFit, finely_scaled, self_scale
 _MOTION_WEIGHT = 0.05
 # Degenerate directions of a view of a plane: two translations and a rotation.
 _PLANE = 3
+# Starts along a degenerate direction each way: the gate is wide where the camera accelerates.
+_MAX_STARTS = 5
 
 
 class HypothesisSelector:
@@ -43,31 +48,49 @@ class HypothesisSelector:
         best = self._first_usual(hypotheses, now)
         if best is None and in_sequence:
             best = self._best_uncertain(hypotheses, now) or self._by_search(hypotheses, now)
-        elif best is not None and in_sequence and self._lost_constraints(best):
+        elif best is not None and in_sequence and len(best.aligned.unobservable):
             best = self._better_constrained(best, hypotheses, now)
         self._degenerate = 0 if best is None else len(best.aligned.unobservable)
         return best
 
-    def _lost_constraints(self, hypothesis: Hypothesis) -> bool:
-        """Whether a view is less constrained than the one before.
-
-        What constrains it may be outside the convergence basin of a wrong start, and the rest fits
-        anywhere along a wall.
-        """
-        return len(hypothesis.aligned.unobservable) > self._degenerate
-
     def _better_constrained(
         self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
     ) -> Hypothesis:
-        """Return the result of a search, if it is better constrained and has a better score."""
-        other = self._by_search(hypotheses, now)
-        if other is None or len(other.aligned.unobservable) >= len(hypothesis.aligned.unobservable):
-            return hypothesis
-        poses = (
-            self._explanation_score(other, hypotheses, now),
-            self._explanation_score(hypothesis, hypotheses, now),
-        )
-        return other if poses[0] > poses[1] else hypothesis
+        """Return the alignment with the best score among those that are better constrained.
+
+        What constrains a view may be outside the convergence basin of a wrong start, and the rest
+        fits anywhere along a wall. So other starts along the degenerate directions are tried, and a
+        search where the view before was better constrained.
+        """
+        best, best_score = hypothesis, self._explanation_score(hypothesis, hypotheses, now)
+        degenerate = len(hypothesis.aligned.unobservable)
+        found = self._by_search(hypotheses, now) if degenerate > self._degenerate else None
+        others = [(found, 0.0)] if found is not None else []
+        others += [(other, MIN_LEAD) for other in self._displaced(hypothesis, hypotheses, now)]
+        for other, lead in others:
+            if len(other.aligned.unobservable) < degenerate:
+                score = self._explanation_score(other, hypotheses, now)
+                if score > best_score + lead:
+                    best, best_score = other, score
+        return best
+
+    def _displaced(
+        self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
+    ) -> Iterator[Hypothesis]:
+        """Align from starts along the degenerate directions, within the gate."""
+        T = hypothesis.T_component_camera
+        for direction in hypothesis.aligned.unobservable * UNITS:
+            lengths = np.linalg.norm(direction.reshape(2, 3), axis=1)
+            step = direction / np.max(lengths / (DISTINCT_M, DISTINCT_RAD))
+            for sign in (-1, 1):
+                for k in range(1, _MAX_STARTS + 1):
+                    start = T @ se3.exp(sign * k * step)
+                    if self._motion.gate_violation(start, now):
+                        break
+                    r, view = hypothesis.reference, hypothesis.view
+                    other = hypotheses.realigned(start, view, r, predicted=True)
+                    if other.assessment.usual and not self._violates_gate(other, now):
+                        yield other
 
     def _first_usual(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
         """Return the first alignment with a usual fit and a motion inside of the gate.

@@ -449,9 +449,7 @@ class BackEnd:
         if closed.sensors:  # the accuracy rests on the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
-                without_sensors = self.graph(
-                    closed.loops, refinement, confirmed=closed.confirmed
-                )
+                without_sensors = self.graph(closed.loops, refinement, confirmed=closed.confirmed)
             images_only = self._measured(without_sensors, refinement.stated)
         moved = 0.0, 0.0
         if self._tracks:  # the initial error of given poses says nothing of the final one

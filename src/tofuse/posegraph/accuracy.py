@@ -19,6 +19,7 @@ from scipy.special import gammaincinv
 
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
+from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.covariances import joint_covariance, pose_covariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.view_store import PosedView
@@ -175,8 +176,9 @@ def degenerate_directions(
 ) -> list[Float64]:
     """Return the degenerate directions of every edge: (k, 6), right perturbations of j.
 
-    Those of the tracker's registrations are known. A pair of the refinement is aligned again if one
-    of its views was degenerate in tracking.
+    Those of the tracker's registrations are known. A pair of the refinement is aligned again if
+    tracking was degenerate in one of its views or between them: after an unnoticed slide along a
+    wall, later views overlap with earlier ones at wrong poses.
 
     Parameters
     ----------
@@ -191,25 +193,33 @@ def degenerate_directions(
     stated
         Pairs (i, j) that do not come from the overlap of the two views: never degenerate.
     """
-    out = []
+    degenerate = np.array(sorted(unobservable), np.intp)
+    out: list[Float64] = []
+    compared: list[int] = []  # edges to align again
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
-        if (i, j) in stated:
-            out.append(_NONE)
-            continue
         # A perturbation of i is the opposite one of j, by the adjoint.
         there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
-        known = np.concatenate([there, unobservable.get(j, _NONE)])
-        found = known
+        here = unobservable.get(j, _NONE)
+        out.append(_NONE if (i, j) in stated else np.concatenate([there, here]))
+        if (i, j) in stated:
+            continue
         if (i, j) in own:
-            found = unobservable.get(j, _NONE)
-        elif len(known) and i in views and j in views:
-            target = [Target(views[i].view.without_caches(), np.eye(4))]
-            aligned = align(views[j].view.without_caches(), target, T_i_j, _ALIGNMENT)
-            found = aligned.unobservable * UNITS
-        # Directions are known to a few degrees only, and the remainder would look measured: a
-        # degenerate pair is taken to be degenerate in all directions of its views.
-        out.append(np.concatenate([found, known]) if len(found) else _NONE)
+            out[-1] = out[-1] if len(here) else _NONE
+        elif i in views and j in views:
+            first, last = np.searchsorted(degenerate, (min(i, j), max(i, j) + 1))
+            compared += [len(out) - 1] if last > first else []
+
+    def work(start: int, stop: int) -> None:
+        for k in compared[start:stop]:
+            i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
+            target = [Target(i, np.eye(4))]
+            found = align(j, target, graph.measurements[k], _ALIGNMENT).unobservable * UNITS
+            # Directions are known to a few degrees only, and the remainder would look measured: a
+            # degenerate pair is taken to be degenerate in all directions of its views.
+            out[k] = np.concatenate([found, out[k]]) if len(found) else _NONE
+
+    run_chunks(work, len(compared), -(-len(compared) // 16))
     return out
 
 
