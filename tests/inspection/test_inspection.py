@@ -475,3 +475,20 @@ def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(d
     assert hints, [str(f) for f in findings]
     told = inspect_recording(of(frames), turning=True).findings
     assert not any("--object" in str(f) for f in told)
+
+
+def test_depth_errors_that_no_lens_explains_are_not_blamed_on_it(tmp_path) -> None:
+    """In a corridor few surfaces are seen, and errors of the depth bend them."""
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
+
+    folder = simulate(
+        "corridor",
+        tmp_path / "corridor",
+        camera="ifm-o3r",
+        seed=10,
+        every=12,
+        effects=Effects(multipath=False),
+    )
+    found = tofuse.inspect(tofuse.open(folder)).findings
+    assert not {f.code for f in found if f.severity == "severe"}

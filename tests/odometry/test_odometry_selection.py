@@ -137,3 +137,28 @@ def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
     assert result.has_pose.all()
     assert displacement(recording.reference, result.trajectory)[0] < 0.04
     assert not any(len(f.unobservable) for f in result.diagnostics.frames)
+
+
+def test_starts_along_a_corridor_find_what_the_prediction_missed(tmp_path) -> None:
+    """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
+    from tofuse.evaluation.trajectory import displacement
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
+    from tofuse.pipeline.config import from_method
+    from tofuse.pipeline.reconstruct import reconstruct
+    from tofuse.recordings.open import open_recording
+
+    folder = simulate(
+        "corridor",
+        tmp_path / "corridor",
+        camera="sr4000",
+        seed=10,
+        every=12,
+        effects=Effects(multipath=False),
+    )
+    recording = open_recording(folder)
+    result = reconstruct(recording, from_method("default"))
+    assert recording.reference is not None
+    assert result.has_pose.all()
+    # 0.27 m near the prediction.
+    assert displacement(recording.reference, result.trajectory)[0] < 0.02

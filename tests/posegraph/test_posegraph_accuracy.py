@@ -172,6 +172,18 @@ def test_what_a_pair_sees_decides(view, degenerate) -> None:
     assert (len(found) > 0) == degenerate
 
 
+@pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
+def test_pairs_over_a_degenerate_frame_are_aligned_again(view, degenerate) -> None:
+    """After a slide in frame 1, frames 0 and 2 overlap wherever the slide ended."""
+    surface = flat_wall() if view == "wall" else surface_of_corner()
+    steps = [Measured(0, 2, np.eye(4), np.eye(6) * 1e6), Measured(2, 3, np.eye(4), np.eye(6) * 1e6)]
+    graph = build_graph(range(4), np.tile(np.eye(4), (4, 1, 1)), steps)
+    views = dict.fromkeys(range(4), PosedView(surface, np.eye(4)))
+    over, after = degenerate_directions(graph, {1: X}, (), views)
+    assert (len(over) > 0) == degenerate
+    assert not len(after)
+
+
 def flat_wall():
     z = np.full((60, 80), 2.0, np.float32)
     return prepare_view(as_frame(z, 0), SurfaceOptions())

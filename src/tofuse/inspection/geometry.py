@@ -20,6 +20,9 @@ _MIN_SCALE = -0.8
 _MIN_SURFACES = 4
 # Surfaces with a larger misfit, relative to the depth, under any lens are not planar.
 _FLAT = 0.012
+# Distortion that leaves a larger fraction of the misfit is not its cause: the surfaces are not
+# planar, or other errors of the depth bend them.
+_EXPLAINED = 0.9
 # Largest offset of the principal point from the image centre, as a fraction of the image size.
 _OFF_CENTRE = 0.2
 # Limits of the focal length as fractions of the width: 150 and 12 degrees field of view.
@@ -70,6 +73,8 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
     lens = None if found is None else fit_distortion(sample.regions, sample.radius, kind)
     if lens is None or lens.rms_after > _FLAT or lens.folds:
         return  # too few surfaces, or no planes
+    if lens.rms_after > _EXPLAINED * lens.rms_before:
+        return
     stretch, sigma = lens.stretch
     scale, scale_sigma = lens.first
     if (
