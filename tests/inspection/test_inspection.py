@@ -28,6 +28,7 @@ from tofuse.inspection.sample import Sample
 from tofuse.pipeline.run import with_findings
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.results.types import SelfCalibration
 from wrapped_depth import wrapping
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
@@ -461,6 +462,22 @@ def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording
     assert "faulty_recording" in {r.code for r in moving.diagnostics.reasons}
     assert "faulty_recording" not in {r.code for r in turning.diagnostics.reasons}
     assert turning.recording["findings"] == moving.recording["findings"]
+
+
+def test_a_focal_length_that_was_corrected_is_no_fault_of_the_result(room_recording: Path) -> None:
+    result = tofuse.reconstruct(tofuse.open(room_recording))
+    result = replace(result, recording={**result.recording, "warnings": []})
+    wrong = Finding("focal_length", "It is that of another camera.", "Use the right one.", {})
+
+    def faults(focal: float, offset_m: float) -> list[str]:
+        corrected = SelfCalibration(focal, offset_m, {}, (0.1, 0.01))
+        diagnostics = replace(result.diagnostics, calibrated=corrected)
+        found = with_findings(replace(result, diagnostics=diagnostics), [wrong])
+        assert found.recording["findings"] == [wrong.to_dict()]
+        return [r.code for r in found.diagnostics.reasons if r.code == "faulty_recording"]
+
+    assert not faults(0.05, 0.0)
+    assert faults(0.0, 0.03)
 
 
 @pytest.mark.parametrize("degrees", [6.0, 15.0])

@@ -268,14 +268,19 @@ def with_findings(
 ) -> Reconstruction:
     """Return the result with the findings of an inspection, which may change the verdict.
 
-    Wrapped background behind a turning object does not matter, as it is left out.
+    Two faults do not matter: wrapped background behind a turning object, which is left out, and a
+    focal length that self-calibration has corrected.
     """
     indices = [f.index for f in result.diagnostics.frames]
     whole = ((indices[0], indices[-1]),)
+    calibrated = result.diagnostics.calibrated
+    harmless = {"phase_wrap"} if turning else set()
+    if calibrated is not None and calibrated.focal:
+        harmless.add("focal_length")
     severe = [
         Reason("faulty_recording", whole, f"{f.text} {f.remedy}")
         for f in findings
-        if f.severity == "severe" and not (turning and f.code == "phase_wrap")
+        if f.severity == "severe" and f.code not in harmless
     ]
     reasons = ranked((*result.diagnostics.reasons, *severe))
     verdict = verdict_of(reasons)
