@@ -29,6 +29,7 @@ from typing import Literal
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
+from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.arrays import Bool, Float64, Int64
 from tofuse.registration.prepared_view import PreparedView
@@ -171,6 +172,13 @@ class Distortion:
         """
         g = np.array([0.0, 1.0, 1.0])
         return float(g @ self.values), float(np.sqrt(g @ self.covariance @ g))
+
+    def quantile(self, sigmas: float) -> float:
+        """Return the multiple of a standard deviation as rare as `sigmas` of a normal variable.
+
+        Standard deviations are estimated from few surfaces: Student's t distribution.
+        """
+        return float(stdtrit(max(self.surfaces - len(self.values), 1), ndtr(sigmas)))
 
     @property
     def folds(self) -> bool:
