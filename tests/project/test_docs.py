@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from tofuse import parts
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
+from tofuse.lab import demo
 from tofuse.pipeline.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
@@ -518,6 +519,9 @@ def test_notebooks_run(
 ) -> None:
     shutil.copytree(room_recording, tmp_path / "scan")
     monkeypatch.chdir(tmp_path)
+    # Effects of the camera take most of the time, and what the notebooks show needs none.
+    plain = partial(demo.simulate_to, without=("all",))
+    monkeypatch.setattr(demo, "simulate_to", plain)
     names = run_notebook(path)
     assert len(names["recording"]) > 1
 
