@@ -12,6 +12,15 @@ settings.register_profile("tests", deadline=None, derandomize=True)
 settings.load_profile("tests")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile kernels once where several processes share the tests; each would compile its own."""
+    several = getattr(config.option, "numprocesses", None)
+    if several and not hasattr(config, "workerinput") and not config.option.collectonly:
+        from compiled_kernels import compile_kernels
+
+        compile_kernels()
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real recordings beside the project; tests that need it skip where it is absent."""
