@@ -83,4 +83,7 @@ def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) 
 
 
 def test_a_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
-    assert soak.live(32, 15.0, 10.0, tmp_path, mapped=True, samples=3)
+    camera = soak.Camera(32, 70, 10.0)
+    list(camera._frames(70))
+    assert min(camera.sent.missing, camera.sent.doubled, camera.sent.late) > 0
+    assert soak.live(32, 7.0, 10.0, tmp_path, mapped=True, samples=3)
