@@ -266,7 +266,8 @@ def test_page_shows_switches_slides_and_measures(folder, browser):
             ends = [result.mesh.points[40 * 20 + 8], result.mesh.points[40 * 20 + 30]]
             second = page.get_by_text("Click the second point.")
             for _ in range(3):  # viser drops clicks until its page has drawn the new mode
-                page.mouse.click(*screen(client, ends[0], box))
+                if not view.ends:  # a slow page has not yet said so
+                    page.mouse.click(*screen(client, ends[0], box))
                 with contextlib.suppress(NotYet):
                     second.wait_for(timeout=10_000)
                     break
