@@ -8,9 +8,12 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
 from tofuse.kernels import ahead, jit
+from tofuse.kernels.moving_objects import Cells, Limits
 
 
 def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
@@ -22,6 +25,22 @@ def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
         lines.append(ahead.signature_line(name, types))
     assert lines == Path(ahead.__file__).with_name("signatures.txt").read_text().splitlines()
     assert len(lines) == len(set(lines)) > 50
+
+
+def test_named_tuples_are_listed_with_their_fields(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits, image = Limits(0.005, 0.04, 2, 3.0, 1.2, 0.3), np.zeros((2, 3), np.float32)
+    alike = Cells(image, image, image, image)
+    types = tuple(numba.typeof(each) for each in (limits, 1, alike, (alike, alike)))
+    line = ahead.signature_line("moving_objects.compare", types)
+    cells = "moving_objects.Cells(f4:2C,f4:2C,f4:2C,f4:2C)"
+    mixed = "moving_objects.Limits(f8,f8,i8,f8,f8,f8)"
+    assert line == f"moving_objects.compare {mixed} i8 {cells} 2x{cells}"
+    listed = tmp_path / "signatures.txt"
+    listed.write_text(line)
+    monkeypatch.setattr(ahead, "_LIST", listed)
+    assert ahead.signatures() == [("moving_objects.compare", types)]
 
 
 def test_what_is_listed_compiles(tmp_path: Path) -> None:

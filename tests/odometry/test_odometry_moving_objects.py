@@ -417,6 +417,12 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
 )
 
 
+def sampled(view):
+    """The view with its cells as the kernels take it."""
+    images = view.rays, view.z, view.sigma, view.planes, view.plane_variance
+    return kernels.View(*images, view.projection.lookup, view.projection.frame, STRIDE)
+
+
 def test_compare_is_its_twin():
     camera, view, other, T = pair()
     flagged = np.zeros((18, 24), bool)
@@ -450,13 +456,10 @@ def test_compare_is_its_twin():
         outcome[a, b] = kernels.IN_FRONT if d < 0 else kernels.BEHIND
         llr[a, b] = min((outside**2 / v - gap) / 2, MOST)
     got, evidence = np.empty(depth.shape, np.uint8), np.empty(depth.shape, np.float32)
+    limits = kernels.Limits(MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT)
+    views = sampled(view), sampled(other)
     for start, stop in ((0, 7), (7, 18)):
-        kernels.compare(
-            view.rays, view.z, view.sigma, view.planes, view.plane_variance, STRIDE,
-            other.z, other.sigma, other.planes, other.plane_variance, flagged, STRIDE,
-            other.projection.lookup, other.projection.frame, T, SCALE, MODEL_ERROR, JUMP, RADIUS,
-            MOST, LEAST, WEIGHT, got, evidence, start, stop,
-        )  # fmt: skip
+        kernels.compare(*views, flagged, T, SCALE, limits, got, evidence, start, stop)
     assert set(np.unique(outcome)) == {0, 1, 2, 3, 4}
     np.testing.assert_array_equal(got, outcome)
     np.testing.assert_allclose(evidence, llr, atol=1e-3)
@@ -472,11 +475,7 @@ def test_residual_ratios_are_their_twin():
     ok &= (there > 0) & ~moving
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = np.abs(here - there) / np.sqrt(variance + own + (MODEL_ERROR * there) ** 2)
-    got = kernels.residual_ratios(
-        view.rays, view.z, view.sigma, view.planes, view.plane_variance, moving, 2, 3,
-        other.z, other.sigma, other.planes, other.plane_variance,
-        other.projection.lookup, other.projection.frame, T, MODEL_ERROR,
-    )  # fmt: skip
+    got = kernels.residual_ratios(sampled(view), moving, 3, sampled(other), T, MODEL_ERROR)
     np.testing.assert_allclose(got, ratios[::3, ::3][ok[::3, ::3]], rtol=1e-3, atol=1e-4)
 
 
@@ -502,13 +501,10 @@ def test_carry_and_predict_are_their_twins():
     odds = np.where(same, odds_before[i, j], np.float32(prior))
     odds = np.where(with_camera, odds_before[own_i, own_j], odds)
     out = [np.empty(before.shape, t) for t in (np.float32, np.float32, np.uint8, np.bool_)]
-    grid = other.projection
+    views = sampled(view), sampled(other)
+    cells = kernels.Cells(before, odds_before, moved, tracked_before)
     for start, stop in ((0, 5), (5, 18)):
-        kernels.propagate(
-            view.rays, view.z, view.sigma, view.planes, view.plane_variance, STRIDE, before,
-            odds_before, moved, tracked_before, STRIDE, other.z.shape, grid.lookup, grid.frame, T,
-            tolerance, prior, *out, start, stop,
-        )  # fmt: skip
+        kernels.propagate(*views, cells, T, tolerance, prior, *out, start, stop)
     np.testing.assert_allclose(out[0], depth, rtol=1e-6)
     assert with_camera.any()
     np.testing.assert_array_equal(out[1], odds)
@@ -528,10 +524,7 @@ def test_carry_and_predict_are_their_twins():
                 moved[near] & (np.abs(before[near] - distance[a, b]) <= 0.1 * distance[a, b])
             )
     got = np.empty(before.shape, np.bool_)
-    kernels.predict(
-        view.rays, view.z, STRIDE, before, moved, STRIDE, other.z.shape, grid.lookup, grid.frame,
-        T, 0.1, 1, got,
-    )  # fmt: skip
+    kernels.predict(*views, cells, T, 0.1, 1, got)
     assert 0 < np.count_nonzero(expected) < expected.size
     np.testing.assert_array_equal(got, expected)
 

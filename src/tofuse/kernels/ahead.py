@@ -8,6 +8,7 @@ records it again.
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -91,9 +92,11 @@ def signature_line(name: str, types: tuple[Any, ...]) -> str:
 
 def _type_of(text: str) -> Any:
     kinds: Any = numba.types
-    if "x" in text:
-        count, item = text.split("x")
-        return kinds.UniTuple(_type_of(item), int(count))
+    if found := re.fullmatch(r"(\d+)x(.+)", text):
+        return kinds.UniTuple(_type_of(found[2]), int(found[1]))
+    if found := re.fullmatch(r"(\w+)\.(\w+)\((.+)\)", text):
+        named = getattr(import_module(f"tofuse.kernels.{found[1]}"), found[2])
+        return kinds.BaseTuple.from_types([_type_of(field) for field in found[3].split(",")], named)
     short, _, shape = text.lstrip("!").partition(":")
     dtype = getattr(kinds, _DTYPES[short])
     if not shape:
@@ -102,9 +105,14 @@ def _type_of(text: str) -> Any:
 
 
 def _text_of(kind: Any) -> str:
-    if isinstance(kind, numba.types.UniTuple):
+    kinds: Any = numba.types
+    if isinstance(kind, kinds.BaseNamedTuple):
+        named = kind.instance_class
+        fields = ",".join(_text_of(field) for field in kind.types)
+        return f"{named.__module__.rsplit('.', 1)[1]}.{named.__name__}({fields})"
+    if isinstance(kind, kinds.UniTuple):
         return f"{kind.count}x{_text_of(kind.dtype)}"
-    if isinstance(kind, numba.types.Array):
+    if isinstance(kind, kinds.Array):
         mark = "" if kind.mutable else "!"
         return f"{mark}{_NAMES[str(kind.dtype)]}:{kind.ndim}{kind.layout}"
     return _NAMES[str(kind)]

@@ -12,6 +12,8 @@ where d is the difference of depth. It is negative where the views agree.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, UInt8
@@ -31,7 +33,78 @@ _MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
 _EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
 
-# The following functions take scalars: Numba counts references to each array that is passed.
+class View(NamedTuple):
+    """A view that is sampled at every `stride`-th pixel, its cells.
+
+    Attributes
+    ----------
+    rays, z, sigma, planes, plane_variance
+        As in `PreparedView`.
+    lookup, lookup_frame
+        Projection of rays, as in `project_ray`.
+    stride
+        Pixels from one cell to the next.
+    """
+
+    rays: Float32
+    z: Float32
+    sigma: Float32
+    planes: Float32
+    plane_variance: Float32
+    lookup: Float32
+    lookup_frame: Float64
+    stride: int
+
+
+class Cells(NamedTuple):
+    """State of the cells of a view: (rows, columns) each.
+
+    Attributes
+    ----------
+    depth
+        m, 0 unknown.
+    odds
+        Log-odds of motion.
+    moving
+        Whether a cell was segmented as moving.
+    tracked
+        1 where the surface agreed with a reference once, and was propagated since then.
+    """
+
+    depth: Float32
+    odds: Float32
+    moving: Bool
+    tracked: UInt8
+
+
+class Limits(NamedTuple):
+    """Limits of what a comparison of cells is evidence of.
+
+    Attributes
+    ----------
+    model_error
+        Sigma of systematic errors, as a fraction of the depth.
+    edge_jump
+        Relative difference between neighbouring depths that makes an edge.
+    radius
+        Registration error of the views in pixels: a point is in front of the other view, or behind
+        it, only if it is so for all pixels within this radius.
+    max_evidence, max_agreement
+        Upper limits of llr and of -llr.
+    flagged_weight
+        Factor of the llr of a cell that agrees with a moving one.
+    """
+
+    model_error: float
+    edge_jump: float
+    radius: int
+    max_evidence: float
+    max_agreement: float
+    flagged_weight: float
+
+
+# The following functions take scalars: Numba counts references to each array that is passed. For
+# the same reason, the kernels unpack named tuples before their loops.
 
 
 @kernel
@@ -90,22 +163,7 @@ def inside(u: float, v: float, node: int, rows: int, columns: int) -> bool:
 
 @kernel
 def residual_ratios(
-    rays: Float32,
-    z: Float32,
-    sigma: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    moving: Bool,
-    stride: int,
-    every: int,
-    other_z: Float32,
-    other_sigma: Float32,
-    other_planes: Float32,
-    other_variance: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
-    T: Float64,
-    model_error: float,
+    view: View, moving: Bool, every: int, other: View, T: Float64, model_error: float
 ) -> Float32:
     """Return absolute depth differences divided by their sigma, (N,), where both views have depth.
 
@@ -115,9 +173,16 @@ def residual_ratios(
         (rows, columns) cells that are known to move, and are left out.
     every
         Only every `every`-th cell is used, in both directions.
+    model_error
+        As in `Limits`.
 
     The other parameters are those of `compare`.
     """
+    rays, z, sigma, stride = view.rays, view.z, view.sigma, view.stride
+    planes, plane_variance = view.planes, view.plane_variance
+    other_z, other_sigma = other.z, other.sigma
+    other_planes, other_variance = other.planes, other.plane_variance
+    lookup, lookup_frame = other.lookup, other.lookup_frame
     motion = rows_of(T)
     rows, columns = moving.shape
     out = np.empty(((rows + every - 1) // every) * ((columns + every - 1) // every), np.float32)
@@ -145,7 +210,7 @@ def residual_ratios(
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             on_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
-            there, other = cell_depth(
+            there, noise = cell_depth(
                 _along(np.float64(other_planes[k, m, 3]), on_ray),
                 np.float64(other_variance[k, m]),
                 np.float64(other_z[k, m]),
@@ -153,7 +218,7 @@ def residual_ratios(
             )
             if not there > 0:
                 continue
-            total = variance + other + model_error * model_error * there * there
+            total = variance + noise + model_error * model_error * there * there
             out[n] = abs(here - there) / np.sqrt(total)
             n += 1
     return out[:n]
@@ -161,28 +226,12 @@ def residual_ratios(
 
 @kernel
 def compare(
-    rays: Float32,
-    z: Float32,
-    sigma: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    stride: int,
-    other_z: Float32,
-    other_sigma: Float32,
-    other_planes: Float32,
-    other_variance: Float32,
+    view: View,
+    other: View,
     other_moving: Bool,
-    other_stride: int,
-    lookup: Float32,
-    lookup_frame: Float64,
     T: Float64,
     scale: float,
-    model_error: float,
-    edge_jump: float,
-    radius: int,
-    max_evidence: float,
-    max_agreement: float,
-    flagged_weight: float,
+    limits: Limits,
     outcome: UInt8,
     llr: Float32,
     start: int,
@@ -192,35 +241,28 @@ def compare(
 
     Parameters
     ----------
-    rays, z, sigma, planes, plane_variance
-        Of the view, as in `PreparedView`.
-    stride, other_stride
-        Pixels from one cell to the next.
-    other_z, other_sigma, other_planes, other_variance, lookup, lookup_frame
-        Of the other view.
+    view, other
+        The view and the other one.
     other_moving
         Cells of the other view that are known to move; agreement with them is weak evidence.
     T
         (4, 4) T_other_view.
     scale
         Factor of the sigmas.
-    model_error
-        Sigma of systematic errors, as a fraction of the depth.
-    edge_jump
-        Relative difference between neighbouring depths that makes an edge.
-    radius
-        Registration error of the views in pixels: a point is in front of the other view, or behind
-        it, only if it is so for all pixels within this radius.
-    max_evidence, max_agreement
-        Upper limits of llr and of -llr.
-    flagged_weight
-        Factor of the llr of a cell that agrees with a moving one.
+    limits
+        Of the evidence.
     outcome, llr
         (rows, columns) of cells, written: see above. For cells behind the other view, llr is that
         of an object that has moved away in between.
     start, stop
         Rows of cells.
     """
+    rays, z, sigma, stride = view.rays, view.z, view.sigma, view.stride
+    planes, plane_variance = view.planes, view.plane_variance
+    other_z, other_sigma = other.z, other.sigma
+    other_planes, other_variance = other.planes, other.plane_variance
+    lookup, lookup_frame, other_stride = other.lookup, other.lookup_frame, other.stride
+    model_error, edge_jump, radius, max_evidence, max_agreement, flagged_weight = limits
     motion = rows_of(T)
     rows, columns = other_z.shape
     model2, scale2 = model_error * model_error, scale * scale
@@ -247,7 +289,7 @@ def compare(
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             on_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
-            there, other = cell_depth(
+            there, noise = cell_depth(
                 _along(np.float64(other_planes[k, m, 3]), on_ray),
                 np.float64(other_variance[k, m]),
                 np.float64(other_z[k, m]),
@@ -256,7 +298,7 @@ def compare(
             if not there > 0:
                 continue
             own = scale2 * variance
-            total = own + scale2 * (other + model2 * there * there)
+            total = own + scale2 * (noise + model2 * there * there)
             gap = max(np.log(there * there / (2 * np.pi * total)), 0.0)
             d = here - there
             if d * d <= gap * total:
@@ -291,20 +333,9 @@ def compare(
 
 @kernel
 def propagate(
-    rays: Float32,
-    z: Float32,
-    sigma: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    stride: int,
-    before: Float32,
-    odds_before: Float32,
-    moving_before: Bool,
-    tracked_before: UInt8,
-    stride_before: int,
-    shape_before: tuple[int, int],
-    lookup: Float32,
-    lookup_frame: Float64,
+    view: View,
+    last: View,
+    last_cells: Cells,
     T: Float64,
     tolerance: float,
     prior: float,
@@ -315,28 +346,28 @@ def propagate(
     start: int,
     stop: int,
 ) -> None:
-    """Propagate the state of the previous view's cells to the cells of a view, rows start..stop.
+    """Propagate the state of the last view's cells to the cells of a view, rows start..stop.
 
     Parameters
     ----------
-    rays, z, sigma, planes, plane_variance, stride
-        Of the view, as in `compare`.
-    before, odds_before, moving_before, tracked_before, stride_before
-        Cells of the previous view: depth in m (0 unknown), log-odds, whether they were segmented
-        as moving, and whether they are tracked.
-    shape_before, lookup, lookup_frame
-        Rows and columns of the previous view, and its projection.
+    view, last, last_cells
+        The view, the last view, and the cells of that.
     T
-        (4, 4) T_before_view.
+        (4, 4) T_last_view.
     tolerance
         Fraction of its depth by which a surface may have moved since.
     prior
         Log-odds of cells that were not seen before.
     depth_now, odds, tracked, arrived
-        Cells of the view, written. `arrived`: the cell lies in free space of the previous view.
+        Cells of the view, written. `arrived`: the cell lies in free space of the last view.
     start, stop
         Rows of cells.
     """
+    rays, z, sigma, stride = view.rays, view.z, view.sigma, view.stride
+    planes, plane_variance = view.planes, view.plane_variance
+    lookup, lookup_frame, stride_before = last.lookup, last.lookup_frame, last.stride
+    before, odds_before, moving_before, tracked_before = last_cells
+    shape_before = last.z.shape
     motion = rows_of(T)
     for a in range(start, stop):
         for b in range(odds.shape[1]):
@@ -378,33 +409,28 @@ def propagate(
 
 @kernel
 def predict(
-    rays: Float32,
-    z: Float32,
-    stride: int,
-    before: Float32,
-    moving_before: Bool,
-    stride_before: int,
-    shape_before: tuple[int, int],
-    lookup: Float32,
-    lookup_frame: Float64,
+    view: View,
+    last: View,
+    last_cells: Cells,
     T: Float64,
     tolerance: float,
     radius: int,
     moving: Bool,
 ) -> None:
-    """Mark cells of a view that are near, in image and depth, to moving cells of the previous view.
+    """Mark cells of a view that are near, in image and depth, to moving cells of the last view.
 
     Parameters
     ----------
-    moving_before
-        Cells of the previous view that were segmented as moving.
     radius
-        In cells of the previous view.
+        In cells of the last view.
     moving
         (rows, columns) of cells, written.
 
     The other parameters are those of `propagate`.
     """
+    rays, z, stride = view.rays, view.z, view.stride
+    lookup, lookup_frame, stride_before = last.lookup, last.lookup_frame, last.stride
+    before, moving_before, shape_before = last_cells.depth, last_cells.moving, last.z.shape
     motion = rows_of(T)
     for a in range(moving.shape[0]):
         for b in range(moving.shape[1]):

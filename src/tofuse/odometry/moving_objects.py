@@ -24,6 +24,7 @@ from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.geometry import se3
 from tofuse.kernels import moving_objects as kernels
 from tofuse.kernels.median import median
+from tofuse.kernels.moving_objects import Cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
@@ -79,20 +80,14 @@ _MIN_RESIDUALS = 50
 # errors of a wrong pose must not pass for noise.
 _SCALES, _MAX_SCALE_RATIO = 31, 3.0
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """State of the cells of a view: (rows, columns) each.
-
-    `depth` m, 0 unknown; `odds` log-odds of motion; `moving` the segmentation; `tracked` 1 where
-    the surface agreed with a reference once, and was propagated since then.
-    """
-
-    depth: Float32
-    odds: Float32
-    moving: Bool
-    tracked: UInt8
+_LIMITS = kernels.Limits(
+    _MODEL_ERROR,
+    _EDGE_JUMP,
+    _MISREGISTRATION,
+    _MAX_EVIDENCE,
+    max_agreement=-float(np.log(_SELF_OVERLAP)),
+    flagged_weight=_SELF_OVERLAP,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +96,7 @@ class _Last:
 
     view: PreparedView
     T_world_camera: Float64
-    cells: _Cells
+    cells: Cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +105,7 @@ class PairUpdate:
 
     last: _Last
     reference: int
-    cells: _Cells
+    cells: Cells
     scale: float | None
 
 
@@ -228,7 +223,7 @@ class MovingObjects:
     def __init__(self, max_references: int = _MAX_REFERENCES) -> None:
         self._max_references = max_references
         self._last: _Last | None = None
-        self._references: OrderedDict[int, _Cells] = OrderedDict()
+        self._references: OrderedDict[int, Cells] = OrderedDict()
         self._scales: deque[float] = deque(maxlen=_SCALES)
 
     def reset(self) -> None:
@@ -252,22 +247,17 @@ class MovingObjects:
         shape = view.z.shape
         if last is None or not last.cells.moving.any():
             return np.zeros(shape, np.bool_)
-        stride = self._stride(view)
+        stride = _stride(view)
         moving = np.empty(_cell_shape(shape, stride), np.bool_)
-        before = last.view
+        T = np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted)
         kernels.predict(
-            view.rays, view.z, stride, last.cells.depth, last.cells.moving, self._stride(before),
-            before.z.shape, before.projection.lookup, before.projection.frame,
-            np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted),
-            2 * _MAX_MOTION, _DILATION, moving,
-        )  # fmt: skip
+            _sampled(view), _sampled(last.view), last.cells, T, 2 * _MAX_MOTION, _DILATION, moving
+        )
         return _pixels(moving, shape, stride)
 
     def reference_mask(self, reference: PreparedView) -> Bool:
         """Return the (H, W) pixels of a keyframe whose surface has moved."""
-        return _pixels(
-            self._reference(reference).moving, reference.z.shape, self._stride(reference)
-        )
+        return _pixels(self._reference(reference).moving, reference.z.shape, _stride(reference))
 
     def compare(
         self,
@@ -318,15 +308,15 @@ class MovingObjects:
         else:
             evidence, evidence_then = now.odds, then.odds
         detect = 0.0 if suspected else _DETECT
-        now, segments = self._segmented(replace(now, tracked=tracked), evidence, detect)
+        now, segments = self._segmented(now._replace(tracked=tracked), evidence, detect)
         then, _ = self._segmented(then, evidence_then, detect)
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
-        mask = _pixels(now.moving, view.z.shape, self._stride(view))
+        mask = _pixels(now.moving, view.z.shape, _stride(view))
         valid = view.z > 0
         return Moving(
             view=mask,
-            reference=_pixels(then.moving, reference.z.shape, self._stride(reference)),
+            reference=_pixels(then.moving, reference.z.shape, _stride(reference)),
             fraction=_fraction(mask & valid, valid),
             compared=int(rest.sum()),
             agreement=float(rest[0] / max(rest.sum(), 1)),
@@ -351,66 +341,59 @@ class MovingObjects:
         if pair.scale is not None:
             self._scales.append(pair.scale)
 
-    def _stride(self, view: PreparedView) -> int:
-        return -(-view.z.shape[1] // _COLUMNS)
-
-    def _reference(self, reference: PreparedView) -> _Cells:
+    def _reference(self, reference: PreparedView) -> Cells:
         """Return the cells of a reference so far."""
-        shape = _cell_shape(reference.z.shape, self._stride(reference))
+        shape = _cell_shape(reference.z.shape, _stride(reference))
         known = self._references.get(reference.index)
         if known is None and self._last is not None and self._last.view.index == reference.index:
             known = self._last.cells
         if known is None or known.odds.shape != shape:
-            stride = self._stride(reference)
+            stride = _stride(reference)
             none = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
-            known = _Cells(none, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
+            known = Cells(none, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
         return known
 
-    def _store(self, index: int, cells: _Cells) -> None:
+    def _store(self, index: int, cells: Cells) -> None:
         self._references[index] = cells
         self._references.move_to_end(index)
         while len(self._references) > self._max_references:
             self._references.popitem(last=False)
 
-    def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[_Cells, Bool]:
+    def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[Cells, Bool]:
         """Propagate the cells of the last view to this one; and which surfaces are new there."""
-        last, stride = self._last, self._stride(view)
+        last, stride = self._last, _stride(view)
         shape = _cell_shape(view.z.shape, stride)
         depth, odds = np.empty(shape, np.float32), np.empty(shape, np.float32)
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, before = np.eye(4), view
-            cells = _Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
+            cells = Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
         else:
             T, before = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
             cells = last.cells
         T = np.ascontiguousarray(T)
         # At the rim of what is tracked a cell may be that of an adjacent surface.
-        tracked_before = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
-        grid = before.projection
+        inner = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
+        cells = cells._replace(tracked=inner)
+        sampled, sampled_before = _sampled(view), _sampled(before)
 
         def work(a: int, b: int) -> None:
             kernels.propagate(
-                view.rays, view.z, view.sigma, view.planes, view.plane_variance, stride,
-                cells.depth, cells.odds, cells.moving, tracked_before, self._stride(before),
-                before.z.shape, grid.lookup, grid.frame, T, _MAX_MOTION, _PRIOR_ODDS, depth,
-                odds, tracked, arrived, a, b,
+                sampled, sampled_before, cells, T, _MAX_MOTION, _PRIOR_ODDS,
+                depth, odds, tracked, arrived, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return _Cells(depth, odds, odds > _DETECT, tracked), arrived
+        return Cells(depth, odds, odds > _DETECT, tracked), arrived
 
     def _scale(
         self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
     ) -> float:
         """Return the robust scale of the residuals between two views, in sigmas."""
-        grid = reference.projection
         ratios = kernels.residual_ratios(
-            view.rays, view.z, view.sigma, view.planes, view.plane_variance, moving,
-            self._stride(view), _SCALE_EVERY, reference.z, reference.sigma, reference.planes,
-            reference.plane_variance, grid.lookup, grid.frame, T, _MODEL_ERROR,
-        )  # fmt: skip
+            _sampled(view), moving, _SCALE_EVERY, _sampled(reference), T, _MODEL_ERROR
+        )
         return _robust_scale(ratios)
 
     def _compare(
@@ -422,38 +405,34 @@ class MovingObjects:
         scale: float,
     ) -> tuple[UInt8, Float32]:
         """Return outcomes and log-likelihood ratios of the cells of a view, against another one."""
-        stride, grid = self._stride(view), other.projection
-        shape = _cell_shape(view.z.shape, stride)
+        shape = _cell_shape(view.z.shape, _stride(view))
+        sampled, sampled_other = _sampled(view), _sampled(other)
         outcome, llr = np.empty(shape, np.uint8), np.empty(shape, np.float32)
 
         def work(a: int, b: int) -> None:
             kernels.compare(
-                view.rays, view.z, view.sigma, view.planes, view.plane_variance, stride,
-                other.z, other.sigma, other.planes, other.plane_variance, other_moving,
-                self._stride(other), grid.lookup, grid.frame, T_other_view, scale,
-                _MODEL_ERROR, _EDGE_JUMP, _MISREGISTRATION,
-                _MAX_EVIDENCE, -float(np.log(_SELF_OVERLAP)), _SELF_OVERLAP,
+                sampled, sampled_other, other_moving, T_other_view, scale, _LIMITS,
                 outcome, llr, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return outcome, llr
 
-    def _updated(self, cells: _Cells, evidence: Float32) -> _Cells:
+    def _updated(self, cells: Cells, evidence: Float32) -> Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(_PRIOR_ODDS)
         odds = prior + np.float32(_DECAY) * (cells.odds - prior) + evidence
         max_odds = _DETECT + 2 * _MAX_EVIDENCE
-        return replace(cells, odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
+        return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
-    def _segmented(self, cells: _Cells, evidence: Float32, detect: float) -> tuple[_Cells, int]:
+    def _segmented(self, cells: Cells, evidence: Float32, detect: float) -> tuple[Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
         `evidence` is that of this frame: segments are not extended over what agrees in it.
         """
         odds, depth = cells.odds, cells.depth
         certain = odds > detect
-        none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
+        none = cells._replace(moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
             return none, 0
         likely = (odds > _EXTEND).view(np.uint8)
@@ -475,7 +454,7 @@ class MovingObjects:
         dilated = cv2.dilate(moving.view(np.uint8), _NEIGHBOURS) > 0
         dilated |= (near > 0) & (np.abs(near - depth) <= np.float32(_MAX_MOTION) * near)
         moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
-        return replace(cells, odds=odds, moving=moving), int(kept.sum())
+        return cells._replace(odds=odds, moving=moving), int(kept.sum())
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
         """Add the rest of surfaces of which more than half moves.
@@ -492,6 +471,18 @@ class MovingObjects:
         majority = 2 * moved > sizes
         majority[0] = False
         return np.asarray(moving | majority[labels], np.bool_)
+
+
+def _stride(view: PreparedView) -> int:
+    return -(-view.z.shape[1] // _COLUMNS)
+
+
+def _sampled(view: PreparedView) -> kernels.View:
+    grid = view.projection
+    return kernels.View(
+        view.rays, view.z, view.sigma, view.planes, view.plane_variance,
+        grid.lookup, grid.frame, _stride(view),
+    )  # fmt: skip
 
 
 def _cell_shape(shape: tuple[int, ...], stride: int) -> tuple[int, int]:
