@@ -274,7 +274,7 @@ def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
 
 def _flat(arguments: Sequence[Any]) -> Iterator[Any]:
     for argument in arguments:
-        yield from argument if isinstance(argument, tuple) else (argument,)
+        yield from _flat(argument) if isinstance(argument, tuple) else (argument,)
 
 
 def _fraction(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:

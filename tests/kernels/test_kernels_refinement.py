@@ -23,15 +23,15 @@ def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
     seen = prepare_view(source, SHARP)
     kernels.pair_equations(
         points_of(seen, 1),
-        surface.target,
-        surface.projection.lookup,
-        surface.projection.frame,
+        surface.target_image,
         np.ascontiguousarray(T),
-        *settings,
-        np.zeros(kernels.ERRORS) if errors is None else errors,
-        known,
-        seen.measures_range,
-        surface.measures_range,
+        kernels.Residuals(*settings),
+        kernels.CameraErrors(
+            np.zeros(kernels.ERRORS) if errors is None else errors,
+            known,
+            seen.measures_range,
+            surface.measures_range,
+        ),
         out,
     )
     return out

@@ -49,10 +49,10 @@ def sums_of(source, target, T):
         source.points, source.patches, surface.target, lookup, frame, T, *WIDE, sums
     )
     row = np.empty(kernels.SIZE)
-    kernels.pair_equations(
-        source.points, surface.target, lookup, frame, T, 0.0, WIDE[0], 0.0, 0.0, *WIDE[1:],
-        np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64), False, False, row,
-    )  # fmt: skip
+    residuals = kernels.Residuals(0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
+    none, known = np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64)
+    camera = kernels.CameraErrors(none, known, False, False)
+    kernels.pair_equations(source.points, surface.target_image, T, residuals, camera, row)
     return sums, row
 
 

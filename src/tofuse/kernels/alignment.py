@@ -12,6 +12,8 @@ difference, the symmetrised product of the two is J J^T - D D^T, in which indepe
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
@@ -73,6 +75,22 @@ _STATS = SQUARES_M + 1 - INLIERS
 RATIO = STAT + _STATS
 ROOT = RATIO + 1
 ROWS = ROOT + 1
+
+
+class TargetImage(NamedTuple):
+    """A view that others are aligned with.
+
+    Attributes
+    ----------
+    image
+        (H, W, PIXEL_SIZE) of `make_target`.
+    lookup, lookup_frame
+        Projection of the view's camera, as in `project_ray`.
+    """
+
+    image: Float32
+    lookup: Float32
+    lookup_frame: Float64
 
 
 @kernel

@@ -8,6 +8,8 @@ and b(p) the displacement of p by an error of size 1, the distance changes by m 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int64
@@ -33,6 +35,7 @@ from tofuse.kernels.alignment import (
     STAT,
     VARIANCE,
     WEIGHT_G,
+    TargetImage,
     compare_albedos,
     compare_planes,
     histogram_bin,
@@ -68,6 +71,36 @@ HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
 
+class Residuals(NamedTuple):
+    """How residuals are computed and weighted: `exposure` and the others as in `accumulate`."""
+
+    exposure: float
+    scale_g: float
+    scale_p: float
+    inflation: float
+    robust: float
+    min_cosine: float
+
+
+class CameraErrors(NamedTuple):
+    """Systematic errors of the cameras of a pair.
+
+    Attributes
+    ----------
+    errors
+        (ERRORS,) current estimate, by which points and planes are displaced.
+    known
+        (ERRORS,) non-zero for errors that are not estimated.
+    radial_source, radial_target
+        Whether the cameras measure radial range, and not z.
+    """
+
+    errors: Float64
+    known: Int64
+    radial_source: bool
+    radial_target: bool
+
+
 @kernel
 def displacement(B: Float64, x: float, y: float, z: float, radial: bool, known: Int64) -> None:
     """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
@@ -100,49 +133,33 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool, known: 
 @kernel
 def pair_equations(
     points: Float32,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    target: TargetImage,
     T: Float64,
-    exposure: float,
-    scale_g: float,
-    scale_p: float,
-    inflation: float,
-    robust: float,
-    min_cosine: float,
-    errors: Float64,
-    known: Int64,
-    radial_source: bool,
-    radial_target: bool,
+    residuals: Residuals,
+    camera: CameraErrors,
     out: Float64,
 ) -> None:
     """Sum the normal equations of one pair into `out` (SIZE,), which is overwritten.
 
     Parameters
     ----------
-    points, target, lookup, lookup_frame, T
+    points, T
         As in `alignment.accumulate`.
-    exposure, scale_g, scale_p, inflation, robust, min_cosine
-        As in `alignment.accumulate`.
-    errors
-        (ERRORS,) current estimate of the camera's errors, by which points and planes are displaced.
-    known
-        (ERRORS,) non-zero for errors that are not estimated.
-    radial_source, radial_target
-        Whether the cameras measure radial range, and not z.
+    target, residuals, camera
+        Of the pair.
     """
+    errors, known, radial_source, radial_target = camera
     out[:] = 0.0
-    rows, columns = target.shape[0], target.shape[1]
     unknowns = UNKNOWNS
     while unknowns > 7 and known[unknowns - 8]:
         unknowns -= 1
     asked = unknowns - 7
     if asked == 0:
-        _pose_equations(
-            points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, inflation, robust,
-            min_cosine, out,
-        )  # fmt: skip
+        _pose_equations(points, target, T, residuals, out)
         return
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    image, lookup, lookup_frame = target
+    rows, columns = image.shape[0], image.shape[1]
     J = np.zeros(UNKNOWNS)
     Bp = np.zeros((ERRORS, 3))
     Bq = np.zeros((ERRORS, 3))
@@ -177,7 +194,7 @@ def pair_equations(
             continue
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        pixel = target[int(v + 0.5), int(u + 0.5)]
+        pixel = image[int(v + 0.5), int(u + 0.5)]
         distance = np.float64(pixel[DISTANCE])
         if distance == 0:
             continue
@@ -273,20 +290,11 @@ def pair_equations(
 
 @kernel
 def _pose_equations(
-    points: Float32,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
-    T: Float64,
-    exposure: float,
-    scale_g: float,
-    scale_p: float,
-    inflation: float,
-    robust: float,
-    min_cosine: float,
-    out: Float64,
+    points: Float32, target: TargetImage, T: Float64, residuals: Residuals, out: Float64
 ) -> None:
     """Do the same without camera errors, vectorised in blocks as in `alignment`."""
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    image, lookup, lookup_frame = target
     block = np.zeros(ROWS * LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
     products, support = 36, 36 + SQUARES_G - INLIERS
@@ -295,7 +303,7 @@ def _pose_equations(
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
         transform_block(block, T)
-        project_block(block, count, target, lookup, lookup_frame)
+        project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
             if block[SEEN * LANES + k] > 0:
@@ -394,7 +402,7 @@ def overlaps(
     sources
         (S,) indices of the source views.
     target, lookup, lookup_frame
-        As in `pair_equations`.
+        As in `alignment.accumulate`.
     T_target_world, T_world_source
         (4, 4) of the target, and (N, 4, 4) of all views.
     tolerance, min_cosine

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as sums
-from tofuse.kernels.alignment import accumulate, bin_edge, normal_equations
+from tofuse.kernels.alignment import TargetImage, accumulate, bin_edge, normal_equations
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.motion import compose, retract, twist_between
 from tofuse.kernels.spurious_information import spurious_information
@@ -18,46 +20,17 @@ SOME_POINTS = 500
 EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
 
 
-@kernel
-def iterate_level(
-    points: Float32,
-    targets: tuple[Float32, ...],
-    lookups: tuple[Float32, ...],
-    lookup_frames: Float64,
-    T_targets: Float64,
-    T: Float64,
-    T_predicted: Float64,
-    estimates: Float64,
-    max_scale: float,
-    iterations: int,
-    inflation: float,
-    albedo_inflation: float,
-    robust: float,
-    min_cosine: float,
-    remap: bool,
-    tilt: float,
-    slope: float,
-    max_sigma: float,
-    prior: Float64,
-    units: Float64,
-    tolerance: float,
-) -> tuple[Float64, Float64, Float64, float, int]:
-    """Iterate one pyramid level of an alignment until it converges.
+class LevelSettings(NamedTuple):
+    """Settings of one pyramid level of an alignment.
 
-    Parameters
+    Attributes
     ----------
-    points, targets, lookups, lookup_frames
-        Source and n targets as in `accumulate`; lookup_frames is (n, 4).
-    T_targets
-        (n, 4, 4) T_target_world of each target.
-    T, estimates
-        (4, 4) T_world_source and (3,) nuisance parameters, both updated in place.
-    T_predicted, prior, units
-        As in `solve_step`.
-    max_scale
-        Upper limit of the scale of the sigmas.
     iterations
         Maximum number of iterations.
+    tolerance
+        Iteration stops when the step is smaller than this, in `units`.
+    max_scale
+        Upper limit of the scale of the sigmas.
     inflation, albedo_inflation
         Noise inflation of distances, m, and of the log albedo.
     robust, min_cosine
@@ -69,8 +42,49 @@ def iterate_level(
         As in `spurious_information`.
     max_sigma
         As in `degenerate_directions`.
-    tolerance
-        Iteration stops when the step is smaller than this, in `units`.
+    prior, units
+        As in `solve_step`.
+    """
+
+    iterations: int
+    tolerance: float
+    max_scale: float
+    inflation: float
+    albedo_inflation: float
+    robust: float
+    min_cosine: float
+    remap: bool
+    tilt: float
+    slope: float
+    max_sigma: float
+    prior: Float64
+    units: Float64
+
+
+@kernel
+def iterate_level(
+    points: Float32,
+    targets: tuple[TargetImage, ...],
+    T_targets: Float64,
+    T: Float64,
+    T_predicted: Float64,
+    estimates: Float64,
+    settings: LevelSettings,
+) -> tuple[Float64, Float64, Float64, float, int]:
+    """Iterate one pyramid level of an alignment until it converges.
+
+    Parameters
+    ----------
+    points, targets
+        Source as in `accumulate`, and n targets.
+    T_targets
+        (n, 4, 4) T_target_world of each target.
+    T, estimates
+        (4, 4) T_world_source and (3,) nuisance parameters, both updated in place.
+    T_predicted
+        As in `solve_step`.
+    settings
+        Of the level.
 
     Returns
     -------
@@ -78,19 +92,21 @@ def iterate_level(
     size of the last step in `units`, and the number of iterations. If the sums are not finite, the
     returned sums are 0, all directions are degenerate, and T is unchanged.
     """
+    robust, min_cosine, inflation = settings.robust, settings.min_cosine, settings.inflation
+    prior, units = settings.prior, settings.units
     total = np.zeros(sums.SIZE)
     weak = np.zeros((0, 6))
     spurious = np.zeros((6, 6))
     size = np.inf
     done = 0
-    while done < iterations and size >= tolerance:
+    while done < settings.iterations and size >= settings.tolerance:
         total[:] = 0.0
         for k in range(len(targets)):
             total += accumulate(
                 points,
-                targets[k],
-                lookups[k],
-                lookup_frames[k],
+                targets[k].image,
+                targets[k].lookup,
+                targets[k].lookup_frame,
                 compose(T_targets[k], T),
                 estimates[EXPOSURE],
                 estimates[SCALE_G],
@@ -99,20 +115,21 @@ def iterate_level(
                 robust,
                 min_cosine,
             )
-        if remap and done == 0:
+        if settings.remap and done == 0:
             spurious = total[sums.INLIERS] * spurious_information(
                 points,
                 max(1, len(points) // SOME_POINTS),
                 estimates[SCALE_G],
                 inflation,
                 estimates[SCALE_P] ** 2,
-                tilt,
-                slope,
+                settings.tilt,
+                settings.slope,
             )
         finite = np.isfinite(total.sum() + spurious.sum())
         if finite:
-            if remap:
-                weak = degenerate_directions(cross_information(total) - spurious, units, max_sigma)
+            if settings.remap:
+                cross = cross_information(total) - spurious
+                weak = degenerate_directions(cross, units, settings.max_sigma)
             onward, step = solve_step(total, T, T_predicted, weak, prior, units)
             finite = np.isfinite(step.sum())
         if not finite:  # fits to noise alone can make planes without bounds
@@ -124,7 +141,7 @@ def iterate_level(
             size = max(size, abs(step[p] / units[p]))
         if estimates[SCALE_P] > 0:
             estimates[EXPOSURE] += step[6]
-        _rescale(total, estimates, max_scale, albedo_inflation)
+        _rescale(total, estimates, settings.max_scale, settings.albedo_inflation)
     return total, spurious, weak, size, done
 
 

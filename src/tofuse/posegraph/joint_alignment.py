@@ -586,20 +586,17 @@ def _evaluate(
             source, target = (views[i[k]].surface for i in (state.source, state.target))
             kernels.pair_equations(
                 views[state.source[k]].points,
-                target.target,
-                target.projection.lookup,
-                target.projection.frame,
+                target.target_image,
                 np.ascontiguousarray(T_target_source[k]),
-                state.exposure[k],
-                state.scale_g[k],
-                state.scale_p[k],
-                stage.inflation_m,
-                options.robust,
-                cosine,
-                errors,
-                known,
-                source.measures_range,
-                target.measures_range,
+                kernels.Residuals(
+                    state.exposure[k],
+                    state.scale_g[k],
+                    state.scale_p[k],
+                    stage.inflation_m,
+                    options.robust,
+                    cosine,
+                ),
+                kernels.CameraErrors(errors, known, source.measures_range, target.measures_range),
                 rows[k],
             )
 

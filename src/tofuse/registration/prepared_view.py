@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.geometry.cameras import Camera, ray_lengths
-from tofuse.kernels.alignment import make_target
+from tofuse.kernels.alignment import TargetImage, make_target
 from tofuse.kernels.median import median
 from tofuse.kernels.plane_extension import extend_planes
 from tofuse.kernels.surface import (
@@ -373,6 +373,11 @@ class PreparedView:
     def target(self) -> Float32:
         """(H, W, PIXEL_SIZE) target image for alignment, see `make_target`."""
         return make_target(self.rays, self.planes, self.plane_variance, self.albedo)
+
+    @property
+    def target_image(self) -> TargetImage:
+        """The target image and its projection."""
+        return TargetImage(self.target, self.projection.lookup, self.projection.frame)
 
     @cached_property
     def planar_fraction(self) -> float:

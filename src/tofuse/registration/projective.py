@@ -260,37 +260,30 @@ def align(
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
         most = max(3.0, options.max_sigma_m / median(sigma), _LARGER * usual_scale)
     near = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
-    views = tuple(t.view.target for t in targets)
-    lookups = tuple(t.view.projection.lookup for t in targets)
-    lookup_frames = np.stack([t.view.projection.frame for t in targets])
+    images = tuple(t.view.target_image for t in targets)
     T_targets = np.stack([t.T_target_world for t in targets])
     T = T0.copy()
     iterations = 0
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
             points = points_of(source, level.stride)
-        total, spurious, weak, size, done = steps.iterate_level(
-            points,
-            views,
-            lookups,
-            lookup_frames,
-            T_targets,
-            T,
-            T_world_predicted,
-            guessed,
-            most,
+        settings = steps.LevelSettings(
             level.iterations,
+            options.tolerance,
+            most,
             level.inflation_m * near,
             level.photometric_inflation,
             options.robust,
             math.cos(options.max_angle),
-            number > 0,  # at the coarsest level the views are not yet aligned
-            options.common_tilt,
-            options.common_slope,
-            options.constrained,
-            prior,
-            UNITS,
-            options.tolerance,
+            remap=number > 0,  # at the coarsest level the views are not yet aligned
+            tilt=options.common_tilt,
+            slope=options.common_slope,
+            max_sigma=options.constrained,
+            prior=prior,
+            units=UNITS,
+        )
+        total, spurious, weak, size, done = steps.iterate_level(
+            points, images, T_targets, T, T_world_predicted, guessed, settings
         )
         iterations += done
     inliers = total[kernels.INLIERS]
