@@ -633,10 +633,7 @@ def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
     view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
     T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
     first = (1 % stride, 0)
-    keys = tsdf.near_cubes(
-        view.z, view.unit, view.normals, view.strength, view.projection.rays,
-        T, 0.05, 0.04, 0.5, first, stride,
-    )  # fmt: skip
+    keys = tsdf.near_cubes(view.stored, T, 0.05, 0.04, 0.5, first, stride)
     expected = set()
     steps = int(np.ceil(0.08 / 0.025))
     for r in range(first[0], 72, stride):

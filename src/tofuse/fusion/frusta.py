@@ -45,14 +45,7 @@ class Frusta:
                 projection = view.projection
                 low, size = projection.frame[:2], np.array(projection.lookup.shape[1::-1]) - 1
                 spans[k] = [*low, *(low + size / projection.frame[2:])]
-                far[k] = max_informative_depth(
-                    view.z,
-                    view.unit,
-                    view.normals,
-                    view.strength,
-                    projection.rays,
-                    free_space_limits,
-                )
+                far[k] = max_informative_depth(view.stored, free_space_limits)
 
         run_chunks(measure, len(views), _CHUNKS)
         T = np.array([se3.inverse(pose) for pose in poses]).reshape(-1, 4, 4)

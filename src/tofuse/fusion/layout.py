@@ -204,11 +204,7 @@ def cubes_near(
         Every n-th column and row is used.
     """
     return near_cubes(
-        view.z,
-        view.unit,
-        view.normals,
-        view.strength,
-        view.projection.rays,
+        view.stored,
         T_world_camera,
         cube_m,
         reach,

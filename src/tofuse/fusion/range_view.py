@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.median import median
-from tofuse.kernels.tsdf import mark_jumps, pack_view, shrink_to_planes
+from tofuse.kernels.tsdf import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.prepared_view import (
     PreparedView,
@@ -142,6 +142,11 @@ class RangeView:
             _intensity(frame, shape),
             _typical_sigma(variance, good),
         )
+
+    @property
+    def stored(self) -> StoredView:
+        """The view as the kernels take it."""
+        return StoredView(self.z, self.unit, self.normals, self.strength, self.projection.rays)
 
     @property
     def nbytes(self) -> int:

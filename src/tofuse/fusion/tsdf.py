@@ -19,10 +19,17 @@ from tofuse.fusion.range_view import DECODED, RangeView
 from tofuse.fusion.stitching import Piece, colored, stitch
 from tofuse.fusion.view_store import Views, summaries
 from tofuse.geometry import se3
-from tofuse.kernels.blocks import EDGE, VOXELS, index_of, mark_eighths, neighbours_of
-from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
+from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, index_of, mark_eighths, neighbours_of
+from tofuse.kernels.surface_nets import Vertices, make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.tsdf import apply_free_space, integrate, unpack_view
+from tofuse.kernels.tsdf import (
+    Batch,
+    Camera,
+    Decoding,
+    apply_free_space,
+    integrate,
+    unpack_view,
+)
 
 _CHUNKS = 16
 _BATCH = 16  # views
@@ -61,7 +68,7 @@ class Volume:
     numbers, own
         (B,) their numbers among all blocks, and the number of the region's own.
     distance, weight, seen, color, free
-        See `tofuse.kernels.tsdf.integrate`.
+        See `tofuse.kernels.blocks.Blocks`.
     free_space_stride, added
         Stride of views for free space far from surfaces, and the number of views added.
     """
@@ -78,6 +85,13 @@ class Volume:
     free: Float32
     free_space_stride: int = 1
     added: int = 0
+
+    @property
+    def blocks(self) -> Blocks:
+        """The blocks as the kernels take them."""
+        return Blocks(
+            self.keys, self.numbers, self.distance, self.weight, self.seen, self.color, self.free
+        )
 
     @cached_property
     def index(self) -> tuple[Int64, Int32]:
@@ -150,74 +164,40 @@ class Volume:
             return
         count, (rows, columns) = len(views), views[0].z.shape
         projection = views[0].projection
-        heights = np.empty((count, rows * columns + 1), np.float32)
-        codes = np.empty((count, rows * columns + 1), np.int32)
         grid = np.array(projection.lookup.shape[:2]) - 1
-        cells = np.empty((count, *grid, 3), np.float32)
-        coarse = np.empty((count, *-(-grid // 4), 3), np.float32)
         channels = self.color.shape[2]
-        free_space_limits = _free_space_limits(self.reach_m)
-        intensity = np.zeros((count, rows * columns, channels), np.float32)
+        batch = Batch(
+            numbers,
+            np.array([se3.inverse(T_world_camera) for T_world_camera in poses]),
+            heights=np.empty((count, rows * columns + 1), np.float32),
+            codes=np.empty((count, rows * columns + 1), np.int32),
+            intensity=np.zeros((count, rows * columns, channels), np.float32),
+            cells=np.empty((count, *grid, 3), np.float32),
+            coarse=np.empty((count, *-(-grid // 4), 3), np.float32),
+        )
+        decoding = Decoding(DECODED, _free_space_limits(self.reach_m), self.reach_m)
 
         def open_views(a: int, b: int) -> None:
             for s in range(a, b):
                 view = views[s]
-                unpack_view(
-                    view.z,
-                    view.unit,
-                    view.normals,
-                    view.strength,
-                    DECODED,
-                    projection.rays,
-                    projection.frame,
-                    self.reach_m,
-                    free_space_limits,
-                    heights[s],
-                    codes[s],
-                    cells[s],
-                    coarse[s],
-                )
+                unpack_view(view.stored, projection.frame, decoding, batch, s)
                 if self.free_space_stride > 1:
                     number = int(numbers[s])
                     cubes = cubes_near(view, poses[s], edge, self.reach_m, CUBE_SPACING, number, 2)
                     mark_eighths(cubes, *self.index, close[s])
                 # Albedo is ignored if other views have colour.
                 if view.intensity is not None and channels == view.channels:
-                    intensity[s] = view.intensity.reshape(-1, channels)
+                    batch.intensity[s] = view.intensity.reshape(-1, channels)
 
         close = np.zeros((count, len(self.keys)), np.uint8)
         edge = 0.5 * EDGE * self.voxel_m
         run_chunks(open_views, count, count)
-        T = np.array([se3.inverse(T_world_camera) for T_world_camera in poses])
         nodes = _straight_nodes(projection.lookup)
+        camera = Camera((rows, columns), projection.lookup, projection.frame, nodes)
+        blocks, turns = self.blocks, self.free_space_stride
         run_chunks(
             lambda a, b: integrate(
-                self.keys,
-                self.numbers,
-                self.voxel_m,
-                T,
-                numbers,
-                heights,
-                codes,
-                DECODED,
-                free_space_limits,
-                close,
-                self.free_space_stride,
-                intensity,
-                (rows, columns),
-                projection.lookup,
-                projection.frame,
-                nodes,
-                cells,
-                coarse,
-                self.reach_m,
-                self.distance,
-                self.weight,
-                self.seen,
-                self.color,
-                self.free,
-                a,
-                b,
+                blocks, self.voxel_m, batch, camera, decoding, close, turns, a, b
             ),
             len(self.keys),
             _CHUNKS,
@@ -230,19 +210,15 @@ class Volume:
         noise. The surface of a region's own blocks is a `piece`.
         """
         net = self._net(min_views)
+        points, normals, tints, sigma, views = net.vertices
         return Mesh(
-            net.points.astype(np.float32),
-            net.faces,
-            net.normals,
-            colored(net.tints),
-            net.sigma,
-            net.views,
-            np.zeros(3),
+            points.astype(np.float32), net.faces, normals, colored(tints), sigma, views, np.zeros(3)
         )
 
     def piece(self, min_views: int = 1) -> Piece:
         """Return the surface of the region's own blocks, to be stitch to those of others."""
         net = self._net(min_views)
+        points, normals, tints, sigma, views = net.vertices
         block, voxel = np.nonzero(net.cells >= 0)
         names = self.numbers[block] * VOXELS + voxel
         mine = int(np.searchsorted(block, self.own))
@@ -252,11 +228,11 @@ class Volume:
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
         return Piece(
             names[used],
-            net.points[:mine].astype(np.float32),
-            net.normals[:mine].copy(),
-            net.tints[:mine].copy(),
-            net.sigma[:mine].copy(),
-            net.views[:mine].copy(),
+            points[:mine].astype(np.float32),
+            normals[:mine].copy(),
+            tints[:mine].copy(),
+            sigma[:mine].copy(),
+            views[:mine].copy(),
             place[net.faces].reshape(-1, 3),
             self.numbers[: self.own],
             net.per_block,
@@ -264,66 +240,36 @@ class Volume:
 
     def _net(self, min_views: int) -> _Net:
         """Return vertices of all cells, and the triangles of the region's own blocks."""
-        blocks = len(self.keys)
-        run_chunks(
-            lambda a, b: apply_free_space(
-                self.distance, self.weight, self.free, self.reach_m, a, b
-            ),
-            blocks,
-            _CHUNKS,
-        )
-        neighbours = np.empty((blocks, 27), np.int32)
+        count, blocks = len(self.keys), self.blocks
+        run_chunks(lambda a, b: apply_free_space(blocks, self.reach_m, a, b), count, _CHUNKS)
+        neighbours = np.empty((count, 27), np.int32)
         neighbours_of(self.keys, neighbours)
-        cells = np.empty((blocks, VOXELS), np.int32)
-        counts = np.zeros(blocks, np.int64)
+        cells = np.empty((count, VOXELS), np.int32)
+        counts = np.zeros(count, np.int64)
+        min_weight = 1 / (_MAX_SIGMA_VOXELS * self.voxel_m) ** 2
         run_chunks(
-            lambda a, b: mark_cells(
-                neighbours,
-                self.distance,
-                self.weight,
-                self.seen,
-                1 / (_MAX_SIGMA_VOXELS * self.voxel_m) ** 2,
-                min_views,
-                cells,
-                counts,
-                a,
-                b,
-            ),
-            blocks,
+            lambda a, b: mark_cells(blocks, neighbours, min_weight, min_views, cells, counts, a, b),
+            count,
             _CHUNKS,
         )
         starts = np.cumsum(counts) - counts
         total = int(counts.sum())
-        channels = self.color.shape[2]
-        points = np.empty((total, 3))
-        normals = np.empty((total, 3), np.float32)
-        tints = np.empty((total, channels), np.float32)
-        sigma = np.empty(total, np.float32)
-        views = np.empty(total, np.int32)
+        vertices = Vertices(
+            np.empty((total, 3)),
+            np.empty((total, 3), np.float32),
+            np.empty((total, self.color.shape[2]), np.float32),
+            np.empty(total, np.float32),
+            np.empty(total, np.int32),
+        )
         run_chunks(
             lambda a, b: make_vertices(
-                self.keys,
-                self.voxel_m,
-                neighbours,
-                self.distance,
-                self.weight,
-                self.seen,
-                self.color,
-                cells,
-                starts,
-                points,
-                normals,
-                tints,
-                sigma,
-                views,
-                a,
-                b,
+                blocks, self.voxel_m, neighbours, cells, starts, vertices, a, b
             ),
-            blocks,
+            count,
             _CHUNKS,
         )
-        faces, per_block = self._faces(neighbours, cells, starts, points)
-        return _Net(points, normals, tints, sigma, views, faces, per_block, cells)
+        faces, per_block = self._faces(neighbours, cells, starts, vertices.points)
+        return _Net(vertices, faces, per_block, cells)
 
     def _faces(
         self,
@@ -362,13 +308,9 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class _Net:
-    """The surface net of a volume: columns of vertices (V,), and faces (M, 3)."""
+    """The surface net of a volume: vertices (V,), and faces (M, 3)."""
 
-    points: Float64
-    normals: Float32
-    tints: Float32
-    sigma: Float32
-    views: Int32
+    vertices: Vertices
     faces: Int32
     per_block: Int64  # (own,) faces of each block
     cells: Int32  # (B, VOXELS) number of the vertex within its block, or -1

@@ -7,9 +7,11 @@ are contiguous in memory.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from tofuse.arrays import Int32, Int64, UInt8
+from tofuse.arrays import Float32, Int32, Int64, UInt8, UInt16
 from tofuse.kernels.jit import kernel
 
 EDGE = 8  # voxels along the edge of a block
@@ -17,6 +19,33 @@ VOXELS = EDGE**3
 EMPTY = -1  # empty slot of a table
 HALF = 1 << 20  # block indices are from -HALF to HALF - 1
 _MASK = (1 << 21) - 1
+
+
+class Blocks(NamedTuple):
+    """B blocks of voxels with signed distances.
+
+    Attributes
+    ----------
+    keys, numbers
+        (B,) of the blocks, and their global numbers, which are the same whichever other blocks are
+        in memory.
+    distance, weight
+        (B, VOXELS) mean distance in m, and sum of the weights in 1/m^2.
+    seen
+        (B, VOXELS) number of views with a surface within reach.
+    color
+        (B, VOXELS, C) mean colour or amplitude over those views; C may be 0.
+    free
+        (B, 8) weight of free-space observations of whole eighths, not yet in `distance`.
+    """
+
+    keys: Int64
+    numbers: Int64
+    distance: Float32
+    weight: Float32
+    seen: UInt16
+    color: Float32
+    free: Float32
 
 
 @kernel

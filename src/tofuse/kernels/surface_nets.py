@@ -7,13 +7,37 @@ of `tofuse.kernels.tsdf`; cells reach into the next blocks, so there are no seam
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from tofuse.arrays import Float32, Float64, Int32, Int64, UInt16
-from tofuse.kernels.blocks import EDGE, VOXELS, block_of, voxel_at, voxel_of
+from tofuse.arrays import Float32, Float64, Int32, Int64
+from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, block_of, voxel_at, voxel_of
 from tofuse.kernels.jit import kernel
 
 _SIDE = EDGE + 1
+
+
+class Vertices(NamedTuple):
+    """N vertices of a surface net.
+
+    Attributes
+    ----------
+    points, normals
+        (N, 3) world frame, m, and (N, 3) normalised gradient.
+    tints
+        (N, C) mean colour of the corners that have one.
+    sigma
+        (N,) inverse root of the corners' mean weight, m.
+    views
+        (N,) largest number of views among the corners.
+    """
+
+    points: Float64
+    normals: Float32
+    tints: Float32
+    sigma: Float32
+    views: Int32
 
 
 @kernel
@@ -46,10 +70,8 @@ def _gather(
 
 @kernel
 def mark_cells(
+    blocks: Blocks,
     neighbours: Int32,
-    distance: Float32,
-    weight: Float32,
-    seen: UInt16,
     min_weight: float,
     views: int,
     cells: Int32,
@@ -63,6 +85,7 @@ def mark_cells(
     and of which at least one corner was seen by `views` views. Writes `cells` (B, VOXELS), the
     number within the block or -1, and `counts` (B,), the number of such cells.
     """
+    distance, weight, seen = blocks.distance, blocks.weight, blocks.seen
     d = np.empty((_SIDE, _SIDE, _SIDE), np.float32)
     for b in range(start, stop):
         cells[b] = -1
@@ -97,29 +120,19 @@ def mark_cells(
 
 @kernel
 def make_vertices(
-    keys: Int64,
+    blocks: Blocks,
     voxel_m: float,
     neighbours: Int32,
-    distance: Float32,
-    weight: Float32,
-    seen: UInt16,
-    color: Float32,
     cells: Int32,
     starts: Int64,
-    points: Float64,
-    normals: Float32,
-    tints: Float32,
-    sigmas: Float32,
-    views: Int32,
+    vertices: Vertices,
     start: int,
     stop: int,
 ) -> None:
-    """Make the vertices of the marked cells of blocks start..stop, from row starts[b] on.
-
-    Writes `points` (world frame, m), `normals` (normalised gradient), `tints` (mean colour of the
-    corners that have one), `sigmas` (inverse root of the corners' mean weight) and `views` (largest
-    number of views among the corners).
-    """
+    """Write the vertices of the marked cells of blocks start..stop, from row starts[b] on."""
+    keys, distance, weight = blocks.keys, blocks.distance, blocks.weight
+    seen, color = blocks.seen, blocks.color
+    points, normals, tints, sigmas, views = vertices
     d = np.empty((2, 2, 2))
     channels = color.shape[2]
     tint = np.zeros(channels)

@@ -6,10 +6,12 @@ Distances are positive in front of a surface and truncated at `reach`. Blocks ar
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
-from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, block_key, block_of
+from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, Blocks, block_key, block_of
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
@@ -20,13 +22,92 @@ _PER_UNIT = np.float32(1 / 127)  # of normals in bytes
 _MIN_WEIGHT = np.float32(1e-30)  # avoids a division by 0
 
 
+class StoredView(NamedTuple):
+    """The stored form of a view.
+
+    Attributes
+    ----------
+    z, unit
+        (H, W) z in counts of `unit` m, 0 where there is none.
+    normals, strength
+        (H, W, 3) 127 times the unit normals away from the camera, and (H, W) codes of the weights;
+        0 for pixels that are not fused.
+    rays
+        (H, W, 2) x/z and y/z.
+    """
+
+    z: UInt16
+    unit: float
+    normals: Int8
+    strength: UInt8
+    rays: Float32
+
+
+class Decoding(NamedTuple):
+    """Weights and truncation distances.
+
+    Attributes
+    ----------
+    weights, backs
+        (256,) in 1/m^2, and truncation distances behind a surface in m, by the code of the weight.
+    reach
+        Truncation distance in front of a surface, m.
+    """
+
+    weights: Float32
+    backs: Float32
+    reach: float
+
+
+class Batch(NamedTuple):
+    """V views of one camera that are integrated together.
+
+    Attributes
+    ----------
+    numbers, T_camera_world
+        (V,) global numbers of the views, and (V, 4, 4).
+    heights, codes
+        (V, H W + 1) h of the pixel's plane n . p = h, and n and the code of the weight in four
+        bytes. The last element stands for all points outside the image.
+    intensity
+        (V, H W, C) colour or amplitude; C may be 0.
+    cells, coarse
+        (V, A, B, 3) for the cells of the lookup: the z in front of which all is free, the z behind
+        which all is occluded, and the smallest weight, 0 where a pixel has no surface or the cell
+        has no pixel. `coarse` is the same for each 4 x 4 cells.
+    """
+
+    numbers: Int64
+    T_camera_world: Float64
+    heights: Float32
+    codes: Int32
+    intensity: Float32
+    cells: Float32
+    coarse: Float32
+
+
+class Camera(NamedTuple):
+    """Projection of the views of a batch.
+
+    Attributes
+    ----------
+    shape
+        (H, W) of the views.
+    lookup, lookup_frame
+        As in `project_ray`.
+    nodes
+        Number of nodes over which the lookup is linear (infinity: everywhere).
+    """
+
+    shape: tuple[int, int]
+    lookup: Float32
+    lookup_frame: Float64
+    nodes: float
+
+
 @kernel
 def near_cubes(
-    z: UInt16,
-    unit: float,
-    normals: Int8,
-    strength: UInt8,
-    rays: Float32,
+    view: StoredView,
     T_world_camera: Float64,
     cube_m: float,
     reach: float,
@@ -38,8 +119,6 @@ def near_cubes(
 
     Parameters
     ----------
-    z, unit, normals, strength, rays
-        Of the view, as in `unpack_view`.
     T_world_camera
         (4, 4).
     cube_m
@@ -51,6 +130,7 @@ def near_cubes(
     first, stride
         Row and column of the first pixel, and step to the next one in both directions.
     """
+    z, unit, normals, strength, rays = view
     T = T_world_camera / cube_m
     steps = max(2, int(np.ceil(2 * reach / (spacing * cube_m))))
     size = (z.shape[0] // stride + 1) * (z.shape[1] // stride + 1) * (steps + 1)
@@ -183,7 +263,7 @@ def pack_view(
     normals: Int8,
     weights: Float32,
 ) -> None:
-    """Compute the stored normals and weights of a view, see `unpack_view`.
+    """Compute the stored normals and weights of a view, see `StoredView`.
 
     Parameters
     ----------
@@ -225,41 +305,13 @@ def pack_view(
 
 @kernel
 def unpack_view(
-    z: UInt16,
-    unit: float,
-    normals: Int8,
-    strength: UInt8,
-    weights: Float32,
-    rays: Float32,
-    lookup_frame: Float64,
-    reach: float,
-    backs: Float32,
-    heights: Float32,
-    codes: Int32,
-    cells: Float32,
-    coarse: Float32,
+    view: StoredView, lookup_frame: Float64, decoding: Decoding, batch: Batch, s: int
 ) -> None:
-    """Unpack the stored form of a view for `integrate`.
-
-    Parameters
-    ----------
-    z, unit
-        (H, W) z in counts of `unit` m, 0 where there is none.
-    normals, strength
-        (H, W, 3) 127 times the unit normals away from the camera, and (H, W) indices into `weights`
-        (256,); 0 for pixels that are not fused.
-    rays, lookup_frame
-        Of the view's `Projection`.
-    reach, backs
-        Truncation distance in front of a surface, and (256,) behind it, by the index of the weight.
-    heights, codes
-        (H W + 1,) written: h of the pixel's plane n . p = h, and n and the index of the weight in
-        four bytes. The last element stands for all points outside the image.
-    cells, coarse
-        (A, B, 3) written, for the cells of the lookup: the z in front of which all is free, the z
-        behind which all is occluded, and the smallest weight, 0 where a pixel has no surface or the
-        cell has no pixel. `coarse` is the same for each 4 x 4 cells.
-    """
+    """Unpack a view into row `s` of a batch, but for its intensity."""
+    z, unit, normals, strength, rays = view
+    weights, backs, reach = decoding
+    heights, codes = batch.heights[s], batch.codes[s]
+    cells, coarse = batch.cells[s], batch.coarse[s]
     rows, columns = z.shape
     cells[..., 0] = np.inf
     cells[..., 1] = -np.inf
@@ -304,19 +356,13 @@ def unpack_view(
 
 
 @kernel
-def max_informative_depth(
-    z: UInt16,
-    unit: float,
-    normals: Int8,
-    strength: UInt8,
-    rays: Float32,
-    backs: Float32,
-) -> float:
+def max_informative_depth(view: StoredView, backs: Float32) -> float:
     """Return an upper bound of the z (m) at which a view still observes anything; 0 if nothing.
 
-    The arguments are those of `unpack_view`. Voxels that project to a pixel are up to half its
-    width from its ray, and see its plane at another depth; a whole width is allowed for.
+    `backs` are those of `Decoding`. Voxels that project to a pixel are up to half its width from
+    its ray, and see its plane at another depth; a whole width is allowed for.
     """
+    z, unit, normals, strength, rays = view
     rows, columns = z.shape
     far = 0.0
     for r in range(rows):
@@ -453,30 +499,13 @@ def _local_projection(
 
 @kernel
 def integrate(
-    keys: Int64,
-    blocks: Int64,
+    blocks: Blocks,
     voxel_m: float,
-    T_camera_world: Float64,
-    views: Int64,
-    heights: Float32,
-    codes: Int32,
-    weights: Float32,
-    backs: Float32,
+    batch: Batch,
+    camera: Camera,
+    decoding: Decoding,
     near: UInt8,
     turns: int,
-    intensity: Float32,
-    shape: tuple[int, int],
-    lookup: Float32,
-    lookup_frame: Float64,
-    nodes: float,
-    cells: Float32,
-    coarse: Float32,
-    reach: float,
-    distance: Float32,
-    weight: Float32,
-    seen: UInt16,
-    color: Float32,
-    free: Float32,
     start: int,
     stop: int,
 ) -> None:
@@ -492,42 +521,21 @@ def integrate(
 
     Parameters
     ----------
-    keys
-        (B,) of the blocks.
+    blocks
+        Updated. Their numbers and those of the views determine whose turn it is.
     voxel_m
         Edge of a voxel, m.
-    blocks, views
-        (B,) and (V,) global numbers of the blocks and views, which determine whose turn it is: a
-        block gets the same result whichever others are in memory.
-    T_camera_world
-        (V, 4, 4) of the views.
-    heights, codes, weights, backs, cells, coarse
-        Of `unpack_view`, one row per view.
-    weights, backs
-        (256,) weights in 1/m^2, and truncation distances behind a surface in m.
+    batch, camera, decoding
+        The views.
     near
         (V, B) bit mask of the eighths of a block that are near a view's surface.
     turns
         Period of the round-robin integration of free space.
-    intensity
-        (V, H W, C) float32 colour or amplitude; C may be 0.
-    shape
-        (H, W) of the views.
-    lookup, lookup_frame, nodes
-        Of their `Projection`, and the number of nodes over which it is linear (infinity:
-        everywhere).
-    reach
-        Truncation distance, m.
-    distance, weight
-        (B, VOXELS) mean distance in m, and sum of the weights, updated.
-    seen
-        (B, VOXELS) number of views with a surface within `reach`, updated.
-    color
-        (B, VOXELS, C) mean of `intensity` over those views, updated.
-    free
-        (B, 8) weight of free-space observations of whole eighths, not yet in `distance`; updated.
     """
-    rows, columns = shape
+    keys, numbers, distance, weight, seen, color, free = blocks
+    views, T_camera_world, heights, codes, intensity, cells, coarse = batch
+    (rows, columns), lookup, lookup_frame, nodes = camera
+    weights, backs, reach = decoding
     middle = 0.5 * (EDGE - 1) * voxel_m
     radius = np.sqrt(3.0) * middle
     # A block that can't be classified as a whole is divided into eighths.
@@ -574,7 +582,7 @@ def integrate(
         mz = oz + middle
         for s in range(len(T_camera_world)):
             # Neighbouring blocks take turns in different views.
-            turn = (views[s] + blocks[b]) % turns == 0
+            turn = (views[s] + numbers[b]) % turns == 0
             if near[s, b] == 0 and not turn:
                 continue
             T = T_camera_world[s]
@@ -798,10 +806,9 @@ def _project_by_lookup(
 
 
 @kernel
-def apply_free_space(
-    distance: Float32, weight: Float32, free: Float32, reach: float, start: int, stop: int
-) -> None:
+def apply_free_space(blocks: Blocks, reach: float, start: int, stop: int) -> None:
     """Integrate the free-space weights of whole eighths into the voxels of blocks start..stop."""
+    distance, weight, free = blocks.distance, blocks.weight, blocks.free
     for b in range(start, stop):
         for v in range(VOXELS):
             new = free[b, v >> 6]
