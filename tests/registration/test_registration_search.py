@@ -109,9 +109,11 @@ def test_every_pose_of_a_grid_is_scored_both_ways():
     poses = small_poses(rng, 6)
     rotations, moves = poses[:, :3, :3].copy(), poses[:4, :3, 3].copy()
     scores = np.full((6, 4), np.nan, np.float32)
-    points = (*source, lights[0], *target, lights[1])
-    arguments = (*points, *grids[0], *grids[1], rotations)
-    kernels.score_grid(*arguments, moves[None], 0.4, 0.3, scores, 0, 6)
+    views = (
+        kernels.Resampled(*source, lights[0], *grids[0]),
+        kernels.Resampled(*target, lights[1], *grids[1]),
+    )
+    kernels.score_grid(*views, rotations, moves[None], 0.4, 0.3, scores, 0, 6)
     most = 0
     for a in range(6):
         for b in range(4):
@@ -129,15 +131,14 @@ def test_every_pose_of_a_grid_is_scored_both_ways():
     # A longer exposure says nothing.
     brighter = grids[0][0].copy()
     brighter[..., 4] += 0.7
-    longer = (*source, lights[0] + np.float32(0.7), *target, lights[1])
+    longer = kernels.Resampled(*source, lights[0] + np.float32(0.7), brighter, grids[0][1])
     again = np.full((6, 4), np.nan, np.float32)
-    images = (brighter, grids[0][1], *grids[1])
-    kernels.score_grid(*longer, *images, rotations, moves[None], 0.4, 0.3, again, 0, 6)
+    kernels.score_grid(longer, views[1], rotations, moves[None], 0.4, 0.3, again, 0, 6)
     np.testing.assert_allclose(again, scores, atol=1e-5)
     # A translation of its own for each rotation.
     single = np.full((4, 1), np.nan, np.float32)
     own = np.ascontiguousarray(moves[:, None])
-    kernels.score_grid(*arguments[:-1], rotations[:4], own, 0.4, 0.3, single, 0, 4)
+    kernels.score_grid(*views, rotations[:4], own, 0.4, 0.3, single, 0, 4)
     np.testing.assert_allclose(single[:, 0], scores[np.arange(4), np.arange(4)], atol=1e-6)
 
 
@@ -180,9 +181,12 @@ def test_a_step_of_the_icp_solves_both_ways_equations():
     H += np.diag([damping] * 3 + [damping * unit**2] * 3)
     expected = T @ se3.exp(-np.linalg.solve(H, g))
     poses = np.stack([np.eye(4), T])
-    kernels.refine_poses(
-        *source, *target, *grids[0], *grids[1], np.array([reach]), cosine, unit, poses, 1, 2
-    )
+    dark = np.zeros(150, np.float32)
+    views = [
+        kernels.Resampled(*points, dark, *image)
+        for points, image in zip((source, target), grids, strict=True)
+    ]
+    kernels.refine_poses(*views, np.array([reach]), cosine, unit, poses, 1, 2)
     np.testing.assert_allclose(poses[1], expected, atol=2e-5)
     np.testing.assert_array_equal(poses[0], np.eye(4))  # not its turn
 

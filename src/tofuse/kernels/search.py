@@ -8,6 +8,8 @@ known; all 0 where nothing is known; and the log albedo, NaN where unknown. The 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Int64
@@ -37,6 +39,84 @@ AGREEMENT_SIZE = 5
 _LANES = 128
 _ROTATION, _TRANSLATION, _POSITION, _PIXEL, _TOTAL, _ALBEDO = 0, 9, 12, 15, 20, 21
 _ROWS = 24
+
+
+class Resampled(NamedTuple):
+    """A view resampled to a grid, and some of its points.
+
+    Attributes
+    ----------
+    points, normals
+        (N, 3) m and (N, 3) unit, in the frame of the camera.
+    log_albedo
+        (N,) at the points, NaN where unknown.
+    grid, frame
+        The image, as described above.
+    """
+
+    points: Float32
+    normals: Float32
+    log_albedo: Float32
+    grid: Float32
+    frame: Float64
+
+
+class Points(NamedTuple):
+    """Points of a view.
+
+    Attributes
+    ----------
+    points, normals, sigma
+        (N, 3) m, (N, 3) unit, (N,) sigma of z in m.
+    log_albedo
+        (N,) NaN where unknown.
+    """
+
+    points: Float32
+    normals: Float32
+    sigma: Float32
+    log_albedo: Float32
+
+
+class Image(NamedTuple):
+    """An image that points are compared with.
+
+    Attributes
+    ----------
+    planes, plane_variance, lookup, lookup_frame
+        As in `alignment.gather` and `alignment.accumulate`.
+    albedo
+        (H, W, 3) log albedo (first channel), NaN where unknown.
+    nearest
+        (H, W) lower bound of the depth, m, 0 where unknown: the free space of pixels without a
+        plane.
+    """
+
+    planes: Float32
+    plane_variance: Float32
+    albedo: Float32
+    nearest: Float32
+    lookup: Float32
+    lookup_frame: Float64
+
+
+class Tolerance(NamedTuple):
+    """Tolerance of points that support a pose.
+
+    Attributes
+    ----------
+    sigmas, floor_m, floor_fraction
+        A point supports the pose if its distance is below `sigmas` standard deviations plus
+        `floor_m` plus `floor_fraction` times its depth; it violates free space if it is nearer than
+        the surface by twice that.
+    min_cosine
+        Smallest cosine between the normals of a supporting point and the plane.
+    """
+
+    sigmas: float
+    floor_m: float
+    floor_fraction: float
+    min_cosine: float
 
 
 @kernel
@@ -186,16 +266,8 @@ def select_distinct(
 
 @kernel
 def score_grid(
-    source_points: Float32,
-    source_normals: Float32,
-    source_log_albedo: Float32,
-    target_points: Float32,
-    target_normals: Float32,
-    target_log_albedo: Float32,
-    source_grid: Float32,
-    source_frame: Float64,
-    target_grid: Float32,
-    target_frame: Float64,
+    source: Resampled,
+    target: Resampled,
     rotations: Float64,
     translations: Float64,
     reach: float,
@@ -208,12 +280,8 @@ def score_grid(
 
     Parameters
     ----------
-    source_points, source_normals, target_points, target_normals
-        (N, 3) and (M, 3), each in the frame of its own camera.
-    source_log_albedo, target_log_albedo
-        (N,) and (M,) log albedo at the points, NaN where unknown.
-    source_grid, source_frame, target_grid, target_frame
-        The images, as described above.
+    source, target
+        The views.
     rotations, translations
         (A, 3, 3) and (A, B, 3), or (1, B, 3) for all rotations, of T_target_source.
     reach
@@ -226,6 +294,8 @@ def score_grid(
         (A, B), written: support minus twice the violations minus the albedo penalty, divided by
         the number of points.
     """
+    source_points, source_normals, source_log_albedo, source_grid, source_frame = source
+    target_points, target_normals, target_log_albedo, target_grid, target_frame = target
     per_point = 1.0 / max(len(source_points) + len(target_points), 1)
     per2 = 1.0 / (albedo * albedo)
     many = translations.shape[1]
@@ -376,14 +446,8 @@ def _solve(H: Float64, g: Float64) -> Float64:
 
 @kernel
 def refine_poses(
-    source_points: Float32,
-    source_normals: Float32,
-    target_points: Float32,
-    target_normals: Float32,
-    source_grid: Float32,
-    source_frame: Float64,
-    target_grid: Float32,
-    target_frame: Float64,
+    source: Resampled,
+    target: Resampled,
     reaches: Float64,
     min_cosine: float,
     unit_m: float,
@@ -395,10 +459,8 @@ def refine_poses(
 
     Parameters
     ----------
-    source_points, source_normals, target_points, target_normals
-        As in `score_grid`.
-    source_grid, source_frame, target_grid, target_frame
-        As in `score_grid`.
+    source, target
+        The views.
     reaches
         (I,) cut-off of Tukey's biweight in each iteration, m.
     min_cosine
@@ -408,6 +470,8 @@ def refine_poses(
     poses
         (N, 4, 4) T_target_source.
     """
+    source_points, source_normals, _, source_grid, source_frame = source
+    target_points, target_normals, _, target_grid, target_frame = target
     H = np.empty((6, 6))
     g = np.empty(6)
     for c in range(start, stop):
@@ -459,21 +523,10 @@ def refine_poses(
 
 @kernel
 def measure_agreement(
-    points: Float32,
-    normals: Float32,
-    sigma: Float32,
-    log_albedo: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    albedo: Float32,
-    nearest: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    of: Points,
+    image: Image,
     T: Float64,
-    sigmas: float,
-    floor_m: float,
-    floor_fraction: float,
-    min_cosine: float,
+    tolerance: Tolerance,
     differences: Float32,
     slants: Float32,
     start: int,
@@ -483,23 +536,12 @@ def measure_agreement(
 
     Parameters
     ----------
-    points, normals, sigma
-        (N, 3) m, (N, 3) unit, (N,) sigma of z in m.
-    planes, plane_variance, lookup, lookup_frame
-        Of the image, as in `alignment.gather` and `alignment.accumulate`.
-    nearest
-        (H, W) lower bound of the depth, m, 0 where unknown: the free space of pixels without a
-        plane.
+    of, image
+        The points and the image.
     T
         (4, 4) from the points' frame to the image's.
-    sigmas, floor_m, floor_fraction
-        A point supports the pose if its distance is below `sigmas` standard deviations plus
-        `floor_m` plus `floor_fraction` times its depth; it violates free space if it is nearer than
-        the surface by twice that.
-    min_cosine
-        Smallest cosine between the normals of a supporting point and the plane.
-    log_albedo, albedo
-        (N,) log albedo of the points and (H, W, 3) of the image (first channel), NaN where unknown.
+    tolerance
+        Of points that support the pose.
     differences
         (N,) written: log albedo of the image minus the point's for supporting points, else NaN.
     slants
@@ -510,6 +552,9 @@ def measure_agreement(
     -------
     (AGREEMENT_SIZE,) counts, and the supporting points' sum of squared distances.
     """
+    points, normals, sigma, log_albedo = of
+    planes, plane_variance, albedo, nearest, lookup, lookup_frame = image
+    sigmas, floor_m, floor_fraction, min_cosine = tolerance
     out = np.zeros(AGREEMENT_SIZE)
     rows, columns = planes.shape[0], planes.shape[1]
     for k in range(start, stop):

@@ -231,27 +231,18 @@ def _one_way(
     options: AgreementOptions,
     log_albedos: Float32,
 ) -> Float64:
+    sampled = kernels.Points(points.points, points.normals, points.sigma, points.log_albedo)
+    grid = view.projection
+    image = kernels.Image(
+        view.planes, view.plane_variance, view.albedo, nearest, grid.lookup, grid.frame
+    )
+    tolerance = kernels.Tolerance(
+        options.sigmas, options.floor_m, options.floor_fraction, float(np.cos(options.max_angle))
+    )
+
     def work(a: int, b: int) -> Float64:
         return kernels.measure_agreement(
-            points.points,
-            points.normals,
-            points.sigma,
-            points.log_albedo,
-            view.planes,
-            view.plane_variance,
-            view.albedo,
-            nearest,
-            view.projection.lookup,
-            view.projection.frame,
-            T,
-            options.sigmas,
-            options.floor_m,
-            options.floor_fraction,
-            float(np.cos(options.max_angle)),
-            log_albedos[0],
-            log_albedos[1],
-            a,
-            b,
+            sampled, image, T, tolerance, log_albedos[0], log_albedos[1], a, b
         )
 
     n = len(points.points)

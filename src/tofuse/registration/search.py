@@ -178,13 +178,14 @@ class _View:
     albedo: Float32
     depth: float
 
-    def some(self, count: int, less: Bool | None = None) -> tuple[Float32, Float32, Float32]:
-        """Subset of `count` points with normals and albedo, one in four of those marked `less`."""
+    def some(self, count: int, less: Bool | None = None) -> kernels.Resampled:
+        """Subset of `count` points with the grid, one in four of those marked `less`."""
         keep = np.arange(len(self.points))
         if less is not None:
             keep = np.concatenate([keep[~less], keep[less][::4]])
         keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
-        return self.points[keep], self.normals[keep], self.albedo[keep]
+        points = self.points[keep], self.normals[keep], self.albedo[keep]
+        return kernels.Resampled(*points, self.grid, self.frame)
 
 
 def search(
@@ -460,8 +461,8 @@ class _Scorer:
 
     def __call__(self, rotations: Float64, translations: Float64, points: int) -> Float32:
         """Scores (A, B) of rotations (A, 3, 3) with translations (1, B, 3), or (A, 1) pairwise."""
-        s, t = self.source, self.target
-        some = (*s.some(points, self.less[0]), *t.some(points, self.less[1]))
+        source = self.source.some(points, self.less[0])
+        target = self.target.some(points, self.less[1])
         rotations, translations = (
             np.ascontiguousarray(rotations),
             np.ascontiguousarray(translations),
@@ -469,18 +470,7 @@ class _Scorer:
         scores = np.empty((len(rotations), translations.shape[-2]), np.float32)
         run_chunks(
             lambda a, b: kernels.score_grid(
-                *some,
-                s.grid,
-                s.frame,
-                t.grid,
-                t.frame,
-                rotations,
-                translations,
-                self.reach,
-                _ALBEDO,
-                scores,
-                a,
-                b,
+                source, target, rotations, translations, self.reach, _ALBEDO, scores, a, b
             ),
             len(rotations),
             _CHUNKS,
@@ -518,13 +508,11 @@ def _refine(
     s: _View, t: _View, poses: Float64, reaches: Float64, points: int, max_angle: float
 ) -> None:
     """Refine poses (N, 4, 4) in place by two-way ICP, with normals within `max_angle`, rad."""
-    some = (*s.some(points)[:2], *t.some(points)[:2])
+    source, target = s.some(points), t.some(points)
     cosine = float(np.cos(max_angle))
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
-        lambda i, j: kernels.refine_poses(
-            *some, s.grid, s.frame, t.grid, t.frame, reaches, cosine, depth, poses, i, j
-        ),
+        lambda i, j: kernels.refine_poses(source, target, reaches, cosine, depth, poses, i, j),
         len(poses),
         _CHUNKS,
     )
