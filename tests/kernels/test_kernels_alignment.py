@@ -62,11 +62,10 @@ def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P
                min_cosine=0.5, robust=ROBUST, start=0, stop=None):  # fmt: skip
     planes, variance, albedo, projection = of
     points = (view if isinstance(view, np.ndarray) else packed(*view))[start:stop]
-    return kernels.accumulate(
-        points, kernels.make_target(projection.rays, planes, variance, albedo), projection.lookup,
-        projection.frame, np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust,
-        min_cosine,
-    )  # fmt: skip
+    image = kernels.make_target(kernels.ViewImages(projection.rays, planes, variance, albedo))
+    seen = kernels.TargetImage(image, projection.lookup, projection.frame)
+    residuals = kernels.Residuals(exposure, scale_g, scale_p, slack, robust, min_cosine)
+    return kernels.accumulate(points, seen, np.ascontiguousarray(T), residuals)
 
 
 def photometric_row(slopes, p, R=None, moved=None):
@@ -353,10 +352,9 @@ def test_the_difference_in_exposure_is_seen_where_points_land():
     view[3][:, 0] -= 0.4
     view[3][5, 0] = np.nan
     projection = of[3]
-    pixels = kernels.make_target(projection.rays, *of[:3])
-    found = kernels.exposure_differences(
-        packed(*view), 2, pixels, projection.lookup, projection.frame, MOTION
-    )
+    pixels = kernels.make_target(kernels.ViewImages(projection.rays, *of[:3]))
+    seen = kernels.TargetImage(pixels, projection.lookup, projection.frame)
+    found = kernels.exposure_differences(packed(*view), 2, seen, MOTION)
     assert len(found) == 30
     assert np.median(found) == pytest.approx(0.4, abs=0.05)
 
@@ -367,7 +365,7 @@ def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
     planes[3:9, 5:11] = 0
     variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)
     rays = CAMERA.rays()
-    points = kernels.gather(rays, planes, variance, albedo, stride)
+    points = kernels.gather(kernels.ViewImages(rays, planes, variance, albedo), stride)
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     w = planes[pick][..., 3]
     good = w > 0

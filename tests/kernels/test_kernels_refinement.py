@@ -10,6 +10,7 @@ import pytest
 from corner_views import SHARP, corner, unpack
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.kernels.alignment import Residuals
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import points_of
 
@@ -25,7 +26,7 @@ def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
         points_of(seen, 1),
         surface.target_image,
         np.ascontiguousarray(T),
-        kernels.Residuals(*settings),
+        Residuals(*settings),
         kernels.CameraErrors(
             np.zeros(kernels.ERRORS) if errors is None else errors,
             known,
@@ -145,9 +146,7 @@ def test_overlap_counts_what_both_see_from_the_same_side(pair):
             points,
             np.array([0, len(points)]),
             np.array([0]),
-            surface.target,
-            surface.projection.lookup,
-            surface.projection.frame,
+            surface.target_image,
             np.ascontiguousarray(pose),
             np.eye(4)[None],
             0.1,

@@ -12,6 +12,7 @@ from corner_views import SHARP, corner, unpack
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
+from tofuse.kernels.alignment import Residuals
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import RefineOptions, refine
 from tofuse.posegraph.view_store import KeptView
@@ -44,12 +45,9 @@ def pair():
 def sums_of(source, target, T):
     sums = np.empty((shared_error.PATCHES, patch_kernels.PATCH_SIZE))
     surface = target.surface
-    lookup, frame = surface.projection.lookup, surface.projection.frame
-    patch_kernels.patch_sums(
-        source.points, source.patches, surface.target, lookup, frame, T, *WIDE, sums
-    )
+    patch_kernels.patch_sums(source.points, source.patches, surface.target_image, T, *WIDE, sums)
     row = np.empty(kernels.SIZE)
-    residuals = kernels.Residuals(0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
+    residuals = Residuals(0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
     none, known = np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64)
     camera = kernels.CameraErrors(none, known, False, False)
     kernels.pair_equations(source.points, surface.target_image, T, residuals, camera, row)

@@ -6,7 +6,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import tiles
-from tofuse.kernels.alignment import POINT_SIZE
+from tofuse.kernels.alignment import POINT_SIZE, Residuals
 from tofuse.kernels.spurious_information import spurious_information
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
@@ -219,11 +219,8 @@ def test_tile_sums_match_numpy():
     z = np.where(inverse_z > 0, 1 / np.maximum(inverse_z, 1e-6), 0).astype(np.float32)
     sigma = (np.sqrt(source.plane_variance) * z * z).astype(np.float32)
 
-    found, whole = tiles.tile_sums(
-        source.rays, source.planes, source.plane_variance, source.albedo, target.target,
-        target.projection.lookup, target.projection.frame, T, 0.0, 1.0, 0.0, 3.5,
-        np.cos(0.7), 2, 4, 3,
-    )  # fmt: skip
+    residuals = Residuals(0.0, 1.0, 0.0, 0.0, 3.5, np.cos(0.7))
+    found, whole = tiles.tile_sums(source.images, target.target_image, T, residuals, 2, 4, 3)
     found = found.reshape(3, 4, tiles.SIZE)
     expected = np.zeros((3, 4, tiles.SIZE))
     upper = np.triu_indices(7)

@@ -93,30 +93,26 @@ class TargetImage(NamedTuple):
     lookup_frame: Float64
 
 
-@kernel
-def accumulate(
-    points: Float32,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
-    T: Float64,
-    exposure: float,
-    scale_g: float,
-    scale_p: float,
-    inflation: float,
-    robust: float,
-    min_cosine: float,
-) -> Float64:
-    """Sum the normal equations over all points.
+class ViewImages(NamedTuple):
+    """The images of a view from which source points and target images are made.
 
-    Parameters
+    Attributes
     ----------
-    points, target
-        (N, POINT_SIZE) source points and (H, W, PIXEL_SIZE) target image, see above.
-    lookup, lookup_frame
-        Projection of the target's camera, as in `project_ray`.
-    T
-        (4, 4) T_target_source.
+    rays, planes, plane_variance, albedo
+        (H, W, 2), (H, W, 4), (H, W) and (H, W, 3) of a `PreparedView`.
+    """
+
+    rays: Float32
+    planes: Float32
+    plane_variance: Float32
+    albedo: Float32
+
+
+class Residuals(NamedTuple):
+    """How residuals are computed and weighted.
+
+    Attributes
+    ----------
     exposure
         Log albedo of the target minus that of the source.
     scale_g, scale_p
@@ -128,11 +124,35 @@ def accumulate(
         Cut-off of Tukey's biweight, in sigmas.
     min_cosine
         Smallest cosine between corresponding normals.
+    """
+
+    exposure: float
+    scale_g: float
+    scale_p: float
+    inflation: float
+    robust: float
+    min_cosine: float
+
+
+@kernel
+def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Residuals) -> Float64:
+    """Sum the normal equations over all points.
+
+    Parameters
+    ----------
+    points
+        (N, POINT_SIZE) source points, see above.
+    target, residuals
+        What they are compared with, and how.
+    T
+        (4, 4) T_target_source.
 
     Returns
     -------
     (SIZE,) sums, laid out as above.
     """
+    image, lookup, lookup_frame = target
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     out = np.zeros(SIZE)
     block = np.zeros(ROWS * LANES, np.float32)
     sums = np.zeros((PROJECTED + _STATS, LANES))
@@ -140,7 +160,7 @@ def accumulate(
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
         transform_block(block, T)
-        out[PROJECTED] += project_block(block, count, target, lookup, lookup_frame)
+        out[PROJECTED] += project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         _add_products(sums, block)
         if scale_p > 0:
@@ -225,7 +245,7 @@ def compare_planes(
     robust: float,
     min_cosine: float,
 ) -> None:
-    """Compare the points of a block with the target planes; parameters as in `accumulate`."""
+    """Compare the points of a block with the target planes; parameters as in `Residuals`."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
@@ -278,7 +298,7 @@ def compare_planes(
 def compare_albedos(
     block: Float32, T: Float64, exposure: float, scale_p: float, robust: float
 ) -> None:
-    """Compare the albedo of a block's inliers with the target; parameters as in `accumulate`."""
+    """Compare the albedo of a block's inliers with the target; parameters as in `Residuals`."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
@@ -413,22 +433,17 @@ def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 @kernel
-def gather(
-    rays: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    albedo: Float32,
-    stride: int,
-) -> Float32:
+def gather(view: ViewImages, stride: int) -> Float32:
     """Return source points (N, POINT_SIZE) on the fitted planes of every `stride`-th pixel.
 
     Parameters
     ----------
-    rays, planes, plane_variance, albedo
-        (H, W, 2), (H, W, 4), (H, W) and (H, W, 3) of a `PreparedView`.
+    view
+        The source.
     stride
         Pixels between samples, in both directions.
     """
+    rays, planes, plane_variance, albedo = view
     rows, columns = planes.shape[0], planes.shape[1]
     most = ((rows + stride - 1) // stride) * ((columns + stride - 1) // stride)
     out = np.empty((most, POINT_SIZE), np.float32)
@@ -461,10 +476,9 @@ def put_point(
 
 
 @kernel
-def make_target(
-    rays: Float32, planes: Float32, plane_variance: Float32, albedo: Float32
-) -> Float32:
-    """Return the target image (H, W, PIXEL_SIZE) of a view; parameters as in `gather`."""
+def make_target(view: ViewImages) -> Float32:
+    """Return the target image (H, W, PIXEL_SIZE) of a view."""
+    rays, planes, plane_variance, albedo = view
     rows, columns = planes.shape[0], planes.shape[1]
     out = np.zeros((rows, columns, PIXEL_SIZE), np.float32)
     for i in range(rows):
@@ -485,13 +499,12 @@ def make_target(
 
 
 @kernel
-def exposure_differences(
-    points: Float32, every: int, target: Float32, lookup: Float32, lookup_frame: Float64, T: Float64
-) -> Float64:
+def exposure_differences(points: Float32, every: int, target: TargetImage, T: Float64) -> Float64:
     """Return log albedo differences, target minus source, at every `every`-th point's projection.
 
     The other parameters are those of `accumulate`. Returns (n,), without unknown ones.
     """
+    image, lookup, lookup_frame = target
     out = np.empty(points.shape[0] // every + 1)
     n = 0
     for k in range(0, points.shape[0], every):
@@ -503,10 +516,10 @@ def exposure_differences(
         y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
         u, v, iu, _ = project_ray(x, y, lookup, lookup_frame)
         if iu < 0 or not (
-            u > -0.5 and v > -0.5 and u < target.shape[1] - 0.5 and v < target.shape[0] - 0.5
+            u > -0.5 and v > -0.5 and u < image.shape[1] - 0.5 and v < image.shape[0] - 0.5
         ):
             continue
-        pixel = target[int(v + 0.5), int(u + 0.5)]
+        pixel = image[int(v + 0.5), int(u + 0.5)]
         if pixel[DISTANCE] == 0:
             continue
         expected = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]

@@ -35,6 +35,7 @@ from tofuse.kernels.alignment import (
     STAT,
     VARIANCE,
     WEIGHT_G,
+    Residuals,
     TargetImage,
     compare_albedos,
     compare_planes,
@@ -69,17 +70,6 @@ TERMS = SQUARES_P + 1  # number of residuals of both terms
 SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweight)
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
-
-
-class Residuals(NamedTuple):
-    """How residuals are computed and weighted: `exposure` and the others as in `accumulate`."""
-
-    exposure: float
-    scale_g: float
-    scale_p: float
-    inflation: float
-    robust: float
-    min_cosine: float
 
 
 class CameraErrors(NamedTuple):
@@ -383,9 +373,7 @@ def overlaps(
     points: Float32,
     starts: Int64,
     sources: Int64,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    target: TargetImage,
     T_target_world: Float64,
     T_world_source: Float64,
     tolerance: float,
@@ -401,8 +389,8 @@ def overlaps(
         (M, POINT_SIZE) points of all views, those of view k from starts[k] to starts[k + 1].
     sources
         (S,) indices of the source views.
-    target, lookup, lookup_frame
-        As in `alignment.accumulate`.
+    target
+        What they are compared with.
     T_target_world, T_world_source
         (4, 4) of the target, and (N, 4, 4) of all views.
     tolerance, min_cosine
@@ -411,7 +399,8 @@ def overlaps(
     min_overlap
         Smaller fractions are reported as 0.
     """
-    rows, columns = target.shape[0], target.shape[1]
+    image, lookup, lookup_frame = target
+    rows, columns = image.shape[0], image.shape[1]
     T = np.empty((3, 4))
     for s in range(len(sources)):
         pose = T_world_source[sources[s]]
@@ -438,7 +427,7 @@ def overlaps(
                 continue
             if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
                 continue
-            pixel = target[int(v + 0.5), int(u + 0.5)]
+            pixel = image[int(v + 0.5), int(u + 0.5)]
             n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
             if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
                 continue

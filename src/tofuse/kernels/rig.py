@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
-from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE
+from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE, TargetImage
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
@@ -29,9 +29,7 @@ ROW = 13
 @kernel
 def residuals(
     points: Float32,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    target: TargetImage,
     T: Float64,
     source_offset: float,
     target_offset: float,
@@ -42,12 +40,13 @@ def residuals(
 
     Parameters
     ----------
-    points, target, lookup, lookup_frame, T, min_cosine
-        As in `alignment.accumulate`.
+    points, target, T, min_cosine
+        As in `alignment.accumulate` and its `Residuals`.
     source_offset, target_offset
         To be added to the ranges of the two cameras, m.
     """
-    rows, columns = target.shape[0], target.shape[1]
+    image, lookup, lookup_frame = target
+    rows, columns = image.shape[0], image.shape[1]
     for k in range(points.shape[0]):
         out[k, :] = 0.0
         x = np.float64(points[k, POINT])
@@ -67,7 +66,7 @@ def residuals(
         u, v, iu, _ = project_ray(q0 / q2, q1 / q2, lookup, lookup_frame)
         if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        pixel = target[int(v + 0.5), int(u + 0.5)]
+        pixel = image[int(v + 0.5), int(u + 0.5)]
         distance = np.float64(pixel[DISTANCE])
         if distance == 0:
             continue

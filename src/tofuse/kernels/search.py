@@ -84,7 +84,7 @@ class Image(NamedTuple):
     Attributes
     ----------
     planes, plane_variance, lookup, lookup_frame
-        As in `alignment.gather` and `alignment.accumulate`.
+        As in `alignment.ViewImages` and `project_ray`.
     albedo
         (H, W, 3) log albedo (first channel), NaN where unknown.
     nearest

@@ -18,6 +18,7 @@ from tofuse.kernels.alignment import (
     MISFIT,
     ROOT,
     ROWS,
+    TargetImage,
     compare_planes,
     load_block,
     project_block,
@@ -37,9 +38,7 @@ PATCH_SIZE = 8
 def patch_sums(
     points: Float32,
     patch: Int64,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    target: TargetImage,
     T: Float64,
     scale_g: float,
     robust: float,
@@ -50,18 +49,19 @@ def patch_sums(
 
     Parameters
     ----------
-    points, target, lookup, lookup_frame, T, scale_g, robust, min_cosine
-        As in `alignment.accumulate`.
+    points, target, T, scale_g, robust, min_cosine
+        As in `alignment.accumulate` and its `Residuals`.
     patch
         (N,) index of the patch of each point.
     """
+    image, lookup, lookup_frame = target
     out[:] = 0.0
     block = np.zeros(ROWS * LANES, np.float32)
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
         transform_block(block, T)
-        project_block(block, count, target, lookup, lookup_frame)
+        project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, 0.0, robust, min_cosine)
         for k in range(count):
             if not block[FITS * LANES + k] > 0:

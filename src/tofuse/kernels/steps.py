@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as sums
-from tofuse.kernels.alignment import TargetImage, accumulate, bin_edge, normal_equations
+from tofuse.kernels.alignment import Residuals, TargetImage, accumulate, bin_edge, normal_equations
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.motion import compose, retract, twist_between
 from tofuse.kernels.spurious_information import spurious_information
@@ -34,7 +34,7 @@ class LevelSettings(NamedTuple):
     inflation, albedo_inflation
         Noise inflation of distances, m, and of the log albedo.
     robust, min_cosine
-        As in `accumulate`.
+        As in `Residuals`.
     remap
         Whether degenerate directions stay at the prediction (solution remapping, Zhang et al.
         2016).
@@ -92,8 +92,7 @@ def iterate_level(
     size of the last step in `units`, and the number of iterations. If the sums are not finite, the
     returned sums are 0, all directions are degenerate, and T is unchanged.
     """
-    robust, min_cosine, inflation = settings.robust, settings.min_cosine, settings.inflation
-    prior, units = settings.prior, settings.units
+    inflation, prior, units = settings.inflation, settings.prior, settings.units
     total = np.zeros(sums.SIZE)
     weak = np.zeros((0, 6))
     spurious = np.zeros((6, 6))
@@ -101,20 +100,16 @@ def iterate_level(
     done = 0
     while done < settings.iterations and size >= settings.tolerance:
         total[:] = 0.0
+        residuals = Residuals(
+            estimates[EXPOSURE],
+            estimates[SCALE_G],
+            estimates[SCALE_P],
+            inflation,
+            settings.robust,
+            settings.min_cosine,
+        )
         for k in range(len(targets)):
-            total += accumulate(
-                points,
-                targets[k].image,
-                targets[k].lookup,
-                targets[k].lookup_frame,
-                compose(T_targets[k], T),
-                estimates[EXPOSURE],
-                estimates[SCALE_G],
-                estimates[SCALE_P],
-                inflation,
-                robust,
-                min_cosine,
-            )
+            total += accumulate(points, targets[k], compose(T_targets[k], T), residuals)
         if settings.remap and done == 0:
             spurious = total[sums.INLIERS] * spurious_information(
                 points,

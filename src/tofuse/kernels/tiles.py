@@ -23,6 +23,9 @@ from tofuse.kernels.alignment import (
     STAT,
     WEIGHT_G,
     WEIGHT_P,
+    Residuals,
+    TargetImage,
+    ViewImages,
     compare_albedos,
     compare_planes,
     load_block,
@@ -49,32 +52,25 @@ UPPER = 28
 
 @kernel
 def tile_sums(
-    rays: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    albedo: Float32,
-    target: Float32,
-    lookup: Float32,
-    lookup_frame: Float64,
+    source: ViewImages,
+    target: TargetImage,
     T: Float64,
-    exposure: float,
-    scale_g: float,
-    scale_p: float,
-    robust: float,
-    min_cosine: float,
+    residuals: Residuals,
     stride: int,
     tiles_x: int,
     tiles_y: int,
 ) -> tuple[Float64, Float64]:
     """Sum over every `stride`-th pixel of every `stride`-th row; see `alignment.accumulate`.
 
-    The source is given by its images (see `alignment.gather`), the target by that of
-    `alignment.make_target`; the image is divided into `tiles_y` x `tiles_x` tiles.
+    The image is divided into `tiles_y` x `tiles_x` tiles.
 
     Returns
     -------
     (tiles_y * tiles_x, SIZE) sums of the tiles, and (KINDS, UPPER) of the image.
     """
+    rays, planes, plane_variance, albedo = source
+    image, lookup, lookup_frame = target
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
     points = np.zeros((LANES, POINT_SIZE), np.float32)
@@ -98,8 +94,8 @@ def tile_sums(
                 continue
             load_block(block, points[:count])
             transform_block(block, T)
-            project_block(block, count, target, lookup, lookup_frame)
-            compare_planes(block, T, scale_g, 0.0, robust, min_cosine)
+            project_block(block, count, image, lookup, lookup_frame)
+            compare_planes(block, T, scale_g, inflation, robust, min_cosine)
             _add_to_tiles(tiles, of, block, count)
             _add_products(sums, block, GEOMETRY, WEIGHT_G)
             if scale_p > 0:

@@ -19,6 +19,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
 from tofuse.kernels import steps
+from tofuse.kernels.alignment import Residuals
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import robust, shared_error
 from tofuse.posegraph.descent import vertical
@@ -588,7 +589,7 @@ def _evaluate(
                 views[state.source[k]].points,
                 target.target_image,
                 np.ascontiguousarray(T_target_source[k]),
-                kernels.Residuals(
+                Residuals(
                     state.exposure[k],
                     state.scale_g[k],
                     state.scale_p[k],
@@ -628,9 +629,7 @@ def _allow_for_shared(
                 patch_kernels.patch_sums(
                     source.points,
                     source.patches,
-                    target.target,
-                    target.projection.lookup,
-                    target.projection.frame,
+                    target.target_image,
                     np.ascontiguousarray(T[k]),
                     state.scale_g[photometric[k]],
                     options.robust,

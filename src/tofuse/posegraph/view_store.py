@@ -15,7 +15,7 @@ from tofuse.arrays import Float32, Float64, Int64, Intp
 from tofuse.files.spill import Scratch, Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA
+from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA, TargetImage
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.registration.prepared_view import PreparedView, Projection
@@ -386,9 +386,7 @@ def _seen_fractions(
                 points,
                 starts,
                 row[rows],
-                view.target,
-                view.projection.lookup,
-                view.projection.frame,
+                TargetImage(view.target, view.projection.lookup, view.projection.frame),
                 inverse[different[k]],
                 at,
                 _NEAR,

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.geometry.cameras import Camera, ray_lengths
-from tofuse.kernels.alignment import TargetImage, make_target
+from tofuse.kernels.alignment import TargetImage, ViewImages, make_target
 from tofuse.kernels.median import median
 from tofuse.kernels.plane_extension import extend_planes
 from tofuse.kernels.surface import (
@@ -372,7 +372,12 @@ class PreparedView:
     @cached_property
     def target(self) -> Float32:
         """(H, W, PIXEL_SIZE) target image for alignment, see `make_target`."""
-        return make_target(self.rays, self.planes, self.plane_variance, self.albedo)
+        return make_target(self.images)
+
+    @property
+    def images(self) -> ViewImages:
+        """The images as the kernels take them."""
+        return ViewImages(self.rays, self.planes, self.plane_variance, self.albedo)
 
     @property
     def target_image(self) -> TargetImage:

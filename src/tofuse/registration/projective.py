@@ -97,7 +97,7 @@ def points_of(view: PreparedView, stride: int) -> Float32:
     The points lie on the fitted surface, as the target's do, so that the smoothing of curved
     surfaces is the same for both.
     """
-    return kernels.gather(view.rays, view.planes, view.plane_variance, view.albedo, stride)
+    return kernels.gather(view.images, stride)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,11 +318,7 @@ def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> fl
     every = max(1, len(points) // steps.SOME_POINTS)
     seen = []
     for target in targets:
-        view = target.view
         moved = np.ascontiguousarray(target.T_target_world @ T)
-        grid = view.projection
-        seen.append(
-            kernels.exposure_differences(points, every, view.target, grid.lookup, grid.frame, moved)
-        )
+        seen.append(kernels.exposure_differences(points, every, target.view.target_image, moved))
     both = np.concatenate(seen) if seen else np.zeros(0)
     return median(both) if len(both) else 0.0

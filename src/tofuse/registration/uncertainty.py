@@ -25,6 +25,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.kernels import tiles as kernels
+from tofuse.kernels.alignment import Residuals
 from tofuse.kernels.median import median
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.registration.prepared_view import PreparedView
@@ -144,6 +145,14 @@ def patches(
     some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
     some = some[some > 0]
     depth = 1 / median(some) if len(some) else 1.0
+    residuals = Residuals(
+        aligned.exposure,
+        aligned.scale,
+        aligned.photo_scale if photometric else 0.0,
+        0.0,
+        alignment.robust,
+        math.cos(alignment.max_angle),
+    )
     distances = []
     upper = np.zeros((kernels.KINDS, kernels.UPPER))
     changes = []
@@ -153,22 +162,7 @@ def patches(
         moved, turned = distance_and_angle(np.eye(4), T)
         changes.append(turned + moved / depth)
         of_tiles, of_image = kernels.tile_sums(
-            source.rays,
-            source.planes,
-            source.plane_variance,
-            source.albedo,
-            view.target,
-            view.projection.lookup,
-            view.projection.frame,
-            T,
-            aligned.exposure,
-            aligned.scale,
-            aligned.photo_scale if photometric else 0.0,
-            alignment.robust,
-            math.cos(alignment.max_angle),
-            stride,
-            across,
-            down,
+            source.images, view.target_image, T, residuals, stride, across, down
         )
         distances.append(of_tiles)
         upper += of_image

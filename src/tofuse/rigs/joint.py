@@ -163,9 +163,7 @@ def distances_between(target: KeptView, source: KeptView, T_target_source: Float
     surface, options = target.surface, JointOptions()
     kernels.residuals(
         source.points,
-        surface.target,
-        surface.projection.lookup,
-        surface.projection.frame,
+        surface.target_image,
         np.ascontiguousarray(T_target_source),
         0.0,
         0.0,
@@ -207,9 +205,7 @@ class _System:
                 out = np.empty((len(points), kernels.ROW))
                 kernels.residuals(
                     points,
-                    surface.target,
-                    surface.projection.lookup,
-                    surface.projection.frame,
+                    surface.target_image,
                     np.ascontiguousarray(inverse[target.camera] @ self.poses[source.camera]),
                     self.offsets[source.camera],
                     self.offsets[target.camera],
