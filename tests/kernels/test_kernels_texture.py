@@ -80,10 +80,15 @@ def test_shading_equals_its_twin():
     normal = np.zeros((rays, 3), np.float32)
     albedo, gloss = np.zeros((2, rays), np.float32)
     surface = np.full(rays, -1, np.int32)
+    triangles = kernels.Triangles(corner.reshape(faces, 9), flat, of_face)
+    others = np.ascontiguousarray(weights[:, 1:])
     kernels.shade_hits(
-        corner.reshape(faces, 9), flat, of_face, rows, *table, origins, directions, rotation,
-        distance, face, np.ascontiguousarray(weights[:, 1:]), normal, albedo, gloss, surface,
-    )  # fmt: skip
+        triangles,
+        kernels.Textures(rows, *table),
+        kernels.Rays(origins, directions, distance, face, others),
+        rotation,
+        kernels.Shading(normal, albedo, gloss, surface),
+    )
     hit = face >= 0
     assert (surface[~hit] == -1).all()
     assert not normal[~hit].any()

@@ -16,7 +16,7 @@ from tofuse.fusion.colors import UNSEEN, has_color, seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.atlas import UNOWNED, add_view, draw_triangles
+from tofuse.kernels.atlas import UNOWNED, Blending, ColoredView, add_view, draw_triangles
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -299,15 +299,13 @@ def _accumulate(
     )
     T = se3.inverse(T_world_camera)
     border = max(2.0, _BORDER * view.z.shape[0])
-    projection = view.projection
+    colored = ColoredView(view.z, intensity, view.projection.lookup, view.projection.frame)
+    blending = Blending(_TOLERANCE_M, _TOLERANCE_FRACTION, border, _POWER)
     run_chunks(
-        lambda a, b: add_view(
-            points, normals, T, view.z, intensity, projection.lookup, projection.frame,
-            _TOLERANCE_M, _TOLERANCE_FRACTION, border, _POWER, sums, weights, a, b,
-        ),
+        lambda a, b: add_view(points, normals, colored, T, blending, sums, weights, a, b),
         len(points),
         _CHUNKS,
-    )  # fmt: skip
+    )
 
 
 def _dilate_colors(image: UInt8, painted: Bool) -> UInt8:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32
@@ -9,6 +11,45 @@ from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
 UNOWNED = -1
+
+
+class ColoredView(NamedTuple):
+    """A view whose colours are blended.
+
+    Attributes
+    ----------
+    z
+        (H, W) z depth of the view, m; 0 where unknown.
+    image
+        (H, W, C), negative where unknown.
+    lookup, lookup_frame
+        Projection of the view's camera, see `project_ray`.
+    """
+
+    z: Float32
+    image: Float32
+    lookup: Float32
+    lookup_frame: Float64
+
+
+class Blending(NamedTuple):
+    """Which views count, and how much.
+
+    Attributes
+    ----------
+    tolerance, tolerance_ratio
+        Largest difference between a point's z and the depth around its projection: m, and relative
+        to z.
+    border
+        Width in pixels of the image border in which the weight decreases.
+    power
+        Exponent by which near and perpendicular views are preferred.
+    """
+
+    tolerance: float
+    tolerance_ratio: float
+    border: float
+    power: float
 
 
 @kernel
@@ -60,15 +101,9 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
 def add_view(
     points: Float32,
     normals: Float32,
+    view: ColoredView,
     T_camera_world: Float64,
-    z: Float32,
-    image: Float32,
-    lookup: Float32,
-    frame: Float64,
-    tolerance: float,
-    tolerance_ratio: float,
-    border: float,
-    power: float,
+    blending: Blending,
     sums: Float32,
     weights: Float32,
     start: int,
@@ -80,24 +115,15 @@ def add_view(
     ----------
     points, normals
         (N, 3) in the world.
-    z
-        (H, W) z depth of the view, m; 0 where unknown.
-    image
-        (H, W, C), negative where unknown.
-    lookup, frame
-        Projection of the view's camera, see `project_ray`.
-    tolerance, tolerance_ratio
-        Largest difference between a point's z and the depth around its projection: m, and relative
-        to z.
-    border
-        Width in pixels of the image border in which the weight decreases.
-    power
-        Exponent by which near and perpendicular views are preferred.
+    view, T_camera_world, blending
+        The view, its (4, 4) pose, and its weight.
     sums, weights
         (N, C) and (N,), added to.
     start, end
         Range of points.
     """
+    z, image, lookup, frame = view
+    tolerance, tolerance_ratio, border, power = blending
     height, width = z.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     for n in range(start, end):

@@ -6,6 +6,8 @@ by its finest octave, so that a camera's pixels can resolve it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32
@@ -16,6 +18,65 @@ PLAIN, NOISE, WOOD, TILES, PRINT, SPECKLE = 0, 1, 2, 3, 4, 5
 # Columns of a row of texture parameters.
 ALBEDO, CONTRAST, SCALE, KIND, GLOSS, SHIFT, COLUMNS = 0, 1, 2, 5, 6, 7, 10
 LATTICE = 256
+
+
+class Triangles(NamedTuple):
+    """Triangles of a body, in the order of the leaves.
+
+    Attributes
+    ----------
+    corner_normals, face_normals
+        (F, 9) and (F, 3).
+    surface
+        (F,) of each triangle.
+    """
+
+    corner_normals: Float64
+    face_normals: Float64
+    surface: Int32
+
+
+class Textures(NamedTuple):
+    """Texture parameters (S, COLUMNS) of every surface; the others as in `value_noise`."""
+
+    rows: Float64
+    order: Int32
+    values: Float64
+
+
+class Rays(NamedTuple):
+    """Rays in a body's frame, and what they hit.
+
+    Attributes
+    ----------
+    origins, directions
+        (1 or N, 3) and (N, 3).
+    distance, face, weights
+        (N,), (N,) and (N, 2) from `cast_rays`.
+    """
+
+    origins: Float64
+    directions: Float64
+    distance: Float64
+    face: Int32
+    weights: Float64
+
+
+class Shading(NamedTuple):
+    """What N rays hit.
+
+    Attributes
+    ----------
+    normal
+        (N, 3) in the room's frame, facing the origin of the ray.
+    albedo, gloss, surface
+        (N,) each.
+    """
+
+    normal: Float32
+    albedo: Float32
+    gloss: Float32
+    surface: Int32
 
 
 @kernel
@@ -90,40 +151,16 @@ def pattern_at(order: Int32, values: Float64, row: Float64, x: float, y: float, 
 
 @kernel
 def shade_hits(
-    corner_normals: Float64,
-    face_normals: Float64,
-    face_surface: Int32,
-    rows: Float64,
-    order: Int32,
-    values: Float64,
-    origins: Float64,
-    directions: Float64,
-    rotation: Float64,
-    distance: Float64,
-    face: Int32,
-    weights: Float64,
-    normal: Float32,
-    albedo: Float32,
-    gloss: Float32,
-    surface: Int32,
+    triangles: Triangles, textures: Textures, rays: Rays, rotation: Float64, out: Shading
 ) -> None:
-    """Fill in what each ray hit, where `face` is not negative.
+    """Fill in what each ray hit, where its face is not negative.
 
-    Parameters
-    ----------
-    corner_normals (F, 9), face_normals (F, 3), face_surface (F,)
-        Of the body's triangles, in the order of the leaves.
-    rows (S, 10)
-        Texture parameters of every surface; `order` and `values` as in `value_noise`.
-    origins (1 or N, 3), directions (N, 3)
-        Rays in the body's frame.
-    rotation (3, 3)
-        Turns directions of the body's frame into the room's.
-    distance (N,), face (N,), weights (N, 2)
-        From `cast_rays`.
-    normal (N, 3), albedo (N,), gloss (N,), surface (N,)
-        Written. Normals are in the room's frame and face the origin of the ray.
+    `rotation` (3, 3) turns directions of the body's frame into the room's.
     """
+    corner_normals, face_normals, face_surface = triangles
+    rows, order, values = textures
+    origins, directions, distance, face, weights = rays
+    normal, albedo, gloss, surface = out
     shared = origins.shape[0] == 1
     n = np.empty(3)
     for i in range(directions.shape[0]):

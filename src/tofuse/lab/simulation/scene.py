@@ -19,7 +19,7 @@ from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels import bvh
-from tofuse.kernels.texture import shade_hits
+from tofuse.kernels.texture import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.kernels.threads import run_chunks
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import texture
@@ -82,26 +82,10 @@ class Body:
         )  # fmt: skip
         return face, weights
 
-    def shade(
-        self,
-        rows: Float64,
-        noise: tuple[Int32, Float64],
-        origins: Float64,
-        directions: Float64,
-        R_room_body: Float64,
-        distance: Float64,
-        face: Int32,
-        weights: Float64,
-        out: tuple[Float32, Float32, Float32, Int32],
-    ) -> None:
+    def shade(self, textures: Textures, rays: Rays, R_room_body: Float64, out: Shading) -> None:
         """Fill in normal, albedo, gloss and surface of the rays that hit this body."""
-        order, values = noise
-        normal, albedo, gloss, surface = out
-        shade_hits(
-            self._corner_normals, self._face_normals, self._surface, rows, order, values,
-            origins, directions, R_room_body, distance, face, weights,
-            normal, albedo, gloss, surface,
-        )  # fmt: skip
+        triangles = Triangles(self._corner_normals, self._face_normals, self._surface)
+        shade_hits(triangles, textures, rays, R_room_body, out)
 
 
 class Scene:
@@ -218,17 +202,19 @@ class Scene:
                 origins if len(origins) != size else origins[a:b], np.float64
             )
             nearest = np.full(b - a, np.inf)
-            out = (normal[a:b], albedo[a:b], gloss[a:b], surface[a:b])
+            out = Shading(normal[a:b], albedo[a:b], gloss[a:b], surface[a:b])
             face, weights = self._room.cast(starts, rays, nearest)
-            rows, noise = self._rows, self._noise
-            self._room.shade(rows, noise, starts, rays, np.eye(3), nearest, face, weights, out)
+            textures = Textures(self._rows, *self._noise)
+            hits = Rays(starts, rays, nearest, face, weights)
+            self._room.shade(textures, hits, np.eye(3), out)
             for body, T in zip(bodies, poses, strict=True):
                 T_body_room = se3.inverse(T)
                 own = np.ascontiguousarray(se3.transform(T_body_room, starts))
                 turned = np.ascontiguousarray(rays @ T_body_room[:3, :3].T)
                 face, weights = body.cast(own, turned, nearest)
                 R = np.ascontiguousarray(T[:3, :3])
-                body.shade(rows, noise, own, turned, R, nearest, face, weights, out)
+                hits = Rays(own, turned, nearest, face, weights)
+                body.shade(textures, hits, R, out)
             distance[a:b] = nearest
 
         run_chunks(chunk, size, chunks=max(1, size // _RAYS_PER_CHUNK))
