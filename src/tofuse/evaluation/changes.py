@@ -25,10 +25,11 @@ from scipy.spatial import cKDTree
 
 from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
+from tofuse.kernels.search import ViewPoints
 from tofuse.kernels.threads import run_chunks
 from tofuse.registration.agreement import nearest_depth
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.view_points import ViewPoints, landing_pixels
+from tofuse.registration.view_points import landing_pixels, sampled_points
 
 Kind = Literal["appeared", "vanished"]
 
@@ -137,7 +138,7 @@ def changes(
 
 def _prepared(views: Sequence[PreparedView], poses: Float64) -> list[_SessionView]:
     return [
-        _SessionView(view, ViewPoints.of(view, _POINTS), nearest_depth(view), T)
+        _SessionView(view, sampled_points(view, _POINTS), nearest_depth(view), T)
         for view, T in zip(views, poses, strict=True)
     ]
 

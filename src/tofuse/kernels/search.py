@@ -61,15 +61,17 @@ class Resampled(NamedTuple):
     frame: Float64
 
 
-class Points(NamedTuple):
-    """Points of a view.
+class ViewPoints(NamedTuple):
+    """Points on the planes of a view.
 
     Attributes
     ----------
-    points, normals, sigma
-        (N, 3) m, (N, 3) unit, (N,) sigma of z in m.
+    points, normals
+        (N, 3) m, and unit, away from the camera.
+    sigma
+        (N,) of their z, m.
     log_albedo
-        (N,) NaN where unknown.
+        (N,) log albedo, NaN where unknown.
     """
 
     points: Float32
@@ -523,7 +525,7 @@ def refine_poses(
 
 @kernel
 def measure_agreement(
-    of: Points,
+    of: ViewPoints,
     image: Image,
     T: Float64,
     tolerance: Tolerance,

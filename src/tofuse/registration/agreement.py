@@ -11,9 +11,10 @@ from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.median import median
+from tofuse.kernels.search import ViewPoints
 from tofuse.kernels.threads import run_chunks
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.view_points import ViewPoints
+from tofuse.registration.view_points import sampled_points
 
 # Smallest difference between the scores of different poses, as a fraction of the points.
 MIN_LEAD = 0.03
@@ -142,8 +143,8 @@ class Comparison:
     ) -> Comparison:
         """Prepare two views."""
         options = AgreementOptions() if options is None else options
-        there = ViewPoints.of(source, options.points), target, nearest_depth(target)
-        back = ViewPoints.of(target, options.points), source, nearest_depth(source)
+        there = sampled_points(source, options.points), target, nearest_depth(target)
+        back = sampled_points(target, options.points), source, nearest_depth(source)
         return cls((there, back), options)
 
     def at(self, T_target_source: Float64) -> Agreement:
@@ -231,7 +232,6 @@ def _one_way(
     options: AgreementOptions,
     log_albedos: Float32,
 ) -> Float64:
-    sampled = kernels.Points(points.points, points.normals, points.sigma, points.log_albedo)
     grid = view.projection
     image = kernels.Image(
         view.planes, view.plane_variance, view.albedo, nearest, grid.lookup, grid.frame
@@ -242,7 +242,7 @@ def _one_way(
 
     def work(a: int, b: int) -> Float64:
         return kernels.measure_agreement(
-            sampled, image, T, tolerance, log_albedos[0], log_albedos[1], a, b
+            points, image, T, tolerance, log_albedos[0], log_albedos[1], a, b
         )
 
     n = len(points.points)

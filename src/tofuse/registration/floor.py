@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float32, Float64
 from tofuse.kernels import search as kernels
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.view_points import ViewPoints
+from tofuse.registration.view_points import sampled_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -
 
     Its normal is within `max_tilt`, rad, of `down`.
     """
-    seen = ViewPoints.of(view, _POINTS)
+    seen = sampled_points(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)
     if len(p) < 20:
         return None

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.view_points import ViewPoints
+from tofuse.registration.view_points import sampled_points
 
 # Points of a view, and hypotheses in each round of RANSAC.
 _POINTS, _TRIED = 3000, 150
@@ -65,7 +65,7 @@ def detect_planes(
     sigmas, thickness
         Largest distance of an inlier: standard deviations, plus a fraction of its depth.
     """
-    seen = ViewPoints.of(view, _POINTS)
+    seen = sampled_points(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)
     within = sigmas * seen.sigma.astype(float) + thickness * p[:, 2]
     weight = 1 / within**2

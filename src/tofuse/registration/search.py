@@ -30,7 +30,7 @@ from tofuse.registration.floor import Floor, find_floors
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.rough import with_rough_planes
-from tofuse.registration.view_points import ViewPoints
+from tofuse.registration.view_points import sampled_points
 
 Mode = Literal["auto", "both", "planar", "full"]
 
@@ -354,7 +354,7 @@ def _prepare(view: PreparedView) -> _View:
     length = np.maximum(np.sqrt((abc * abc).sum(-1)), 1e-12)
     grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
     grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
-    seen = ViewPoints.of(view, _SEEN)
+    seen = sampled_points(view, _SEEN)
     albedo = _low_pass(np.where(known, view.albedo[v, u, 0], np.nan), _BLUR / spacing)
     at = seen.points[:, :2] / seen.points[:, 2:] - (x[0], y[0])
     j, i = (at / spacing).round().astype(int).T

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from tofuse.arrays import Float32, Float64, Intp
+from tofuse.arrays import Float64, Intp
 from tofuse.kernels.alignment import NORMAL, POINT, POINT_ALBEDO, SIGMA
+from tofuse.kernels.search import ViewPoints
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import points_of
 
 
-@dataclass(frozen=True, eq=False)
-class ViewPoints:
-    """Points on the planes of a view.
-
-    Attributes
-    ----------
-    points, normals
-        (N, 3) m, and unit, away from the camera.
-    sigma
-        (N,) of their z, m.
-    log_albedo
-        (N,) log albedo, NaN where unknown.
-    """
-
-    points: Float32
-    normals: Float32
-    sigma: Float32
-    log_albedo: Float32
-
-    @classmethod
-    def of(cls, view: PreparedView, count: int) -> ViewPoints:
-        """Take about `count` pixels that have a plane, evenly over the image."""
-        there = view.planar_fraction * view.z.size
-        packed = points_of(view, max(1, round(float(np.sqrt(there / count)))))
-        points = np.ascontiguousarray(packed[:, POINT : POINT + 3])
-        return cls(
-            points,
-            np.ascontiguousarray(packed[:, NORMAL : NORMAL + 3]),
-            packed[:, SIGMA] * points[:, 2],
-            packed[:, POINT_ALBEDO].copy(),
-        )
+def sampled_points(view: PreparedView, count: int) -> ViewPoints:
+    """Return about `count` pixels that have a plane, evenly over the image."""
+    there = view.planar_fraction * view.z.size
+    packed = points_of(view, max(1, round(float(np.sqrt(there / count)))))
+    points = np.ascontiguousarray(packed[:, POINT : POINT + 3])
+    return ViewPoints(
+        points,
+        np.ascontiguousarray(packed[:, NORMAL : NORMAL + 3]),
+        packed[:, SIGMA] * points[:, 2],
+        packed[:, POINT_ALBEDO].copy(),
+    )
 
 
 def landing_pixels(view: PreparedView, points: Float64) -> Intp:
