@@ -47,7 +47,7 @@ def test_what_is_listed_compiles(tmp_path: Path) -> None:
     """From the cache of these tests, or anew: types that a kernel can't take would fail."""
     words = [sys.executable, "-m", "tofuse.kernels.ahead"]
     subprocess.run(words, check=True, capture_output=True)
-    assert (Path(jit.cache_folder()) / "compiled").exists()
+    assert ahead.compiled_marker().exists()
 
 
 def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
@@ -97,7 +97,7 @@ def test_only_a_first_run_starts_a_second_process(
     with pytest.raises(RuntimeError), ahead.compiling_in_background():
         raise RuntimeError
     assert [p.ended for p in started] == [2]
-    (tmp_path / "compiled").touch()
+    ahead.compiled_marker().touch()
     with ahead.compiling_in_background():
         pass
     assert len(started) == 1

@@ -8,6 +8,7 @@ records it again.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import subprocess
 import sys
@@ -23,7 +24,6 @@ from tofuse.kernels import jit
 from tofuse.kernels.cores import usable_cores
 
 _LIST = Path(__file__).with_name("signatures.txt")
-_DONE = "compiled"
 _DTYPES = {
     "b1": "boolean",
     "i1": "int8",
@@ -54,7 +54,7 @@ def compiling_in_background() -> Iterator[None]:
 
 
 def _start() -> subprocess.Popen[bytes] | None:
-    if usable_cores() < 2 or (Path(jit.cache_folder()) / _DONE).exists():
+    if usable_cores() < 2 or compiled_marker().exists():
         return None
     try:
         return subprocess.Popen(
@@ -82,7 +82,19 @@ def compile_listed() -> None:
     for name, types in reversed(signatures()):
         module, function = name.rsplit(".", 1)
         getattr(import_module(f"tofuse.kernels.{module}"), function).compile(types)
-    (Path(jit.cache_folder()) / _DONE).touch()
+    compiled_marker().touch()
+
+
+def compiled_marker() -> Path:
+    """Return the file that exists once the listed kernels of this installation are in the cache.
+
+    Its name contains what Numba's cache depends on: paths, sizes and times of the source files.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        stat = file.stat()
+        digest.update(f"{file} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return Path(jit.cache_folder()) / f"compiled-{digest.hexdigest()[:16]}"
 
 
 def signature_line(name: str, types: tuple[Any, ...]) -> str:

@@ -24,7 +24,6 @@ from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.geometry import se3
 from tofuse.kernels import moving_objects as kernels
 from tofuse.kernels.median import median
-from tofuse.kernels.moving_objects import Cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
@@ -91,12 +90,27 @@ _LIMITS = kernels.Limits(
 
 
 @dataclass(frozen=True, eq=False)
+class _Cells:
+    """State of the cells of a view, see `kernels.moving_objects.Cells`."""
+
+    depth: Float32
+    odds: Float32
+    moving: Bool
+    tracked: UInt8
+
+    @property
+    def arrays(self) -> kernels.Cells:
+        """The same for kernels."""
+        return kernels.Cells(self.depth, self.odds, self.moving, self.tracked)
+
+
+@dataclass(frozen=True, eq=False)
 class _Last:
     """The previous view, its pose, and its cells."""
 
     view: PreparedView
     T_world_camera: Float64
-    cells: Cells
+    cells: _Cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +119,7 @@ class PairUpdate:
 
     last: _Last
     reference: int
-    cells: Cells
+    cells: _Cells
     scale: float | None
 
 
@@ -223,7 +237,7 @@ class MovingObjects:
     def __init__(self, max_references: int = _MAX_REFERENCES) -> None:
         self._max_references = max_references
         self._last: _Last | None = None
-        self._references: OrderedDict[int, Cells] = OrderedDict()
+        self._references: OrderedDict[int, _Cells] = OrderedDict()
         self._scales: deque[float] = deque(maxlen=_SCALES)
 
     def reset(self) -> None:
@@ -251,7 +265,13 @@ class MovingObjects:
         moving = np.empty(_cell_shape(shape, stride), np.bool_)
         T = np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted)
         kernels.predict(
-            _sampled(view), _sampled(last.view), last.cells, T, 2 * _MAX_MOTION, _DILATION, moving
+            _sampled(view),
+            _sampled(last.view),
+            last.cells.arrays,
+            T,
+            2 * _MAX_MOTION,
+            _DILATION,
+            moving,
         )
         return _pixels(moving, shape, stride)
 
@@ -308,7 +328,7 @@ class MovingObjects:
         else:
             evidence, evidence_then = now.odds, then.odds
         detect = 0.0 if suspected else _DETECT
-        now, segments = self._segmented(now._replace(tracked=tracked), evidence, detect)
+        now, segments = self._segmented(replace(now, tracked=tracked), evidence, detect)
         then, _ = self._segmented(then, evidence_then, detect)
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
@@ -341,7 +361,7 @@ class MovingObjects:
         if pair.scale is not None:
             self._scales.append(pair.scale)
 
-    def _reference(self, reference: PreparedView) -> Cells:
+    def _reference(self, reference: PreparedView) -> _Cells:
         """Return the cells of a reference so far."""
         shape = _cell_shape(reference.z.shape, _stride(reference))
         known = self._references.get(reference.index)
@@ -351,16 +371,16 @@ class MovingObjects:
             stride = _stride(reference)
             none = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
-            known = Cells(none, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
+            known = _Cells(none, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
         return known
 
-    def _store(self, index: int, cells: Cells) -> None:
+    def _store(self, index: int, cells: _Cells) -> None:
         self._references[index] = cells
         self._references.move_to_end(index)
         while len(self._references) > self._max_references:
             self._references.popitem(last=False)
 
-    def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[Cells, Bool]:
+    def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[_Cells, Bool]:
         """Propagate the cells of the last view to this one; and which surfaces are new there."""
         last, stride = self._last, _stride(view)
         shape = _cell_shape(view.z.shape, stride)
@@ -368,24 +388,24 @@ class MovingObjects:
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, before = np.eye(4), view
-            cells = Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
+            cells = _Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
         else:
             T, before = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
             cells = last.cells
         T = np.ascontiguousarray(T)
         # At the rim of what is tracked a cell may be that of an adjacent surface.
         inner = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
-        cells = cells._replace(tracked=inner)
+        last_cells = replace(cells, tracked=inner).arrays
         sampled, sampled_before = _sampled(view), _sampled(before)
 
         def work(a: int, b: int) -> None:
             kernels.propagate(
-                sampled, sampled_before, cells, T, _MAX_MOTION, _PRIOR_ODDS,
+                sampled, sampled_before, last_cells, T, _MAX_MOTION, _PRIOR_ODDS,
                 depth, odds, tracked, arrived, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return Cells(depth, odds, odds > _DETECT, tracked), arrived
+        return _Cells(depth, odds, odds > _DETECT, tracked), arrived
 
     def _scale(
         self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
@@ -418,21 +438,21 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return outcome, llr
 
-    def _updated(self, cells: Cells, evidence: Float32) -> Cells:
+    def _updated(self, cells: _Cells, evidence: Float32) -> _Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(_PRIOR_ODDS)
         odds = prior + np.float32(_DECAY) * (cells.odds - prior) + evidence
         max_odds = _DETECT + 2 * _MAX_EVIDENCE
-        return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
+        return replace(cells, odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
-    def _segmented(self, cells: Cells, evidence: Float32, detect: float) -> tuple[Cells, int]:
+    def _segmented(self, cells: _Cells, evidence: Float32, detect: float) -> tuple[_Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
         `evidence` is that of this frame: segments are not extended over what agrees in it.
         """
         odds, depth = cells.odds, cells.depth
         certain = odds > detect
-        none = cells._replace(moving=np.zeros(odds.shape, np.bool_))
+        none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
             return none, 0
         likely = (odds > _EXTEND).view(np.uint8)
@@ -454,7 +474,7 @@ class MovingObjects:
         dilated = cv2.dilate(moving.view(np.uint8), _NEIGHBOURS) > 0
         dilated |= (near > 0) & (np.abs(near - depth) <= np.float32(_MAX_MOTION) * near)
         moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
-        return cells._replace(odds=odds, moving=moving), int(kept.sum())
+        return replace(cells, odds=odds, moving=moving), int(kept.sum())
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
         """Add the rest of surfaces of which more than half moves.
