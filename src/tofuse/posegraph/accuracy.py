@@ -39,6 +39,9 @@ _HIDDEN = 1.6
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
+# Number of pairs over degenerate frames that are aligned again, the shortest first: at the end of a
+# long one the camera came back, which a loop closure verifies.
+_MAX_SPANNING = 2000
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = ProjectiveOptions()
 # Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
@@ -196,19 +199,25 @@ def degenerate_directions(
     degenerate = np.array(sorted(unobservable), np.intp)
     out: list[Float64] = []
     compared: list[int] = []  # edges to align again
+    spanning: list[tuple[int, int]] = []  # those over degenerate frames, and their length
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
+        if (i, j) in stated:
+            out.append(_NONE)
+            continue
         # A perturbation of i is the opposite one of j, by the adjoint.
         there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
         here = unobservable.get(j, _NONE)
-        out.append(_NONE if (i, j) in stated else np.concatenate([there, here]))
-        if (i, j) in stated:
-            continue
+        known = np.concatenate([there, here])
         if (i, j) in own:
-            out[-1] = out[-1] if len(here) else _NONE
+            known = known if len(here) else _NONE
         elif i in views and j in views:
-            first, last = np.searchsorted(degenerate, (min(i, j), max(i, j) + 1))
-            compared += [len(out) - 1] if last > first else []
+            if len(known):
+                compared.append(len(out))
+            elif np.diff(np.searchsorted(degenerate, sorted((i, j)))).any():
+                spanning.append((abs(j - i), len(out)))
+        out.append(known)
+    compared += [k for _, k in sorted(spanning)[:_MAX_SPANNING]]
 
     def work(start: int, stop: int) -> None:
         for k in compared[start:stop]:
