@@ -16,9 +16,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile kernels once where several processes share the tests; each would compile its own."""
     several = getattr(config.option, "numprocesses", None)
     if several and not hasattr(config, "workerinput") and not config.option.collectonly:
-        from compiled_kernels import compile_kernels
+        from tofuse.kernels import ahead
 
-        compile_kernels()
+        if not ahead.compiled_marker().exists():
+            with ahead.compiling_in_background():
+                ahead.compile_listed(ahead.signatures())
 
 
 @pytest.fixture(scope="session")

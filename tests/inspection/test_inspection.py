@@ -13,6 +13,7 @@ import pytest
 
 import made_rooms
 import tofuse
+from coarse_steps import without_multipath
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
 from tofuse.files.geometry_record import GeometryRecord
@@ -496,16 +497,6 @@ def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(d
 
 def test_depth_errors_that_no_lens_explains_are_not_blamed_on_it(tmp_path) -> None:
     """In a corridor few surfaces are seen, and errors of the depth bend them."""
-    from tofuse.lab.simulation.effects import Effects
-    from tofuse.lab.simulation.record import simulate
-
-    folder = simulate(
-        "corridor",
-        tmp_path / "corridor",
-        camera="ifm-o3r",
-        seed=10,
-        every=12,
-        effects=Effects(multipath=False),
-    )
-    found = tofuse.inspect(tofuse.open(folder)).findings
+    recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)
+    found = tofuse.inspect(recording).findings
     assert not {f.code for f in found if f.severity == "severe"}

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.geometry import se3
 from tofuse.odometry.keyframes import Keyframes
@@ -115,22 +116,10 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
 def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and what stands before it is out of reach."""
     from tofuse.evaluation.trajectory import displacement
-    from tofuse.lab.simulation.effects import Effects
-    from tofuse.lab.simulation.record import simulate
     from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
-    from tofuse.recordings.open import open_recording
 
-    folder = simulate(
-        "rail",
-        tmp_path / "rail",
-        camera="ifm-o3r",
-        seed=10,
-        every=20,
-        frames=16,
-        effects=Effects(multipath=False),
-    )
-    recording = open_recording(folder)
+    recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
     config = changed(from_method("default"), {"refinement": {"part": "none"}}, where="test")
     result = reconstruct(recording, config)
     assert recording.reference is not None
@@ -142,21 +131,10 @@ def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
 def test_starts_along_a_corridor_find_what_the_prediction_missed(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.evaluation.trajectory import displacement
-    from tofuse.lab.simulation.effects import Effects
-    from tofuse.lab.simulation.record import simulate
     from tofuse.pipeline.config import from_method
     from tofuse.pipeline.reconstruct import reconstruct
-    from tofuse.recordings.open import open_recording
 
-    folder = simulate(
-        "corridor",
-        tmp_path / "corridor",
-        camera="sr4000",
-        seed=10,
-        every=12,
-        effects=Effects(multipath=False),
-    )
-    recording = open_recording(folder)
+    recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)
     result = reconstruct(recording, from_method("default"))
     assert recording.reference is not None
     assert result.has_pose.all()

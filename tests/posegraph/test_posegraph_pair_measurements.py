@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-import tofuse
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.pair_measurements import measured_pairs
-from tofuse.posegraph.view_store import PosedView
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 
-@pytest.fixture(scope="module")
-def views(room_recording):
-    recording = tofuse.open(room_recording)
-    prepared = [prepare_view(frame, SurfaceOptions()) for frame in recording]
-    truth = recording.reference
-    return [PosedView(v, T) for v, T in zip(prepared, truth, strict=True)], truth
-
-
-def test_pairs_measure_the_true_motion_from_poses_that_are_off(views) -> None:
-    posed, truth = views
+def test_pairs_measure_the_true_motion_from_poses_that_are_off(posed_views) -> None:
+    posed, truth = posed_views
     rng = np.random.default_rng(0)
     start = truth @ se3.exp(0.01 * rng.standard_normal((len(truth), 6)))
     graph = measured_pairs(posed, start)
@@ -40,8 +28,8 @@ def test_pairs_measure_the_true_motion_from_poses_that_are_off(views) -> None:
     assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12
 
 
-def test_threads_change_nothing(views) -> None:
-    posed, truth = views
+def test_threads_change_nothing(posed_views) -> None:
+    posed, truth = posed_views
     found = []
     for count in (1, 2):
         with threads(count):

@@ -12,7 +12,7 @@ import hashlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -77,9 +77,9 @@ def signatures() -> list[tuple[str, tuple[Any, ...]]]:
     return found
 
 
-def compile_listed() -> None:
-    """Compile the listed kernels in reverse order, or load them from the cache."""
-    for name, types in reversed(signatures()):
+def compile_listed(listed: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
+    """Compile all of `signatures`, in the given order, or load them from the cache."""
+    for name, types in listed:
         module, function = name.rsplit(".", 1)
         getattr(import_module(f"tofuse.kernels.{module}"), function).compile(types)
     compiled_marker().touch()
@@ -131,4 +131,4 @@ def _text_of(kind: Any) -> str:
 
 
 if __name__ == "__main__":
-    compile_listed()
+    compile_listed(reversed(signatures()))

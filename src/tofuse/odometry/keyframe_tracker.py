@@ -216,7 +216,7 @@ class KeyframeTracker(Tracker):
 
 
 def _inflation(accepted: Hypothesis) -> float:
-    """Odds that are twice as high as usual double the standard deviation."""
+    """Factor of the standard deviations: odds twice as high as usual double them."""
     return float(np.exp(min(accepted.assessment.excess, 5.0)))
 
 

@@ -78,7 +78,7 @@ class HypothesisSelector:
         self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
     ) -> Iterator[Hypothesis]:
         """Align from starts along the degenerate directions, within the gate."""
-        T = hypothesis.T_component_camera
+        T, view, r = hypothesis.T_component_camera, hypothesis.view, hypothesis.reference
         for direction in hypothesis.aligned.unobservable * UNITS:
             lengths = np.linalg.norm(direction.reshape(2, 3), axis=1)
             step = direction / np.max(lengths / (DISTINCT_M, DISTINCT_RAD))
@@ -87,7 +87,6 @@ class HypothesisSelector:
                     start = T @ se3.exp(sign * k * step)
                     if self._motion.gate_violation(start, now):
                         break
-                    r, view = hypothesis.reference, hypothesis.view
                     other = hypotheses.realigned(start, view, r, predicted=True)
                     if other.assessment.usual and not self._violates_gate(other, now):
                         yield other

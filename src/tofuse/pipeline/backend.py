@@ -210,7 +210,7 @@ class BackEnd:
         if graph.loop.any() or sensors:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
-                optimisation, confirmed = self._optimise(loops, sensors, sequential)
+                optimisation, confirmed = self._optimise(graph, loops, sensors)
                 if sensors and graph.loop.any():  # the poses that loops are compared with
                     without_loops = with_sensors(tracked, sensors)
                     guided = self._config.optimiser.optimise(without_loops).graph.poses
@@ -225,30 +225,29 @@ class BackEnd:
         return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)
 
     def _optimise(
-        self, loops: Sequence[ClosedLoop], sensors: SensorPriors, sequential: Float64
+        self, graph: PoseGraph, loops: Sequence[ClosedLoop], sensors: SensorPriors
     ) -> tuple[Optimisation, frozenset[int]]:
-        """Optimise the poses; again if neighbouring views no longer agree.
+        """Optimise a graph with loops; again if neighbouring views no longer agree.
 
         The registrations between those get their usual uncertainty: see `worse_neighbours`.
         Returns the frames of these registrations as well.
         """
+        row = {int(index): k for k, index in enumerate(graph.ids)}
         suspects = frozenset(
             e.record.index for e in self._posed if e.step is not None and e.step.inflation > 1
         )
         confirmed: frozenset[int] = frozenset()
         while True:
-            graph = with_sensors(self.graph(loops, confirmed=confirmed), sensors)
-            optimisation = self._config.optimiser.optimise(graph)
-            row = {int(index): k for k, index in enumerate(graph.ids)}
+            optimisation = self._config.optimiser.optimise(with_sensors(graph, sensors))
             views = self._kept.views.of(row) if suspects else []
             at = [row[v.index] for v in views]
-            poses = optimisation.graph.poses
-            worse = worse_neighbours(views, sequential[at], poses[at], suspects)
-            between = {k for i, j in worse for k in range(i + 1, j + 1)}
-            if not between & suspects:
+            before, after = graph.poses[at], optimisation.graph.poses[at]
+            worse = worse_neighbours(views, before, after, suspects)
+            right = suspects.intersection(k for i, j in worse for k in range(i + 1, j + 1))
+            if not right:
                 return optimisation, confirmed
-            confirmed |= between & suspects
-            suspects -= between
+            confirmed, suspects = confirmed | right, suspects - right
+            graph = self.graph(loops, confirmed=confirmed)
 
     def _search_loops_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
         """Search loops again once those found have corrected the poses in between.

@@ -1,0 +1,20 @@
+"""Simulated recordings with large steps from frame to frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+
+
+def without_multipath(
+    folder: Path, scene: str, camera: str, every: int, frames: int | None = None
+) -> Recording:
+    """A scene seen from every `every`-th place of its path, with all errors but multipath."""
+    effects = Effects(multipath=False)
+    out = folder / scene
+    simulate(scene, out, camera=camera, seed=10, every=every, frames=frames, effects=effects)
+    return open_recording(out)
