@@ -138,6 +138,27 @@ def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_pat
         (0, 2, False, False),
         (1, 2, True, True),
     ]
+    (apart,) = [c.result for c in found.components if not c.connected]
+    off = se3.inverse(TRUE[0]) @ TRUE
+    assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
+
+
+def test_loops_of_an_earlier_merge_are_registered_again(both, results, tmp_path) -> None:
+    write_result(both, OutputFolder(tmp_path / "pair"))
+    sessions = read_sessions([results["elsewhere"], tmp_path / "pair"], 2, Silent())
+    across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < 12 <= p.j]
+    assert len(across) >= 2
+    assert sessions[0].links == ()
+    assert set(sessions[1].links) == set(across)
+    # No view may be a candidate by its overlap.
+    config = quick(merged_config(sessions))
+    config = replace(config, loops=replace(config.loops, per_view=0))
+    found = merge_sessions(sessions, config, threads=2)
+    (apart,) = [c.result for c in found.components if not c.connected]
+    closed = {(p.i - 12, p.j - 12) for p in apart.diagnostics.loops if p.accepted}
+    assert closed == set(across)
+    codes = {reason.code for reason in apart.diagnostics.reasons}
+    assert "loop_rejected" not in codes
 
 
 def test_threads_change_nothing(both, results) -> None:

@@ -48,7 +48,7 @@ def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
 def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -> None:
     """With noise alone, which the covariance knows in full."""
-    monkeypatch.setattr(accuracy, "_HIDDEN", 1.0)
+    monkeypatch.setattr(accuracy, "HIDDEN", 1.0)
     rng = np.random.default_rng(11)
     solve = LevenbergMarquardt(robust="none").optimise
     found = np.array(
@@ -77,7 +77,7 @@ def test_what_the_recording_shows_is_added() -> None:
     more = accuracy_of(walk(), Shown(0.03, 0.02, 0.04), 1.0)
     assert more.position_m > 0.05
     assert more.position_m == pytest.approx(
-        np.hypot(plain.position_m, accuracy._HIDDEN * 0.05), rel=1e-6
+        np.hypot(plain.position_m, accuracy.HIDDEN * 0.05), rel=1e-6
     )
     assert more.rotation_rad > plain.rotation_rad
     bent = accuracy_of(walk(), Shown(calibration_m=0.2, calibration_rad=0.1), 1.0)
@@ -90,7 +90,7 @@ def test_what_the_recording_shows_is_added() -> None:
 
 def test_halves_of_the_images_replace_a_covariance_that_is_too_small() -> None:
     plain = accuracy_of(walk(), Shown(), 1.0)
-    stated = plain.position_m / accuracy._HIDDEN
+    stated = plain.position_m / accuracy.HIDDEN
     assert accuracy_of(walk(), Shown(split_m=0.3 * stated), 1.0) == plain
     one, more = (accuracy_of(walk(), Shown(split_m=k * stated), 1.0) for k in (2, 4))
     # They are rms errors, and a bound on them is larger.

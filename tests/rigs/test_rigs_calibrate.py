@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Its accuracy is that of the rig, and not of one camera that jumps from place to place.
     told = json.loads((tmp_path / "model" / "run.json").read_text())
     assert told["verdict"] == "good"
-    assert told["accuracy"]["position_m"] < 0.004
+    assert 0.005 < told["accuracy"]["position_m"] < 0.03
     assert not told["reasons"]
     report = (tmp_path / "model" / "report.html").read_text()
     assert '<section id="rig">' in report
@@ -150,7 +151,7 @@ def test_a_knocked_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 0
     rig = read_rig(out)
     moved = rig.cameras[2].T_rig_camera @ se3.exp([0.03, 0, 0, 0, np.radians(1.5), 0])
-    last = RigCamera("cam2", "", moved, rig.cameras[2].covariance)
+    last = replace(rig.cameras[2], T_rig_camera=moved)
     write_rig(tmp_path / "knocked.json", Rig((*rig.cameras[:2], last)))
     capsys.readouterr()
     assert main(["rig", "check", str(tmp_path / "knocked.json"), *cameras]) == 3
@@ -162,7 +163,7 @@ def test_a_rig_that_contradicts_the_images_is_marked(tmp_path: Path) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]
     knocked = relative(STANDS)
-    knocked[1] = knocked[1] @ se3.exp([0.03, 0, 0, 0, 0, 0])
+    knocked[1] = knocked[1] @ se3.exp([0.1, 0, 0, 0, 0, 0])
     rows = [RigCamera(f"cam{k}", "", T, 1e-8 * np.eye(6)) for k, T in enumerate(knocked)]
     write_rig(tmp_path / "rig.json", Rig(tuple(rows)))
     out = tmp_path / "model"

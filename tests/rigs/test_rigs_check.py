@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig, RigCamera
-from tofuse.rigs.check import compare
+from tofuse.rigs.check import compare, compare_in_scene
 
 SIGMA = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
 
@@ -49,6 +49,25 @@ def test_the_camera_that_was_knocked_is_named(which: int, by: list[float]) -> No
     assert motion.distance_m == pytest.approx(np.linalg.norm(by[:3]), abs=0.003)
     assert motion.angle_rad == pytest.approx(np.linalg.norm(by[3:]), abs=np.radians(0.12))
     assert motion.chance < 0.01
+
+
+def test_systematic_errors_recur_in_the_same_scene() -> None:
+    """A camera that moved by 5 mm is found there; elsewhere systematic errors might explain it."""
+    rng = np.random.default_rng(4)
+    before, after = truth(), truth()
+    after[2] = after[2] @ se3.exp([0.005, 0, 0, 0, 0, 0])
+    rigs = []
+    for poses in (before, after):
+        rig = measured(poses, rng)
+        cameras = [
+            replace(c, covariance=c.covariance + 1e-4 * np.eye(6), random_covariance=c.covariance)
+            for c in rig.cameras
+        ]
+        rigs.append(replace(rig, cameras=tuple(cameras)))
+    assert not any(m.moved for m in compare(*rigs))
+    found = compare_in_scene(*rigs)
+    assert [m.name for m in found if m.moved] == ["2"]
+    assert found[2].chance < 0.01 < found[2].chance_elsewhere
 
 
 def test_a_camera_that_can_not_be_placed_is_not_checked() -> None:

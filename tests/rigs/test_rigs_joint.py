@@ -4,32 +4,40 @@ The scene is made of planes that are rendered exactly, with noise: an open box t
 look into from four sides.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from scipy.stats import chi2
 
 from rig_scene import looked_at
 from tofuse.geometry import se3
 from tofuse.lab.simulation.rig import around, relative
 from tofuse.posegraph.view_store import KeptView
+from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
-from tofuse.rigs.joint import View, disagreements, refine_together
+from tofuse.rigs.joint import JointOptions, View, disagreements, refine_together
 
 
-def rig(seed: int, offset: float = 0.0) -> tuple[list[View], np.ndarray]:
+def distorted(frame: RangeFrame, by: np.ndarray) -> RangeFrame:
+    """Scale the ranges of an image by a field that varies smoothly over it."""
+    v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
+    x, y = 2 * u / u.max() - 1, 2 * v / v.max() - 1
+    field = np.tensordot(by, np.stack([np.ones_like(x), x, y, x * y]), 1)
+    return replace(frame, depth=(frame.depth * (1 + field)).astype(np.float32))
+
+
+def rig(
+    seed: int, offset: float = 0.0, distortion: np.ndarray | None = None
+) -> tuple[list[View], np.ndarray]:
     rng = np.random.default_rng([seed, 3])
     T = around((0, 0, 0.2), 1.3, 1.3, 4)
-    views = [
-        View(
-            k,
-            0,
-            KeptView.of(
-                prepare_view(looked_at(T[k], rng, offset if k == 2 else 0.0), SurfaceOptions()),
-                4000,
-            ),
-        )
-        for k in range(4)
-    ]
+    views = []
+    for k in range(4):
+        frame = looked_at(T[k], rng, offset if k == 2 else 0.0)
+        if distortion is not None:
+            frame = distorted(frame, distortion[k])
+        views.append(View(k, 0, KeptView.of(prepare_view(frame, SurfaceOptions()), 4000)))
     return views, np.stack(relative(T))
 
 
@@ -61,17 +69,39 @@ def test_covariance_is_of_the_size_of_the_errors() -> None:
         placed, truth = found(seed)
         for k in range(1, 4):
             e = se3.log(se3.inverse(placed.poses[k]) @ truth[k])
-            squares.append(e @ np.linalg.solve(placed.covariance[k][:6, :6], e))
+            squares.append(e @ np.linalg.solve(placed.random_covariance[k][:6, :6], e))
     # Chi-square with 6 degrees of freedom has the median 5.3.
     assert 1.5 < np.median(squares) < 12.0
 
 
+def test_systematic_errors_of_the_ranges_are_in_the_covariance() -> None:
+    """Each camera's ranges are distorted smoothly, as by multipath: the poses absorb it."""
+    rng = np.random.default_rng(8)
+    by_random, by_all = [], []
+    for seed in range(8):
+        views, truth = rig(seed, distortion=0.0025 * rng.normal(size=(4, 4)))
+        placed = refine_together(views, disturbed(truth, seed))
+        for k in range(1, 4):
+            e = se3.log(se3.inverse(placed.poses[k]) @ truth[k])
+            for found, C in ((by_random, placed.random_covariance), (by_all, placed.covariance)):
+                found.append(e @ np.linalg.solve(C[k][:6, :6], e))
+    assert np.median(by_random) > 20
+    assert np.mean(np.array(by_all) < chi2.ppf(0.95, 6)) > 0.85
+    assert np.median(by_all) > 0.5
+
+
 def test_the_depth_offset_of_one_camera_is_found() -> None:
     views, truth = rig(1, offset=0.008)
-    placed = refine_together(views, disturbed(truth, 1))
+    no_multipath = JointOptions(systematic=0)
+    placed = refine_together(views, disturbed(truth, 1), no_multipath)
     sigma = np.sqrt(placed.covariance[2][6, 6])
     assert abs(-placed.offsets[2] - 0.008) < max(3 * sigma, 0.002)
     assert sigma < 0.005
+    # With it the images hardly constrain the offset, so that it stays near its prior.
+    placed = refine_together(views, disturbed(truth, 1))
+    sigma = np.sqrt(placed.covariance[2][6, 6])
+    assert 0.01 < sigma < 0.05
+    assert 0 < -placed.offsets[2] < 0.008
 
 
 def test_surfaces_disagree_more_where_a_camera_is_wrong() -> None:

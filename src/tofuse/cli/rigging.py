@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
 from tofuse.results.output import plain
 from tofuse.rigs.calibrate import Calibration, loosest
-from tofuse.rigs.check import Moved
+from tofuse.rigs.check import LEVEL, Moved
 
 
 def tables(rig: Rig) -> list[Table]:
@@ -67,7 +67,10 @@ def _outcome(camera: Moved) -> str:
     by = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
     sigma = f"1 sigma: {1000 * camera.sigma_m:.1f} mm, {np.degrees(camera.sigma_rad):.2f} deg"
     if camera.moved:
-        return f"moved by {by} ({sigma}; p = {camera.chance:.1g})"
+        text = f"moved by {by} ({sigma}; p = {camera.chance:.1g})"
+        if camera.chance_elsewhere > LEVEL:
+            text += ", unless the scene is not the one of the calibration"
+        return text
     if camera.sigma_m == 0:
         return "unchanged: reference for the others"
     return f"unchanged, within {by} ({sigma})"
@@ -85,6 +88,7 @@ def check_json(cameras: Sequence[Moved]) -> dict[str, Any]:
             "sigma_m": c.sigma_m,
             "sigma_rad": c.sigma_rad,
             "chance": c.chance,
+            "chance_elsewhere": c.chance_elsewhere,
             "reason": c.reason,
         }
         for c in cameras

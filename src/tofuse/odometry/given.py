@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from tofuse.arrays import Float64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
@@ -53,11 +55,13 @@ class GivenPoses(Bounded, Odometry):
 
 
 class _GivenTracker(Tracker):
-    def __init__(self, options: GivenPoses) -> None:
+    """See `GivenPoses`. By default the first frame with a pose defines the component's frame."""
+
+    def __init__(self, options: GivenPoses, T_component_world: Float64 | None = None) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
         self._objects = MovingObjects()
-        self._T_component_world: Float64 | None = None
+        self._T_component_world = T_component_world
 
     def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
@@ -119,12 +123,16 @@ class StatedPose:
         (4, 4); None without a pose.
     component
         Number of the component.
+    covariance
+        (6, 6) of its right perturbation, m and rad, relative to the first pose of the component;
+        None if unknown.
     """
 
     status: Status
     reason: str
     T_component_camera: Float64 | None = None
     component: int = 0
+    covariance: Float64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +157,8 @@ class StatedPoses(Odometry):
         return _StatedTracker(self)
 
 
+# m^2 and rad^2: keeps the covariance of the first frame invertible.
+_MIN_VARIANCE = np.array([1e-10] * 6)
 _UNKNOWN = StatedPose("lost", "no pose was given")
 
 
@@ -171,10 +181,47 @@ class _StatedTracker(Tracker):
         if stated.T_component_camera is None:
             return Step("lost", stated.reason, None)
         if stated.component not in self._trackers:
-            self._trackers[stated.component] = self._odometry.options.start(0)
+            # Another session of the component may have begun elsewhere.
+            self._trackers[stated.component] = _GivenTracker(self._odometry.options, np.eye(4))
         tracker = self._trackers[stated.component]
         step = tracker.push(frame, stated.T_component_camera, surface)
-        return replace(step, status=stated.status, reason=stated.reason, component=stated.component)
+        registration = self._constrained(step, stated)
+        return replace(
+            step,
+            status=stated.status,
+            reason=stated.reason,
+            component=stated.component,
+            registration=registration,
+        )
+
+    def _constrained(self, step: Step, stated: StatedPose) -> Registration | None:
+        """Return the registration of a frame; if degenerate, the relative pose of the result.
+
+        The refinement of the earlier result may have constrained it by other views.
+        """
+        found = step.registration
+        if found is None or not len(found.unobservable) or step.reference is None:
+            return found
+        reference = self._odometry.stated[step.reference]
+        T, T_reference = stated.T_component_camera, reference.T_component_camera
+        if T is None or T_reference is None:
+            return found
+        if stated.covariance is None or reference.covariance is None:
+            return found
+        T_reference_frame = np.asarray(se3.inverse(T_reference) @ T, np.float64)
+        A = se3.adjoint(se3.inverse(T_reference_frame))
+        # An upper limit: errors that both poses share cancel.
+        C = A @ reference.covariance @ A.T + stated.covariance
+        alignment = self._odometry.options.views.alignment
+        prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
+        if np.linalg.eigvalsh(C / np.outer(prior, prior))[-1] > 1:
+            return found
+        return replace(
+            found,
+            T_target_source=T_reference_frame,
+            information=np.asarray(np.linalg.inv(C + np.diag(_MIN_VARIANCE)), np.float64),
+            unobservable=np.zeros((0, 6)),
+        )
 
     def _stated(self, frame: Frame) -> StatedPose:
         return self._odometry.stated.get(frame.index, _UNKNOWN)

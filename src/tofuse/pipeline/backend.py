@@ -320,7 +320,7 @@ class BackEnd:
                 self._config.tolerance_m,
                 kept.knows_errors,
                 refined.refinement,
-                frozenset((g.i, g.j) for g in self._given),
+                frozenset((g.i, g.j) for g in self._given if g.by_user),
                 tuple(d for index, d in kept.depths.items() if d > 0 and index in self._poses),
                 kept.ambiguity_m,
                 tuple(log.repeated),

@@ -79,7 +79,7 @@ class Evidence:
     refinement
         Result of the refinement of all views.
     given
-        Pairs (i, j) of given loops.
+        Pairs (i, j) of loops given by the user.
     depths
         Median radial range of every frame with a pose, m.
     ambiguity_m

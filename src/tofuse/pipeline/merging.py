@@ -28,6 +28,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import Tracked, described, push_frames
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
+from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
@@ -147,7 +148,8 @@ def merge_sessions(
     """Join, refine and fuse sessions; see `merge`."""
     progress = progress or Silent()
     recording, firsts = joined_recording(sessions)
-    mapper = Mapper(config, seed=seed, threads=threads, progress=progress)
+    links = _earlier_links(sessions, firsts)
+    mapper = Mapper(config, seed=seed, threads=threads, loops=links, progress=progress)
     progress.stage("reading sessions", len(recording))
     with threadpool_limits(1):
         for session, first in zip(sessions, firsts, strict=True):
@@ -180,6 +182,19 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
     path = " ".join(s.recording.path for s in sessions)
     joined = JoinedSource(sources, names)
     return Recording(joined, path, "+".join(formats), np.concatenate(indices)), firsts
+
+
+def _earlier_links(sessions: Sequence[Session], firsts: Sequence[int]) -> list[GivenLoop]:
+    """Return the loops that earlier merges closed between sessions, to be registered again.
+
+    The loop search selects the pairs with the largest overlap, which need not connect all sessions.
+    """
+    return [
+        GivenLoop(i + first, j + first, by_user=False)
+        for session, first in zip(sessions, firsts, strict=True)
+        if session.first == 0
+        for i, j in session.links
+    ]
 
 
 def _config_of(session: Session, first: int) -> Config:

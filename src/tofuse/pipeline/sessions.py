@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
+
+import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
@@ -44,6 +47,10 @@ class Session:
     stated
         By the index of a frame in the recording. Components are numbered over all sessions: joined
         components of one result have the same number and coordinate frame.
+    first
+        Index of its first frame in the result.
+    links
+        (i, j) frames in the result, of the loop closures between its sessions.
     """
 
     name: str
@@ -52,6 +59,8 @@ class Session:
     recording: Recording
     config: Config
     stated: Mapping[int, StatedPose]
+    first: int = 0
+    links: tuple[tuple[int, int], ...] = ()
 
     @property
     def posed(self) -> dict[int, StatedPose]:
@@ -102,18 +111,20 @@ def sessions_of(
     InputError
         If the result can't be merged with any other; see `read_sessions`.
     """
+    parts, links = _read_parts(folder, components)
     return [
-        _session(part, stated, folder, threads, progress)
-        for part, stated in _read_parts(folder, components)
+        replace(_session(part, stated, folder, threads, progress), links=links)
+        for part, stated in parts
     ]
 
 
 def _read_parts(
     folder: Path, components: int
-) -> list[tuple[StoredRecording, dict[int, StatedPose]]]:
+) -> tuple[list[tuple[StoredRecording, dict[int, StatedPose]]], tuple[tuple[int, int], ...]]:
     """Read the recordings of a result and the poses of their frames, by index in the recording.
 
-    Its components are numbered from `components`.
+    Also the loop closures between them, see `Session`. Its components are numbered from
+    `components`.
     """
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
@@ -124,11 +135,19 @@ def _read_parts(
     try:
         stated = _stated(folder, run, components)
         parts = list(stored_recordings(folder, run))
-        return [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
+        posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
+        return posed, _links(run, parts)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
         ) from error
+
+
+def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tuple[int, int], ...]:
+    """Return the loop closures (i, j) of a result between its sessions."""
+    begin = sorted(p.first for p in parts)
+    closed = ((int(p["i"]), int(p["j"])) for p in run.get("loops", ()) if p["accepted"])
+    return tuple((i, j) for i, j in closed if bisect_right(begin, i) != bisect_right(begin, j))
 
 
 def _session(
@@ -149,7 +168,7 @@ def _session(
         )
     config = _config(part.config, recording, folder, threads, progress)
     opening = locate_recording(part.opening, folder)
-    return Session(part.name, folder, opening, recording, config, stated)
+    return Session(part.name, folder, opening, recording, config, stated, part.first)
 
 
 def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
@@ -168,11 +187,19 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
             raise ValueError(f"frame {index} is {status!r}")
         if index in main:
             T, component = main[index]
-            found[index] = StatedPose(status, str(frame["reason"]), T, component)
+            C = _covariance(frame) if component == components else None
+            found[index] = StatedPose(status, str(frame["reason"]), T, component, C)
         else:
             reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
             found[index] = StatedPose("lost", reason)
     return found
+
+
+def _covariance(frame: Mapping[str, Any]) -> Float64 | None:
+    """Return the (6, 6) covariance of a frame's pose; None if it is unknown."""
+    stated = frame.get("covariance")
+    C = None if stated is None else np.array(stated, float).reshape(6, 6)
+    return None if C is None or not np.isfinite(C).all() else C
 
 
 def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:

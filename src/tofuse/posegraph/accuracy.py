@@ -35,7 +35,7 @@ _OPEN = np.array([30.0] * 3 + [10.0] * 3)
 _UNMEASURED_FRACTION = 0.05
 # Ratio of the total error to that in which views differ: errors of the sensor that all views of a
 # place share are invisible.
-_HIDDEN = 1.6
+HIDDEN = 1.6
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
@@ -297,8 +297,8 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
         first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
         return Accuracy(assessed=True, worst=first, unbounded=free)
     extra = shown.beyond(stated)
-    of_all = _HIDDEN * np.hypot(stated.bounds, extra)
-    single = _HIDDEN * np.hypot(stated.single, extra)
+    of_all = HIDDEN * np.hypot(stated.bounds, extra)
+    single = HIDDEN * np.hypot(stated.single, extra)
     of_each = np.where(unbounded[stated.positions], np.inf, single)
     worst = int(np.argmax((of_each / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
@@ -321,7 +321,7 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     more = np.repeat(shown.beyond(_Stated.by(graph)) ** 2 / 3, 3)
     C = pose_covariances(graph)
     C[1:] += np.diag(more)
-    return _HIDDEN**2 * C
+    return HIDDEN**2 * C
 
 
 def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, Bool]:

@@ -28,14 +28,16 @@ GIVEN_INFORMATION = np.diag([1e4] * 6)
 
 @dataclass(frozen=True, eq=False)
 class GivenLoop:
-    """A loop given by the user: frames i and j (indices, i < j) see the same place.
+    """A loop given by the user, or closed before: frames i and j (indices, i < j) see one place.
 
-    `T_i_j` is the (4, 4) relative pose, or None if it is to be registered.
+    `T_i_j` is the (4, 4) relative pose, or None if it is to be registered. `by_user` is False if an
+    earlier result closed it.
     """
 
     i: int
     j: int
     T_i_j: Float64 | None = None
+    by_user: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class ClosedLoop:
 def given_loop(
     loop: GivenLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
 ) -> ClosedLoop:
-    """Accept or reject a loop given by the user.
+    """Accept or reject a given loop.
 
     Parameters
     ----------
@@ -149,7 +151,7 @@ class LoopDetector(Protocol):
         seed
             Of the run's random numbers.
         given
-            Loops given by the user.
+            Given loops.
         views
             Prepared views of frames with a pose; each is stored before its frame is pushed.
         search

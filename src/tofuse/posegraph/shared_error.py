@@ -37,7 +37,7 @@ _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 
-def patches_of(points: Float32, surface: PreparedView) -> Int64:
+def patches_of(points: Float32 | Float64, surface: PreparedView) -> Int64:
     """Return the (N,) patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
     low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))

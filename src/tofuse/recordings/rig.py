@@ -39,6 +39,9 @@ class RigCamera:
         (4, 4) mounting pose.
     covariance
         (6, 6) of its right perturbation, m and rad.
+    random_covariance
+        (6, 6) the part of it due to errors that differ between two calibrations in the same scene,
+        without systematic ones such as multipath; None if unknown.
     time_offset_s
         The rig's time is the camera's timestamp plus this.
     depth_offset_m
@@ -51,6 +54,7 @@ class RigCamera:
     covariance: Float64
     time_offset_s: float = 0.0
     depth_offset_m: float = 0.0
+    random_covariance: Float64 | None = None
 
 
 @dataclass(frozen=True)
@@ -89,17 +93,7 @@ class Rig:
         """Return plain data, as stored in rig.json."""
         data: dict[str, Any] = {
             "schema": SCHEMA,
-            "cameras": [
-                {
-                    "name": c.name,
-                    "recording": c.recording,
-                    "T_rig_camera": c.T_rig_camera.tolist(),
-                    "covariance": c.covariance.ravel().tolist(),
-                    "time_offset_s": c.time_offset_s,
-                    "depth_offset_m": c.depth_offset_m,
-                }
-                for c in self.cameras
-            ],
+            "cameras": [_camera_data(c) for c in self.cameras],
             "disagreement": [
                 {"a": d.a, "b": d.b, "median_m": d.median_m, "pixels": d.pixels}
                 for d in self.disagreement
@@ -108,6 +102,20 @@ class Rig:
         if self.unplaced:
             data["unplaced"] = [{"name": n, "reason": r} for n, r in self.unplaced.items()]
         return data
+
+
+def _camera_data(camera: RigCamera) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "name": camera.name,
+        "recording": camera.recording,
+        "T_rig_camera": camera.T_rig_camera.tolist(),
+        "covariance": camera.covariance.ravel().tolist(),
+        "time_offset_s": camera.time_offset_s,
+        "depth_offset_m": camera.depth_offset_m,
+    }
+    if camera.random_covariance is not None:
+        data["random_covariance"] = camera.random_covariance.ravel().tolist()
+    return data
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
@@ -170,15 +178,22 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     T = check_pose(
         _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=str(path)
     )
-    C = _numbers(row.get("covariance", [0.0] * 36), (6, 6), f"{at}.covariance", path)
-    smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
-    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or smallest < -1e-6 * max(
-        np.abs(C).max(), 1e-9
-    ):
-        raise InputError(f"{at}.covariance is not a covariance", where=path, remedy=_REMEDY)
+    C = _covariance(row.get("covariance", [0.0] * 36), f"{at}.covariance", path)
+    random = row.get("random_covariance")
+    if random is not None:
+        random = _covariance(random, f"{at}.random_covariance", path)
     time = _number(row.get("time_offset_s", 0.0), _MAX_SECONDS, f"{at}.time_offset_s", path)
     depth = _number(row.get("depth_offset_m", 0.0), _MAX_METRES, f"{at}.depth_offset_m", path)
-    return RigCamera(name, recording, T, 0.5 * (C + C.T), time, depth)
+    return RigCamera(name, recording, T, C, time, depth, random)
+
+
+def _covariance(value: object, name: str, path: str | Path) -> Float64:
+    C = _numbers(value, (6, 6), name, path)
+    smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
+    tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
+    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or smallest < -tolerance:
+        raise InputError(f"{name} is not a covariance", where=path, remedy=_REMEDY)
+    return np.asarray(0.5 * (C + C.T), np.float64)
 
 
 def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:

@@ -29,6 +29,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "weak_registration": ("degraded", "Frames have too few correspondences."),
     "not_converged": ("degraded", "Registrations stopped before they converged."),
     "rig_changed": ("degraded", "A camera of the rig has moved from its pose in rig.json."),
+    "uncertain_rig": ("degraded", "The rig's cameras may be off by more than the tolerance."),
     "inconsistent_poses": ("degraded", "Registrations contradict the poses that were given."),
     "uncertain_poses": ("degraded", "Poses may be off by more than the tolerance."),
     "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
@@ -56,6 +57,7 @@ REASONS: dict[str, tuple[str, str]] = {
 # What the user can do about a reason, where there is something to do.
 ADVICE: dict[str, str] = {
     "rig_changed": "Recalibrate the rig: tofuse rig calibrate.",
+    "uncertain_rig": "Let the fields of view overlap more, or add a camera, and recalibrate.",
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
     "images_disagree": "Look at the model from above: a wall that appears twice shows where "
     "tracking failed.",

@@ -14,7 +14,7 @@ from tofuse.errors import InputError
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.rig import Disagreement, Rig, RigCamera
-from tofuse.rigs.check import Moved, compare
+from tofuse.rigs.check import Moved, compare_in_scene
 from tofuse.rigs.inputs import Camera, open_cameras
 from tofuse.rigs.moving_rig import MovingRig, calibrate_moving
 from tofuse.rigs.still import StillRig, calibrate_still, stands_still
@@ -107,7 +107,7 @@ def check(
     with using_threads(threads), threadpool_limits(1):
         cameras = cameras_of([c.name for c in rig.cameras], recordings, format)
         found = calibrate_cameras(cameras, recordings, motion, progress or Silent())
-    return found, compare(rig, found.rig)
+    return found, compare_in_scene(rig, found.rig)
 
 
 def cameras_of(
@@ -168,6 +168,7 @@ def _of_still(
             placed.covariance[k][:6, :6],
             float(found.time_offsets[c]),
             -float(placed.offsets[k]),
+            placed.random_covariance[k][:6, :6],
         )
         for k, c in enumerate(found.cameras)
     )

@@ -2,14 +2,15 @@
 
 Under the null hypothesis the motion xi of a camera from its pose in the file to the new one is
 normally distributed with the sum of both covariances, and xi^T C^-1 xi is chi-square with six
-degrees of freedom. If the first camera was moved, all others appear moved: if most do, another
-camera is the reference.
+degrees of freedom. Systematic errors of the ranges, such as multipath, recur in the same scene;
+there the covariances of random errors alone apply. If the first camera was moved, all others appear
+moved: if most do, another camera is the reference.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -36,6 +37,8 @@ class Moved:
         p-value: probability of at least this motion for a camera that was not moved.
     moved
         Whether the motion is significant.
+    chance_elsewhere
+        The same if the scene is not that of the calibration, so that systematic errors differ.
     sigma_m, sigma_rad
         Standard deviation of the motion along the direction where it is largest.
     reason
@@ -46,6 +49,7 @@ class Moved:
     T_before_after: Float64 | None
     chance: float
     moved: bool
+    chance_elsewhere: float = 1.0
     sigma_m: float = np.nan
     sigma_rad: float = np.nan
     reason: str = ""
@@ -62,6 +66,28 @@ class Moved:
         return (
             float("nan") if self.T_before_after is None else float(se3.angle(self.T_before_after))
         )
+
+
+def compare_in_scene(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
+    """As `compare`, for two calibrations in one scene, where systematic errors recur."""
+    anywhere = compare(stated, found, level)
+    return [
+        replace(moved, chance_elsewhere=other.chance)
+        for moved, other in zip(
+            compare(_random_only(stated), _random_only(found), level), anywhere, strict=True
+        )
+    ]
+
+
+def _random_only(rig: Rig) -> Rig:
+    """Return the rig with the covariances of random errors, as far as they are known."""
+    return replace(
+        rig,
+        cameras=tuple(
+            c if c.random_covariance is None else replace(c, covariance=c.random_covariance)
+            for c in rig.cameras
+        ),
+    )
 
 
 def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
@@ -109,7 +135,7 @@ def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCame
 def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> Moved:
     """Test the motion of a camera relative to a reference."""
     if camera.name == reference.name:
-        return Moved(camera.name, np.eye(4), 1.0, False, 0.0, 0.0)
+        return Moved(camera.name, np.eye(4), 1.0, False, sigma_m=0.0, sigma_rad=0.0)
     before, C_before = _relative(reference, camera)
     now, now_reference = found.camera(camera.name), found.camera(reference.name)
     assert now is not None
@@ -125,7 +151,7 @@ def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) ->
         float(np.sqrt(max(np.linalg.eigvalsh(C[part, part])[-1], 0)))
         for part in (slice(3), slice(3, 6))
     )
-    return Moved(camera.name, T, chance, chance < limit, position, rotation)
+    return Moved(camera.name, T, chance, chance < limit, chance, position, rotation)
 
 
 def _relative(reference: RigCamera, camera: RigCamera) -> tuple[Float64, Float64]:

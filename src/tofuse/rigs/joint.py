@@ -18,8 +18,10 @@ from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import rig as kernels
 from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import UNITS, Round
 from tofuse.posegraph.view_store import KeptView
+from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7
@@ -31,14 +33,11 @@ _MIN_SCALE, _MAX_SCALE = 0.7, 30.0
 _MIN_COMPARED = 50
 # Points further from a surface than this fraction of the depth are on another one.
 _OTHER_SURFACE = 0.1
-# Largest sigma of a constrained direction, and the sigma of an unconstrained one, in units of 1 cm
-# and 1 degree.
-_MAX_SIGMA, _LOOSEST = 3.0, 30.0
+# Factor on the standard deviation of the prior during the iterations.
+_WEAKER = 10.0
 # Windows of plane fits overlap: number of pixels per independent value of noise (half the smallest
 # window; covariances of simulated boards are then consistent, see tests).
 _SHARED_NOISE = 12.0
-# Size of regions of space with equal errors, as a fraction of the depth.
-_REGION = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,15 @@ class JointOptions:
     overlap
         Minimum fraction of a view's points that project onto surfaces of another one.
     offset_sigma_m
-        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre.
+        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre; up
+        to 3 cm were seen between real cameras.
     reach
         Correlation length of errors (to 1/e), as a fraction of the depth.
     steepness
         As in `registration.uncertainty`.
+    systematic
+        Standard deviation of the systematic error of a camera's ranges, as a fraction of the range:
+        calibrated on simulated rigs with multipath (`benchmarks/rigs.py systematic`).
     convergence
         Iterations stop when no unknown changes by more, in units of 1 cm and 1 degree.
     """
@@ -67,9 +70,10 @@ class JointOptions:
     robust: float = 3.5
     max_angle: float = 0.7
     overlap: float = 0.04
-    offset_sigma_m: float = 0.01
+    offset_sigma_m: float = 0.05
     reach: float = 0.31
     steepness: float = 0.3
+    systematic: float = 0.004
     convergence: float = 0.002
 
 
@@ -94,8 +98,8 @@ class Placed:
         (K,) amount by which each camera's ranges are too short relative to the first one's, m.
     covariance
         (K, 7, 7) marginal covariances of the right perturbation of the pose, and of the offset.
-    whole
-        (7 (K - 1), 7 (K - 1)) joint covariance of all cameras but the first.
+    random_covariance
+        (K, 7, 7) the part of it due to random errors: systematic ones recur in the same scene.
     rms_m
         Robust root mean square distance between surfaces.
     disagreement
@@ -106,7 +110,7 @@ class Placed:
     poses: Float64
     offsets: Float64
     covariance: Float64
-    whole: Float64
+    random_covariance: Float64
     rms_m: float
     disagreement: dict[tuple[int, int], tuple[float, int]] = field(default_factory=dict)
 
@@ -279,17 +283,22 @@ class _System:
             at = self.unknowns(k)
             H[np.ix_(at, at)] += (J * w[:, None]).T @ J
             g[at] += J.T @ (w * row[:, kernels.RESIDUAL])
-        self.add_prior(H, g)
+        prior = np.tile(self._weak_prior(), len(self.poses))
+        H[np.diag_indices(size)] += prior
+        g[6::_SIZE] += prior[6::_SIZE] * self.offsets / 0.01
         free = np.arange(_SIZE, size)
         H = H[np.ix_(free, free)]
         # Damping, so that an unconstrained camera stays.
         H[np.diag_indices(len(H))] += 1e-3 + 1e-6 * H.diagonal()
-        step = np.zeros(size)
-        step[free] = -np.linalg.solve(H, g[free])
-        change = (step.reshape(-1, _SIZE) * _UNITS)[1:]
+        step = np.asarray(-np.linalg.solve(H, g[free]), np.float64)
+        self._move(step)
+        return float(np.abs(step).max(initial=0.0))
+
+    def _move(self, step: Float64) -> None:
+        """Change poses and offsets of all cameras but the first by (7 (K - 1),), in units."""
+        change = step.reshape(-1, _SIZE) * _UNITS
         self.poses[1:] = se3.orthonormalise(self.poses[1:] @ se3.exp(change[:, :6]))
         self.offsets[1:] += change[:, 6]
-        return float(np.abs(step).max())
 
     def weights(self, k: int, row: Float64, inflation_m: float) -> tuple[Float64, Float64]:
         """Return Tukey's weights over the variance, and the derivative of the influence."""
@@ -299,12 +308,11 @@ class _System:
         f = np.maximum(1 - e2, 0)
         return f * f / variance, f * (1 - 5 * e2) / variance
 
-    def add_prior(self, H: Float64, g: Float64) -> None:
-        """Add the prior of the offsets, in units."""
-        at = _SIZE * np.arange(len(self.poses)) + 6
-        known = (0.01 / self.options.offset_sigma_m) ** 2
-        H[at, at] += known
-        g[at] += known * self.offsets / 0.01
+    def _weak_prior(self) -> Float64:
+        """Return the (7,) information of a camera's prior during the iterations, in units."""
+        prior = np.zeros(_SIZE)
+        prior[6] = (0.01 / (_WEAKER * self.options.offset_sigma_m)) ** 2
+        return prior
 
     def placed(self) -> Placed:
         """Return the poses and offsets of the cameras, with covariances."""
@@ -314,6 +322,7 @@ class _System:
         plain, cross = np.zeros((size, size)), np.zeros((size, size))
         noise = np.zeros((size, size))
         places, gradients = [], []
+        responses = np.zeros((count, shared_error.PATCHES, size))
         squares = weight = 0.0
         for k, row in enumerate(rows):
             if not len(row):
@@ -329,23 +338,105 @@ class _System:
             each[:, at] = J * (w * r)[:, None]
             source = self.views[self.pairs[k][1]].camera
             where = se3.transform(self.poses[source], row[:, kernels.MOVED : kernels.MOVED + 3])
-            region, summed = _by_region(where, each, _REGION * self.depth)
+            where /= self.depth
+            region, summed = by_region(where, each)
             places.append(region)
             gradients.append(summed)
+            self._add_responses(responses, k, row, J * w[:, None])
             squares += float((w * r * r).sum())
             weight += float(w.sum())
-        C = np.full((size - _SIZE, size - _SIZE), np.nan)
+        random = systematic = np.full((size - _SIZE, size - _SIZE), np.nan)
         if places:
-            C = self._covariance(
-                plain, cross, noise, np.concatenate(places), np.concatenate(gradients)
+            free = slice(_SIZE, None)
+            B = noise[free, free] + np.diag(np.tile(self._weak_prior(), count - 1))
+            B += correlated(
+                np.concatenate(places), np.concatenate(gradients)[:, free], self.options.reach
             )
-        scaled = C * np.outer(np.tile(_UNITS, count - 1), np.tile(_UNITS, count - 1))
-        blocks = np.zeros((count, _SIZE, _SIZE))
-        for c in range(1, count):
-            own = slice(_SIZE * (c - 1), _SIZE * c)
-            blocks[c] = scaled[own, own]
+            for matrix in (plain, cross):
+                matrix[np.diag_indices(size)] += np.tile(self._weak_prior(), count)
+            bread, unconstrained = inverse_slope(
+                plain[free, free], cross[free, free], self.options.steepness
+            )
+            random = bread @ B @ bread + unconstrained
+            systematic = bread @ self._systematic(responses[:, :, free]) @ bread
+            random, systematic = self._use_prior(random, systematic)
         rms = float(np.sqrt(squares / weight)) if weight else float("nan")
-        return Placed(self.poses, self.offsets, blocks, scaled, rms, self.disagreement(rows))
+        return Placed(
+            self.poses,
+            self.offsets,
+            self._marginals(random + systematic),
+            self._marginals(random),
+            rms,
+            self.disagreement(self.compare()),
+        )
+
+    def _use_prior(self, random: Float64, systematic: Float64) -> tuple[Float64, Float64]:
+        """Update the estimate by the prior of the depth offsets; returns both covariances.
+
+        During the iterations all residuals count as independent, so the prior has no weight beside
+        them; the covariance of the estimate includes their correlation.
+        """
+        C = random + systematic
+        count = len(C) // _SIZE
+        offset = _SIZE * np.arange(count) + 6
+        sigma = self.options.offset_sigma_m / 0.01
+        gain = np.linalg.solve(C[np.ix_(offset, offset)] + sigma**2 * np.eye(count), C[offset]).T
+        self._move(-gain @ (self.offsets[1:] / 0.01))
+        kept = np.eye(len(C))
+        kept[:, offset] -= gain
+        # Offsets are the same in each calibration: the uncertainty of the prior is systematic.
+        random = kept @ random @ kept.T
+        return random, kept @ C - random
+
+    def _marginals(self, C: Float64) -> Float64:
+        """Return the (K, 7, 7) blocks of the cameras, m and rad; the first camera is fixed."""
+        blocks = np.zeros((len(self.poses), _SIZE, _SIZE))
+        for c in range(1, len(blocks)):
+            own = slice(_SIZE * (c - 1), _SIZE * c)
+            blocks[c] = 0.5 * (C[own, own] + C[own, own].T) * np.outer(_UNITS, _UNITS)
+        return blocks
+
+    def _systematic(self, responses: Float64) -> Float64:
+        """Return the covariance of the gradient due to systematic range errors of each camera.
+
+        Parameters
+        ----------
+        responses
+            (K, PATCHES, n) of the gradient to a relative error of each patch.
+        """
+        surface_of = {view.camera: view.kept.surface for view in self.views}
+        B = np.zeros((responses.shape[2],) * 2)
+        for camera, surface in surface_of.items():
+            # Twice the correlation length of errors that leave residuals, as in the tracker.
+            correlation = np.sqrt(shared_error.alike(surface))
+            L = self.options.systematic * responses[camera]
+            B += L.T @ correlation @ L
+        return B
+
+    def _add_responses(self, responses: Float64, k: int, row: Float64, weighted: Float64) -> None:
+        """Add a pair's response of the gradient to relative range errors, by camera and patch.
+
+        Parameters
+        ----------
+        responses
+            (K, PATCHES, 7 K) sums, which are changed.
+        k, row
+            A pair and its residual rows.
+        weighted
+            (N, 14) its weighted derivatives, see `jacobian`.
+        """
+        target, source = (self.views[i] for i in self.pairs[k])
+        p = row[:, kernels.MOVED : kernels.MOVED + 3]
+        T_target_source = se3.inverse(self.poses[target.camera]) @ self.poses[source.camera]
+        q = se3.transform(T_target_source, p)
+        at = self.unknowns(k)
+        ends = (source, p, kernels.BY_SOURCE), (target, q, kernels.BY_TARGET)
+        for view, points, column in ends:
+            by_error = row[:, column] * np.linalg.norm(points, axis=1)
+            patch = shared_error.patches_of(points, view.kept.surface)
+            sums = np.zeros((shared_error.PATCHES, weighted.shape[1]))
+            np.add.at(sums, patch, weighted * by_error[:, None])
+            responses[view.camera][:, at] += sums
 
     def _shared(self, k: int) -> float:
         """Return the number of residuals of a pair per independent value of noise.
@@ -355,34 +446,6 @@ class _System:
         kept = self.views[self.pairs[k][1]].kept
         return 2 * max(1.0, _SHARED_NOISE * len(kept.points) / max(kept.surface.pixels, 1))
 
-    def _covariance(
-        self, plain: Float64, cross: Float64, noise: Float64, places: Float64, gradients: Float64
-    ) -> Float64:
-        free = np.arange(_SIZE, len(plain))
-        none = np.zeros(len(plain))
-        for matrix in (plain, cross):
-            self.add_prior(matrix, none.copy())
-        X = _slope(plain[np.ix_(free, free)], cross[np.ix_(free, free)], self.options.steepness)
-        regions, inverse = np.unique(places, axis=0, return_inverse=True)
-        g = np.zeros((len(regions), len(free)))
-        np.add.at(g, inverse.ravel(), gradients[:, free])
-        at = (regions + 0.5) * _REGION * self.depth
-        apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-        alike = np.exp(-apart / (self.options.reach * self.depth))
-        B = g.T @ alike @ g
-        B += noise[np.ix_(free, free)]
-        known = (0.01 / self.options.offset_sigma_m) ** 2
-        prior = np.zeros(len(free))
-        prior[6::_SIZE] = known
-        B += np.diag(prior)
-        # Directions beyond the largest sigma are unconstrained: there is the noise of normals.
-        P = plain[np.ix_(free, free)]
-        values, vectors = np.linalg.eigh(0.5 * (P + P.T))
-        weak, strong = vectors[:, values < _MAX_SIGMA**-2], vectors[:, values >= _MAX_SIGMA**-2]
-        bread = strong @ np.linalg.inv(strong.T @ X @ strong) @ strong.T
-        C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
-        return 0.5 * (C + C.T)
-
     def disagreement(self, rows: Sequence[Float64]) -> dict[tuple[int, int], tuple[float, int]]:
         """See `disagreements`."""
         found: dict[tuple[int, int], list[Float64]] = {}
@@ -391,22 +454,3 @@ class _System:
             found.setdefault((a, b), []).append(np.abs(row[:, kernels.RESIDUAL]))
         every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
         return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
-
-
-def _by_region(where: Float64, rows: Float64, size: float) -> tuple[Float64, Float64]:
-    """Sum rows (N, n) over cubes of space; returns the cubes (R, 3), and their sums (R, n)."""
-    cube = np.floor(where / size)
-    regions, inverse = np.unique(cube, axis=0, return_inverse=True)
-    out = np.zeros((len(regions), rows.shape[1]))
-    np.add.at(out, inverse.ravel(), rows)
-    return regions, out
-
-
-def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
-    """Return the Hessian, bounded below by a fraction of that without robust weights."""
-    values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
-    root = vectors / np.sqrt(np.maximum(values, _MAX_SIGMA**-2))
-    values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)
-    back = np.linalg.inv(root).T @ turned
-    X: Float64 = (back * np.maximum(values, steepness)) @ back.T
-    return X

@@ -20,6 +20,7 @@ from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
+from tofuse.posegraph.accuracy import HIDDEN, Accuracy
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import Known, NoRefinement
@@ -177,7 +178,9 @@ def reconstruct_rig(
     names = [camera.name for camera in rig.cameras]
     of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
     result = replace(
-        _as_rig(result), config=given.to_dict(), recording={**result.recording, "rig": of_rig}
+        _as_rig(result, moves=moved),
+        config=given.to_dict(),
+        recording={**result.recording, "rig": of_rig},
     )
     between = tuple(
         Disagreement(names[a], names[b], median, pixels)
@@ -200,7 +203,8 @@ def _fixed(
     Calibration errors are equal at all instants: if the rig is static (`follow`), later frames are
     tied to the first ones of their cameras.
     """
-    covariances = [camera.covariance + np.diag(_AT_LEAST) for camera in rig.cameras]
+    # The bound on the errors is enlarged for systematic ones, which these covariances include.
+    covariances = [c.covariance / HIDDEN**2 + np.diag(_AT_LEAST) for c in rig.cameras]
     covariances[0] = np.diag(_AT_LEAST)
     known = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
@@ -221,12 +225,25 @@ def _fixed(
     return found
 
 
-def _as_rig(result: Reconstruction) -> Reconstruction:
+def _as_rig(result: Reconstruction, *, moves: bool) -> Reconstruction:
     """Return the result without diagnostics that concern only single-camera tracking."""
     d = result.diagnostics
     reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
+    if not moves:
+        reasons = ranked([_of_calibration(r, d.accuracy) for r in reasons])
     d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
     return replace(result, diagnostics=d)
+
+
+def _of_calibration(reason: Reason, accuracy: Accuracy) -> Reason:
+    """Return the reason; if poses of static cameras are uncertain, the calibration is."""
+    if reason.code != "uncertain_poses":
+        return reason
+    text = (
+        f"The cameras' poses may be off by {1000 * accuracy.position_m:.0f} mm rms (95 % bound), "
+        "by the covariances in rig.json. They include systematic errors, such as multipath."
+    )
+    return replace(reason, code="uncertain_rig", text=text)
 
 
 def _checked(

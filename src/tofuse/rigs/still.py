@@ -124,7 +124,7 @@ def _with_clock_errors(
 ) -> Placed:
     """Add the uncertainty of the clocks to the covariances: how far poses move by one frame."""
     at = _common_times(cameras, offsets)
-    blocks = placed.covariance.copy()
+    by_clock = np.zeros_like(placed.covariance)
     for c in order[1:]:
         interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
         late = list(instants)
@@ -132,8 +132,12 @@ def _with_clock_errors(
         shifted = refine_together(_views(late, order), placed.poses).poses
         for k in range(1, len(order)):
             xi = _CLOCK * se3.log(se3.inverse(placed.poses[k]) @ shifted[k])
-            blocks[k, :6, :6] += np.outer(xi, xi)
-    return replace(placed, covariance=blocks)
+            by_clock[k, :6, :6] += np.outer(xi, xi)
+    return replace(
+        placed,
+        covariance=placed.covariance + by_clock,
+        random_covariance=placed.random_covariance + by_clock,
+    )
 
 
 def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]) -> list[View]:
