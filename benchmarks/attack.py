@@ -48,13 +48,13 @@ def main() -> int:
     quick, only = arguments.quick, arguments.only
     files = arguments.files or (QUICK_FILES if quick else FILES)
     cuts = arguments.cuts or (QUICK_CUTS if quick else CUTS)
-    most = QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)
+    limit = QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)
     begun = time.monotonic()
     journal = Journal(arguments.journal, {"seed": arguments.seed, "files": files, "cuts": cuts})
     with tempfile.TemporaryDirectory() as base:
         plan = {
             "cuts": lambda: power_cuts(cuts, arguments.seed),
-            "environments": lambda: environments(most, Path(base)),
+            "environments": lambda: environments(limit, Path(base)),
             "files": lambda: fuzzed_files(files, arguments.seed),
         }
         work = [part() for name, part in plan.items() if only in (None, name)]
@@ -86,7 +86,7 @@ def fuzzed_files(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
 
     def work(name: str, first: int, count: int) -> tuple[int, list[str]]:
         outcomes = mutation.run(name, count, 1_000_000 * seed + first)
-        return count, [f"seed {k}: {said}" for k, said in outcomes if said not in PASSED]
+        return count, [f"seed {k}: {result}" for k, result in outcomes if result not in PASSED]
 
     for number, first, count in pieces(each, FILES_IN_PIECE):
         for name in reversed(subjects):  # the small ones first
@@ -151,11 +151,11 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
     return count, faults
 
 
-def environments(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
+def environments(limit: int, base: Path) -> Iterator[tuple[str, int, Work]]:
     """Runs in hostile environments."""
     from tofuse.lab.simulation.record import simulate
 
-    chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // most)][:most]
+    chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // limit)][:limit]
     recording = base / "rec"
 
     def work(environment: Environment) -> tuple[int, list[str]]:

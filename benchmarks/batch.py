@@ -1,14 +1,14 @@
-"""Many short recordings as a batch: how much faster two workers are, and what kills cost.
+"""Many short recordings as a batch: speed-up of two workers, and cost of killed workers.
 
 The recordings are turns in simulated furnished rooms, each with its own noise. They are run alone
 (`tofuse run`, one after the other), then by `tofuse batch` on this machine, on a Dask
-`LocalCluster`, and by a Dask scheduler with workers in processes of their own, by one worker and by
-two. In the end workers are killed by SIGKILL at random moments. Each job has one thread, and of
-each way all files of all results are compared with those of the runs alone: to the byte, but for
-the times in `run.json` and `report.html`. A cluster is started before the clock is.
+`LocalCluster`, and on a Dask scheduler with separate worker processes, with one worker and with
+two. At the end workers are killed by SIGKILL at random moments. Each job has one thread. All files
+of all results are compared byte by byte with those of the runs alone, except for the times in
+`run.json` and `report.html`. Starting a cluster is not timed.
 
     python benchmarks/batch.py                                  100 recordings, ten kills
-    python benchmarks/batch.py --recordings 6 --frames 3        a quick look
+    python benchmarks/batch.py --recordings 6 --frames 3        a quick check
 
 Needs `pip install tofuse[dask]`.
 """
@@ -33,12 +33,12 @@ from time import perf_counter, sleep
 import numpy as np
 
 OUT = Path(__file__).parent / "out" / "batch"
-# What a report says of times.
+# The times in a report.
 _TIMES = re.compile(
     r'<tr><td>[\w ]+</td><td class="number">[^<]*</td><td class="bars">.*?</tr>'
     r'|<strong>[^<]*</strong></td><td class="muted">[^<]* per frame'
 )
-# A cluster as a person starts it in Python; it ends with its standard input.
+# A cluster as users start it in Python; it exits when its standard input closes.
 _LOCAL_CLUSTER = """
 import sys
 from distributed import LocalCluster
@@ -52,12 +52,12 @@ if __name__ == "__main__":
 Pids = Callable[[], list[int]]
 
 
-def tofuse(*words: object) -> list[str]:
-    return [sys.executable, "-m", "tofuse", *map(str, words)]
+def tofuse(*args: object) -> list[str]:
+    return [sys.executable, "-m", "tofuse", *map(str, args)]
 
 
 def make_recordings(folder: Path, count: int, frames: int) -> list[Path]:
-    """Simulate those that are missing."""
+    """Simulate the recordings that do not exist yet."""
     from tofuse.lab.simulation.record import simulate
 
     paths = [folder / f"{frames}-frames" / f"room-{k:03d}" for k in range(count)]
@@ -72,23 +72,23 @@ def make_recordings(folder: Path, count: int, frames: int) -> list[Path]:
 
 
 def run_alone(recordings: list[Path], out: Path) -> float:
-    """Run each recording by itself, and return the seconds."""
+    """Run each recording in its own process; return the total seconds."""
     start = perf_counter()
     for path in recordings:
-        words = ("run", path, "--out", out / path.name, "--threads", 1)
-        done = subprocess.run(tofuse(*words), capture_output=True, text=True, check=False)
+        args = ("run", path, "--out", out / path.name, "--threads", 1)
+        done = subprocess.run(tofuse(*args), capture_output=True, text=True, check=False)
         if done.returncode not in (0, 3):
             raise SystemExit(f"{path}: {done.stderr}")
     return perf_counter() - start
 
 
-def start_batch(list_file: Path, out: Path, *words: object) -> subprocess.Popen[str]:
-    """Begin a batch of one thread a job, which Ctrl-C interrupts.
+def start_batch(list_file: Path, out: Path, *args: object) -> subprocess.Popen[str]:
+    """Start a batch with one thread per job that SIGINT interrupts.
 
-    A shell lets what it begins in the background ignore Ctrl-C, as would all that begins from
-    there: who runs this in the background wants to interrupt the batch all the same.
+    A shell makes its background processes ignore SIGINT, which their children inherit; the batch
+    must be interruptible even if this benchmark runs in the background.
     """
-    command = tofuse("batch", list_file, "--out", out, "--threads", 1, *words)
+    command = tofuse("batch", list_file, "--out", out, "--threads", 1, *args)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -97,15 +97,15 @@ def start_batch(list_file: Path, out: Path, *words: object) -> subprocess.Popen[
 
 
 def finish(batch: subprocess.Popen[str]) -> str:
-    """Wait for its end, and return what it said on standard error."""
-    _, said = batch.communicate()
+    """Wait for the batch to end; return its standard error."""
+    _, stderr = batch.communicate()
     if batch.returncode not in (0, 3):
-        raise SystemExit(f"tofuse batch ended with {batch.returncode}: {said}")
-    return said
+        raise SystemExit(f"tofuse batch exited with {batch.returncode}: {stderr}")
+    return stderr
 
 
 def contents(result: Path) -> dict[str, bytes]:
-    """What the files of a result hold, but for times."""
+    """Contents of the files of a result, without times."""
     found = {}
     for path in sorted(p for p in result.rglob("*") if p.is_file()):
         data = path.read_bytes()
@@ -118,13 +118,13 @@ def contents(result: Path) -> dict[str, bytes]:
 
 
 def same_results(recordings: list[Path], alone: Path, out: Path) -> int:
-    """How many results are the same as those of the runs alone."""
+    """Number of results identical to those of the runs alone."""
     names = [path.name for path in recordings]
     return sum(contents(alone / name) == contents(out / name) for name in names)
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started itself, and that go on."""
+    """Running child processes of a process."""
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):
@@ -133,13 +133,13 @@ def children(pid: int) -> list[int]:
 
 
 def at_work(workers: list[int]) -> list[int]:
-    """Those that have a job's process."""
+    """Workers that are running a job."""
     return [pid for pid in workers if children(pid)]
 
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[tuple[str, Pids]]:
-    """Give the address of a `LocalCluster`, which begins killed workers anew, and its workers."""
+    """Yield address and busy workers of a `LocalCluster`, which restarts killed workers."""
     process = subprocess.Popen(
         [sys.executable, "-c", _LOCAL_CLUSTER, str(workers)],
         stdin=subprocess.PIPE,
@@ -157,22 +157,22 @@ def local_cluster(workers: int) -> Iterator[tuple[str, Pids]]:
 
 @contextmanager
 def own_processes(workers: int, folder: Path) -> Iterator[tuple[str, Pids]]:
-    """Give the address of a scheduler, and its workers: each a process, begun anew if killed."""
+    """Yield the address of a scheduler and its busy workers: processes, restarted if killed."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
     dask = [sys.executable, "-m", "dask"]
-    told = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    words = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    scheduler = subprocess.Popen([*dask, "scheduler", *words], **told)
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    args = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    scheduler = subprocess.Popen([*dask, "scheduler", *args], **streams)
     ended = threading.Event()
     running: dict[int, subprocess.Popen[bytes]] = {}
 
     def keep(number: int) -> None:
         local = ["--local-directory", str(folder / f"worker-{number}")]
-        words = ["--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        args = ["--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", "--no-dashboard"]
         while not ended.is_set():
-            running[number] = subprocess.Popen([*dask, "worker", *words, *local], **told)
+            running[number] = subprocess.Popen([*dask, "worker", *args, *local], **streams)
             if ended.is_set():
                 running[number].kill()
             running[number].wait()
@@ -181,7 +181,7 @@ def own_processes(workers: int, folder: Path) -> Iterator[tuple[str, Pids]]:
     try:
         while not file.exists():
             if scheduler.poll() is not None:
-                raise SystemExit("the scheduler ended")
+                raise SystemExit("the scheduler exited")
             sleep(0.1)
         for keeper in keepers:
             keeper.start()
@@ -193,7 +193,7 @@ def own_processes(workers: int, folder: Path) -> Iterator[tuple[str, Pids]]:
         scheduler.terminate()
         scheduler.wait()
         for process in list(running.values()):
-            process.kill()  # without its scheduler a worker may wait for ever to say goodbye
+            process.kill()  # without its scheduler a worker may never exit by itself
         for keeper in keepers:
             if keeper.ident is not None:
                 keeper.join()
@@ -209,7 +209,7 @@ def wait_for(address: str, workers: int) -> None:
 def kill_often(
     batch: subprocess.Popen[str], pids: Pids, kills: int, pause_s: float, seed: int
 ) -> int:
-    """Kill one of the processes, again and again, while a batch goes on; how often that was."""
+    """Repeatedly kill one of the processes while a batch runs; return the number of kills."""
     rng = np.random.default_rng(seed)
     done = 0
     while done < kills and batch.poll() is None:
@@ -236,10 +236,10 @@ def main() -> None:
     list_file.write_text("".join(f"{path}\n" for path in recordings))
     results = out / "results"
     shutil.rmtree(results, ignore_errors=True)
-    # What is compiled and read for the first time counts for nobody.
+    # Warm-up: compilation and first reads are not timed.
     run_alone(recordings[:1], results / "first")
     print(f"{len(recordings)} recordings of {arguments.frames} frames, one thread a job")
-    print("| how | workers | seconds | one worker over this | results as alone |", flush=True)
+    print("| mode | workers | seconds | speed-up over one worker | identical results |", flush=True)
     print("|---|---|---|---|---|", flush=True)
 
     def row(how: str, workers: int, seconds: float, one: float | None, same: int) -> None:
@@ -251,18 +251,18 @@ def main() -> None:
     seconds = run_alone(recordings, alone)
     row("`tofuse run`, one after the other", 1, seconds, seconds, len(recordings))
 
-    def timed(how: str, workers: int, one: float | None, *words: object) -> float:
+    def timed(how: str, workers: int, one: float | None, *args: object) -> float:
         folder = results / f"{how}-{workers}".replace(" ", "-").replace("`", "")
         start = perf_counter()
-        finish(start_batch(list_file, folder, *words))
+        finish(start_batch(list_file, folder, *args))
         seconds = perf_counter() - start
         row(how, workers, seconds, one or seconds, same_results(recordings, alone, folder))
         return seconds
 
-    def killed(how: str, pids_of: Callable[[subprocess.Popen[str]], Pids], *words: object) -> None:
+    def killed(how: str, pids_of: Callable[[subprocess.Popen[str]], Pids], *args: object) -> None:
         folder = results / f"{how}-killed".replace(" ", "-").replace("`", "")
         start = perf_counter()
-        batch = start_batch(list_file, folder, "--retries", arguments.kills, *words)
+        batch = start_batch(list_file, folder, "--retries", arguments.kills, *args)
         pause = fastest / (arguments.kills + 1)
         kills = kill_often(batch, pids_of(batch), arguments.kills, pause, arguments.seed)
         finish(batch)

@@ -2,10 +2,10 @@
 
     python benchmarks/calibration.py [cameras, separated by commas [seeds]]
 
-For each camera and seed: a checkerboard on a wall, seen from 32 places, with all errors of the
-camera but indirect light (a wall alone has none) and drift. Prints how far off the lens is, and
-what is left of the errors of depth: by a board on a wall, by the board alone, and by the wall at
-unknown poses. The wiggling is as strong as to be 20 mm at its peaks in the SR4000.
+For each camera and seed: a checkerboard on a wall, seen from 32 viewpoints, with all errors of the
+camera except multipath (a single wall has none) and drift. Prints the errors of the intrinsics, and
+the residual depth errors after calibration with a board on a wall, with the board alone, and with
+the wall at unknown poses. Wiggling peaks at 20 mm for the SR4000.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
             )
             print(f"| {name} | {seed} | {lens_row(recording, model)} |")
             depths.append(f"| {name} | {seed} | {depth_row(recording, model)} |")
-    print("\nErrors in mm rms: curve (but for its mean and slope), offsets of single pixels\n")
+    print("\nErrors in mm rms: curve (without its mean and slope), offsets of single pixels\n")
     print("| camera | seed | before | board on wall | board | wall |")
     print("|---|---|---|---|---|---|")
     print("\n".join(depths))
@@ -61,9 +61,9 @@ def lens_row(recording: Recording, model: CameraModel) -> str:
     found = fit.camera
     focal = 100 * max(abs(found.fx / true.fx - 1), abs(found.fy / true.fy - 1))
     centre = max(abs(found.cx - true.cx), abs(found.cy - true.cy))
-    apart = (found.rays() - true.rays()) * true.fx
-    whole = np.sqrt(np.nanmean((apart**2).sum(-1)))
-    return f"{len(fit.views)} | {focal:.3f} | {centre:.2f} | {whole:.2f}"
+    residual = (found.rays() - true.rays()) * true.fx
+    rms_px = np.sqrt(np.nanmean((residual**2).sum(-1)))
+    return f"{len(fit.views)} | {focal:.3f} | {centre:.2f} | {rms_px:.2f}"
 
 
 def depth_row(recording: Recording, model: CameraModel) -> str:
@@ -86,7 +86,7 @@ def depth_row(recording: Recording, model: CameraModel) -> str:
         bias = np.interp(r, true.range_m, true.bias_m) + true.pixel_bias_m.mean()
         error = np.interp(r, fit.correction.range_m, fit.correction.bias_m) - bias
         bent = error - np.polyval(np.polyfit(r, error, 1), r)
-        # Offsets of pixels that were seen; their mean is the curve's.
+        # Offsets of observed pixels; their mean belongs to the curve.
         seen = np.zeros(true.pixel_bias_m.size, bool)
         seen[np.concatenate([view.pixels for view in views])] = True
         assert fit.correction.pixel_bias_m is not None

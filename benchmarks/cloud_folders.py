@@ -1,8 +1,8 @@
-"""Folders of bare clouds through `tofuse run`: how many views are placed, how well, and marked.
+"""Folders of bare clouds through `tofuse run`: views registered, errors, wrong poses flagged.
 
-Each case is a folder of PLY files without poses, camera or time. What counts as wrong and as marked
-is said in `scoring.py`, but that views of clouds are wrong by more than 0.1 m or 4 degrees, as
-`cloud_pairs.py` has it; scans are those of `cloud_pairs.py`, with more points.
+Each case is a folder of PLY files without poses, camera or time. `scoring.py` defines wrong and
+marked poses; here, as in `cloud_pairs.py`, a pose is wrong beyond 0.1 m or 4 degrees. Scans are
+those of `cloud_pairs.py`, with more points.
 
     python benchmarks/cloud_folders.py [--data ../shared/data] [--cases kitchen scans]
 """
@@ -30,12 +30,12 @@ from sequences import DATA
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 
-# Poses (4, 4) in one frame, and points (n, 3) of each view.
+# Pose (4, 4) in a common frame and points (n, 3) of each view.
 Views = Iterator[tuple[Float64, Float32]]
 
 
 def every(name: str, step: int) -> Callable[[Path], Views]:
-    """Every so manieth view of a scene of `pairs.py`."""
+    """Every `step`-th view of a scene of `pairs.py`."""
 
     def views(data: Path) -> Views:
         recording = pairs.opened(name, data)
@@ -47,7 +47,7 @@ def every(name: str, step: int) -> Callable[[Path], Views]:
 
 
 def spheres(name: str, count: int, points: int, seed: int) -> Callable[[Path], Views]:
-    """Spherical scans through a simulated scene, with any heading."""
+    """Spherical scans along a path through a simulated scene, with random heading."""
     return lambda _data: cloud_pairs.scanned(name, count, points, seed)
 
 
@@ -64,7 +64,7 @@ CASES: dict[str, tuple[str, Callable[[Path], Views]]] = {
 
 
 def row(title: str, views: Views) -> str:
-    """Reconstruct one folder, and tell what became of it."""
+    """Reconstruct one folder; return its row of the table."""
     poses = []
     with tempfile.TemporaryDirectory() as folder:
         for k, (T, points) in enumerate(views):
@@ -76,15 +76,15 @@ def row(title: str, views: Views) -> str:
     allowed = scoring.Tolerance(cloud_pairs.RIGHT_M, float(np.radians(cloud_pairs.RIGHT_DEG)))
     truth = scoring.Truth(np.stack(poses), np.zeros(len(poses), np.intp), allowed)
     score = scoring.score(scoring.parts_of(result, range(len(poses))), truth)
-    told = result.diagnostics
+    diagnostics = result.diagnostics
     cells = [
         title,
         f"{score.main} of {score.frames}",
         f"{1000 * score.ate_m:.0f}",
         score.wrong,
         score.unmarked,
-        sum(loop.accepted for loop in told.loops),
-        told.verdict,
+        sum(loop.accepted for loop in diagnostics.loops),
+        diagnostics.verdict,
         f"{seconds:.0f}",
     ]
     return f"| {' | '.join(map(str, cells))} |"
@@ -96,8 +96,8 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
     given = parser.parse_args()
     print(
-        "| Folder | in the main model | rms error, mm | wrong | of these unmarked | loops | verdict"
-        " | s |\n|---|---|---|---|---|---|---|---|"
+        "| Folder | in the main component | ATE rms, mm | wrong | of these unmarked | loops"
+        " | verdict | s |\n|---|---|---|---|---|---|---|---|"
     )
     for name in given.cases:
         title, made = CASES[name]

@@ -1,12 +1,13 @@
-"""Two bare clouds far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
+"""Global registration of two bare clouds: success of `tofuse.register`, and its calibration.
 
-`table` gives, over kinds of pairs, how many poses are right (within 0.1 m, or 5 % of the extent
-where that is less, at the middle of the source, and 4 degrees), how many of those are accepted, and
-how many are accepted and wrong; beside it Open3D's RANSAC over FPFH with point-to-plane ICP, and
-KISS-Matcher, as far as they are installed, with voxels of 1/100 of the target's extent. Clouds have
-at most 20,000 points. "moved" clouds were taken to another frame, so that nothing is known of
-where they were seen from; of "sparse" pairs the source has a tenth of the target's points. `fit`
-fits the logistic models of `tofuse.registration.confidence` to simulated pairs.
+`table` prints, for each kind of pair, how many poses are right (within 0.1 m, or 5 % of the extent
+if that is less, at the centre of the source, and 4 degrees), how many of those are accepted, and
+how many are accepted and wrong; also for Open3D's RANSAC over FPFH with point-to-plane ICP, and for
+KISS-Matcher, if installed, with voxels of 1/100 of the target's extent. Clouds have at most 20,000
+points. "moved" clouds were transformed into another frame, so that their viewpoint is unknown; in
+"sparse" pairs the source has a tenth of the target's points. `fit` fits the logistic models of
+`tofuse.registration.confidence` to simulated pairs. `viewpoints` counts the clouds whose origin is
+taken for the viewpoint.
 
     python benchmarks/cloud_pairs.py table [--data ../shared/data] [--kinds scans]
     python benchmarks/cloud_pairs.py fit
@@ -46,13 +47,13 @@ from tofuse.registration.viewpoint import viewpoint_of
 
 POINTS = 20_000
 RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0
-# What moves by itself stands before a background that does not.
+# A rotating object stands in front of a static background.
 OBJECT_M = 1.6
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Points (n, 3) of two views in m, and the true T_target_source; None if they share nothing."""
+    """Points (n, 3) of two views in m, and the true T_target_source; None without overlap."""
 
     source: Float64
     target: Float64
@@ -60,26 +61,26 @@ class Pair:
 
     @property
     def allowed_m(self) -> float:
-        """Error up to which a pose is right."""
+        """Largest error of a right pose, m."""
         return min(RIGHT_M, RIGHT_FRACTION * self.extent)
 
     @property
     def extent(self) -> float:
-        """Diagonal of the middle of the target, m."""
+        """Diagonal of the central part of the target, m."""
         low, high = np.percentile(self.target, [2, 98], axis=0)
         return float(np.linalg.norm(high - low))
 
-    def off(self, T: Float64) -> tuple[float, float]:
-        """Error at the middle of the source in m, and in degrees."""
+    def error(self, T: Float64) -> tuple[float, float]:
+        """Error at the centre of the source in m, and of the rotation in degrees."""
         if self.true is None:
             return np.inf, np.inf
-        middle = np.median(self.source, 0)[None]
-        gap = se3.transform(T, middle) - se3.transform(self.true, middle)
+        centre = np.median(self.source, 0)[None]
+        gap = se3.transform(T, centre) - se3.transform(self.true, centre)
         turned = se3.angle(se3.inverse(self.true) @ T)
         return float(np.linalg.norm(gap)), float(np.degrees(turned))
 
     def is_right(self, T: Float64) -> bool:
-        metres, degrees = self.off(T)
+        metres, degrees = self.error(T)
         return metres < self.allowed_m and degrees < RIGHT_DEG
 
 
@@ -88,9 +89,9 @@ Maker = Callable[[Path, int, np.random.Generator], Iterator[Pair]]
 
 @dataclass(frozen=True)
 class Kind:
-    """Pairs of one kind; those of one family show the same place.
+    """Pairs of one kind; kinds of one family show the same place.
 
-    The model of the probability is `fitted` to some; `shown` are those of the table.
+    The probability model is `fitted` on some kinds; the table shows those with `shown`.
     """
 
     name: str
@@ -101,23 +102,23 @@ class Kind:
     shown: bool = True
 
 
-def thinned(points: Float32, rng: np.random.Generator, most: int = POINTS) -> Float64:
-    """At most so many points, chosen at random."""
-    chosen = np.sort(rng.permutation(len(points))[:most])
+def thinned(points: Float32, rng: np.random.Generator, max_points: int = POINTS) -> Float64:
+    """Random subset of at most `max_points` points."""
+    chosen = np.sort(rng.permutation(len(points))[:max_points])
     return points[chosen].astype(np.float64)
 
 
 def frames(
     name: str, apart: tuple[int, ...], *, moved: bool = False, sparse: bool = False
 ) -> Maker:
-    """Points of a camera's frames, of a scene of `pairs.py`."""
+    """Pairs of frames of a camera, from a scene of `pairs.py`."""
 
-    def make(data: Path, most: int, rng: np.random.Generator) -> Iterator[Pair]:
+    def make(data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
         recording = pairs.opened(name, data)
         T = recording.reference
         assert T is not None
         for step in apart:
-            for i, j in pairs.chosen(len(recording), step, most):
+            for i, j in pairs.chosen(len(recording), step, max_pairs):
                 if not np.isfinite(T[[i, j]]).all():
                     continue
                 source, target = (_object(recording[k], name).points for k in (j, i))
@@ -138,7 +139,7 @@ def _object(frame: Frame, name: str) -> Frame:
 
 
 def _elsewhere(pair: Pair, rng: np.random.Generator) -> Pair:
-    """The same pair in other frames, turned by any angle."""
+    """The same pair in other frames, with arbitrary rotations."""
     assert pair.true is not None
     A, B = (_any_motion(rng) for _ in range(2))
     source, target = se3.transform(A, pair.source), se3.transform(B, pair.target)
@@ -152,10 +153,10 @@ def _any_motion(rng: np.random.Generator) -> Float64:
 
 
 def scans(name: str, *, moved: bool = False, points: int = 200_000, seed: int = 0) -> Maker:
-    """Spherical scans through a simulated scene, with any heading: neighbours, and every second."""
+    """Spherical scans with random heading along a path: pairs one and two scans apart."""
 
-    def make(_data: Path, most: int, rng: np.random.Generator) -> Iterator[Pair]:
-        taken = list(scanned(name, most + 1, points, seed))
+    def make(_data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
+        taken = list(scanned(name, max_pairs + 1, points, seed))
         for apart in (1, 2):
             for (T_a, a), (T_b, b) in zip(taken[:-apart], taken[apart:], strict=True):
                 pair = Pair(b.astype(float), a.astype(float), se3.inverse(T_a) @ T_b)
@@ -164,7 +165,7 @@ def scans(name: str, *, moved: bool = False, points: int = 200_000, seed: int = 
     return make
 
 
-def scanned(name: str, most: int, points: int, seed: int) -> Iterator[tuple[Float64, Float32]]:
+def scanned(name: str, max_scans: int, points: int, seed: int) -> Iterator[tuple[Float64, Float32]]:
     """Poses (4, 4) in the room and points of a scanner with a grid of equal angles, z up."""
     built, sequence = scenes.build(name, seed=seed)
     rng = np.random.default_rng([seed, 5])
@@ -189,11 +190,11 @@ def scanned(name: str, most: int, points: int, seed: int) -> Iterator[tuple[Floa
         seen = np.isfinite(hits.distance)
         distance = hits.distance[seen] + 0.003 * rng.standard_normal(int(seen.sum()))
         yield T, (rays[seen] * distance[:, None]).astype(np.float32)
-        if count == most:
+        if count == max_scans:
             return
 
 
-def _lidar_pair(data: Path, _most: int, _rng: np.random.Generator) -> Iterator[Pair]:
+def _lidar_pair(data: Path, _max_pairs: int, _rng: np.random.Generator) -> Iterator[Pair]:
     folder = data / "lidar_pair_gt"
     if not folder.is_dir():
         raise FileNotFoundError(folder)
@@ -241,7 +242,7 @@ KINDS = {
         Kind("scans-moved", "Scans of the flat, moved", scans("flat", moved=True), "flat"),
         Kind("scans-2", "Scans of another flat", scans("flat", seed=3), "flat", False),
         Kind("lidar", "LiDAR outdoors", _lidar_pair, "lidar", False),
-        # Of flats that the table does not show.
+        # Flats that are not in the table.
         *(
             Kind(
                 f"scans-of-{seed}{name}",
@@ -258,8 +259,8 @@ KINDS = {
 }
 
 
-def off_and_belief(pair: Pair, found: Registration | Float64) -> tuple[bool, bool, float]:
-    """Whether a pose is right, whether it is accepted, and its probability."""
+def correctness(pair: Pair, found: Registration | Float64) -> tuple[bool, bool, float]:
+    """Whether a pose is right, whether it is accepted, and its stated probability."""
     if isinstance(found, Registration):
         T = found.T_target_source
         return pair.is_right(T), bool(found.believed), found.probability or 0.0
@@ -267,18 +268,18 @@ def off_and_belief(pair: Pair, found: Registration | Float64) -> tuple[bool, boo
 
 
 def timed(method: pairs.Method, pair: Pair) -> tuple[bool, bool, float, float]:
-    """As `off_and_belief`, and seconds; what refuses is wrong."""
+    """As `correctness`, and seconds; a failed registration counts as wrong."""
     views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
     start = time.perf_counter()
     try:
         found = method(*views)
     except RegistrationError:
         return False, False, 0.0, time.perf_counter() - start
-    return *off_and_belief(pair, found), time.perf_counter() - start
+    return *correctness(pair, found), time.perf_counter() - start
 
 
-def print_table(names: list[str], data: Path, most: int) -> None:
-    """A row for each kind, and what the probability is worth over all of them."""
+def print_table(names: list[str], data: Path, max_pairs: int) -> None:
+    """Print a row for each kind, and the ROC area of the probability over all of them."""
     print(
         "| Clouds | right | of these accepted | accepted and wrong | s a pair"
         " | Open3D | s | KISS-Matcher | s |\n|---|---|---|---|---|---|---|---|---|"
@@ -287,7 +288,7 @@ def print_table(names: list[str], data: Path, most: int) -> None:
     for name in names:
         ours, theirs = [], ([], [])  # type: ignore[var-annotated]
         try:
-            made = list(KINDS[name].make(data, most, np.random.default_rng([1, 5])))
+            made = list(KINDS[name].make(data, max_pairs, np.random.default_rng([1, 5])))
         except FileNotFoundError:
             print(f"| {name}: no data |")
             continue
@@ -309,7 +310,7 @@ def print_table(names: list[str], data: Path, most: int) -> None:
     )
     print(f"area under the ROC curve {pairs.roc_area(np.array(p), np.array(right)):.3f}")
     pairs.print_calibration(np.array(p), np.array(right))
-    _print_decoys(names, data, most)
+    _print_decoys(names, data, max_pairs)
 
 
 def _row(title: str, ours: list, theirs: tuple[list, list]) -> str:  # type: ignore[type-arg]
@@ -329,27 +330,27 @@ def _row(title: str, ours: list, theirs: tuple[list, list]) -> str:  # type: ign
 
 
 def decoys(
-    names: list[str], data: Path, most: int, rng: np.random.Generator
+    names: list[str], data: Path, max_pairs: int, rng: np.random.Generator
 ) -> Iterator[tuple[Pair, str]]:
-    """Pairs of views of different places, some moved, and which kind the source is of."""
+    """Pairs of views of different places, some moved, with the kind of the source."""
     made: dict[str, list[Pair]] = {}
     for name in names:
         try:
-            made[name] = list(KINDS[name].make(data, most, rng))
+            made[name] = list(KINDS[name].make(data, max_pairs, rng))
         except FileNotFoundError:
             continue
     for name, mine in made.items():
         others = [n for n in made if KINDS[n].family != KINDS[name].family]
-        for _ in range(most if others else 0):
+        for _ in range(max_pairs if others else 0):
             other = made[others[int(rng.integers(len(others)))]]
             a, b = mine[int(rng.integers(len(mine)))], other[int(rng.integers(len(other)))]
             yield Pair(a.source, b.target, None), name
 
 
-def _print_decoys(names: list[str], data: Path, most: int) -> None:
+def _print_decoys(names: list[str], data: Path, max_pairs: int) -> None:
     found = [
         timed(tofuse.register, pair)
-        for pair, _ in decoys(names, data, most, np.random.default_rng([1, 6]))
+        for pair, _ in decoys(names, data, max_pairs, np.random.default_rng([1, 6]))
     ]
     if found:
         accepted = sum(f[1] for f in found)
@@ -357,33 +358,33 @@ def _print_decoys(names: list[str], data: Path, most: int) -> None:
         print(f"highest probability {max(f[2] for f in found):.2f}")
 
 
-def print_fit(data: Path, most: int) -> None:
-    """Coefficients of both models, and what those in use are worth for kinds that took no part."""
+def print_fit(data: Path, max_pairs: int) -> None:
+    """Print coefficients of both models, and test those in use on kinds not used in the fit."""
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, root of margin, root of contradiction, degenerate",
-        "Followed: constant, support, root of contradiction",
+        "Searched: constant, sqrt of margin, sqrt of contradiction, degenerate",
+        "Followed: constant, support, sqrt of contradiction",
     )
-    mine, theirs = (samples(names, data, most) for names in (fitted, others))
+    mine, theirs = (samples(names, data, max_pairs) for names in (fitted, others))
     for title, rows, held_out in zip(titles, mine, theirs, strict=True):
         pairs.print_fit(title, pairs.stacked([row[:3] for row in rows]))
         p = np.array([row[3] for row in held_out])
         right = np.array([row[1] for row in held_out], bool)
         accepted = p >= pairs.ACCEPTED
-        print(f"\nas in use, on {len(p)} poses of {', '.join(others)}:")
+        print(f"\ncoefficients in use, on {len(p)} poses of {', '.join(others)}:")
         print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, accepted", end=" ")
         print(f"{accepted.sum()}, of these wrong {(accepted & ~right).sum()}")
 
 
-# Regressors, whether the pose is right, number of the family, and the probability in use.
+# Regressors, whether the pose is right, index of the family, and the probability in use.
 Row = tuple[Float64, bool, int, float]
 
 
-def samples(names: list[str], data: Path, most: int) -> tuple[list[Row], list[Row]]:
-    """Poses that were searched, and that were followed from guesses without degenerate directions.
+def samples(names: list[str], data: Path, max_pairs: int) -> tuple[list[Row], list[Row]]:
+    """Poses from the global search, and from initial guesses without degenerate directions.
 
-    A part of the pairs is of different places.
+    Some of the pairs are of different places.
     """
     families = sorted({kind.family for kind in KINDS.values()})
     searched: list[Row] = []
@@ -392,10 +393,10 @@ def samples(names: list[str], data: Path, most: int) -> tuple[list[Row], list[Ro
     todo = []
     for name in names:
         try:
-            todo += [(pair, name) for pair in KINDS[name].make(data, most, rng)]
+            todo += [(pair, name) for pair in KINDS[name].make(data, max_pairs, rng)]
         except FileNotFoundError:
             print(f"{name}: no data")
-    todo += list(decoys(names, data, most, rng))
+    todo += list(decoys(names, data, max_pairs, rng))
     for pair, name in todo:
         views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
         start = np.eye(4) if pair.true is None else pair.true
@@ -422,12 +423,12 @@ def samples(names: list[str], data: Path, most: int) -> tuple[list[Row], list[Ro
     return searched, followed
 
 
-def print_viewpoints(names: list[str], data: Path, most: int) -> None:
-    """Of how many clouds the origin counts as the viewpoint, where it is and where it is not."""
+def print_viewpoints(names: list[str], data: Path, max_pairs: int) -> None:
+    """Print for how many clouds the origin is taken for the viewpoint, rightly and wrongly."""
     counts = {False: [0, 0], True: [0, 0]}
     for name in names:
         try:
-            made = list(KINDS[name].make(data, most, np.random.default_rng([1, 5])))
+            made = list(KINDS[name].make(data, max_pairs, np.random.default_rng([1, 5])))
         except FileNotFoundError:
             continue
         count = counts[name.endswith("-moved")]
@@ -436,7 +437,7 @@ def print_viewpoints(names: list[str], data: Path, most: int) -> None:
             count[1] += 1
     for moved, (found, total) in counts.items():
         where = "another frame" if moved else "the camera's frame"
-        print(f"in {where} the origin counts as the viewpoint of {found} of {total} clouds")
+        print(f"in {where} the origin is taken for the viewpoint of {found} of {total} clouds")
 
 
 def _off_by(metres: float, degrees: float, rng: np.random.Generator) -> Float64:
@@ -451,7 +452,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, default=DATA)
     shown = [kind.name for kind in KINDS.values() if kind.shown]
     parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=shown)
-    parser.add_argument("--pairs", type=int, default=8, help="of each step")
+    parser.add_argument("--pairs", type=int, default=8, help="pairs for each step")
     given = parser.parse_args(arguments)
     if given.what == "table":
         print_table(given.kinds, given.data, given.pairs)

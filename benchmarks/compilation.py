@@ -1,11 +1,11 @@
-"""How long the first run on a machine compiles, alone and with a second process beside it.
+"""Compilation time of the first run on a machine, alone and with a second compiling process.
 
     python benchmarks/compilation.py [RECORDING]
     python benchmarks/compilation.py --list RECORDING [RECORDING ...]
 
-Each row is a `tofuse run` in a process of its own: with all kernels in the cache, with none and no
-second process, and with none and the second process (`tofuse.kernels.ahead`). `--list` writes the
-list by which that process works, from what runs of the recordings call.
+Each row is a `tofuse run` in its own process: with all kernels cached, with an empty cache, and
+with an empty cache and the second process (`tofuse.kernels.ahead`). `--list` writes the list of
+kernels that this process compiles, from those that runs of the recordings call.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ BOTH = "import sys; from tofuse.cli import main; sys.exit(main())"
 def seconds(program: str, recording: Path, cache: str) -> float:
     """Wall time of a run."""
     with tempfile.TemporaryDirectory() as out:
-        words = ["run", str(recording), "--out", f"{out}/result", "--threads", "2"]
+        args = ["run", str(recording), "--out", f"{out}/result", "--threads", "2"]
         start = time.perf_counter()
         subprocess.run(
-            [sys.executable, "-c", program, *words],
+            [sys.executable, "-c", program, *args],
             env=os.environ | {"NUMBA_CACHE_DIR": cache},
             check=True,
             capture_output=True,
@@ -43,20 +43,20 @@ def seconds(program: str, recording: Path, cache: str) -> float:
 
 
 def print_table(recording: Path) -> None:
-    """Print the seconds of each way."""
+    """Print the seconds of each case."""
     print("| kernels | s |\n|---|---|")
     with tempfile.TemporaryDirectory() as cache:
         cold = seconds(ALONE, recording, cache)
         warm = seconds(ALONE, recording, cache)
     with tempfile.TemporaryDirectory() as cache:
-        beside = seconds(BOTH, recording, cache)
-    print(f"| in the cache | {warm:.1f} |")
+        helped = seconds(BOTH, recording, cache)
+    print(f"| cached | {warm:.1f} |")
     print(f"| compiled by the run alone | {cold:.1f} |")
-    print(f"| and by a second process | {beside:.1f} |")
+    print(f"| compiled with a second process | {helped:.1f} |")
 
 
 def called(recordings: list[Path]) -> list[str]:
-    """Lines of the list, in the order in which runs call kernels from Python."""
+    """Lines of the list, in the order in which runs call the kernels."""
     lines: dict[str, None] = {}
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NUMBA_CACHE_DIR"] = cache

@@ -1,16 +1,16 @@
-"""Are covariances right? Errors of simulated pairs of views, in units of their stated sigma.
+"""Are covariances consistent? Normalised errors of simulated pairs of views.
 
-Pairs of five kinds of scene, with all effects of the camera and its factory correction, are
-aligned from a guess 1 cm and half a degree off. Half of the sequences have a random steady motion
-on top of the scene's own, a fifth have uniform albedo. The covariance's eigen-directions are
-sorted from the tightest (1) to the loosest (6), in units of 1 cm and 1 degree; the error along
-each, over its sigma, should be within 0.674, 1.645 and 1.960 in 50, 90 and 95 of 100 cases.
-Directions that were reported as unobservable, and alignments that the tracker would not have
-accepted, are counted and left out. "plain" is the inverse of the plain information matrix.
+Pairs from five kinds of scene, with all camera effects and factory correction, are aligned from an
+initial error of 1 cm and 0.5 degrees. Half of the sequences add a random constant motion to that of
+the scene; a fifth have uniform albedo. The eigenvectors of the covariance are sorted from the best
+(1) to the worst (6) constrained, in units of 1 cm and 1 degree; the error along each, divided by
+its sigma, should be below 0.674, 1.645 and 1.960 in 50, 90 and 95 % of the cases. Directions
+reported as unobservable, and alignments that the tracker would reject, are counted and excluded.
+"plain" is the inverse of the plain information matrix.
 
     python benchmarks/covariance.py [--pairs 500] [--noise poisson other] [--seed 1000]
 
-The constants were chosen on seeds 0 to 7 and 100 to 116; --seed 1000 and above are others.
+The constants were tuned on seeds 0 to 7 and 100 to 116; seeds from 1000 on are independent.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ WANTED = ((40, 60), (85, 95), (91, 98))
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Three views of one scene, and where the camera truly was."""
+    """Three views of one scene, and the true camera poses."""
 
     frames: list[RangeFrame]
     T_room_camera: list[Float64]
 
 
 def chain(kind: str, seed: int, effects: Effects, camera: str) -> Chain:
-    """Take three views, one to six raw frames apart."""
+    """Simulate three views, one to six raw frames apart."""
     rng = np.random.default_rng([seed, KINDS.index(kind), 77])
     model = camera_model(camera)
     scene, sequence = build(kind, seed=seed, texture=bool(rng.random() > 0.2))
@@ -105,9 +105,9 @@ def outcome(
     options = ProjectiveOptions()
     truth = se3.inverse(poses[a]) @ poses[b]
     rng = np.random.default_rng([seed, a, b, KINDS.index(kind)])
-    off = np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, np.radians(0.5), 3)])
+    perturbation = np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, np.radians(0.5), 3)])
     targets = [Target(views[a], np.eye(4))]
-    aligned = align(views[b], targets, truth @ se3.exp(off), options)
+    aligned = align(views[b], targets, truth @ se3.exp(perturbation), options)
     if not UsualFit().assess(aligned).usual:
         return None
     plain: Float64 = np.linalg.inv(aligned.information + np.diag(1e-6 / UNITS**2))
@@ -120,7 +120,7 @@ def outcome(
 
 
 def whitened(found: Outcome, C: Float64) -> Float64:
-    """(6,) errors in sigmas from the tightest direction to the loosest, NaN if unobservable."""
+    """(6,) errors in sigmas, best to worst constrained direction; NaN: unobservable."""
     values, vectors = np.linalg.eigh(C / np.outer(UNITS, UNITS))
     out = np.abs(vectors.T @ (found.error / UNITS)) / np.sqrt(values)
     if len(found.unobservable):
@@ -144,7 +144,7 @@ def row(name: str, errors: Float64) -> str:
 def report(found: list[Outcome], which: int) -> None:
     errors = np.array([whitened(f, f.covariances[which]) for f in found])
     kinds = np.array([f.kind for f in found])
-    print("               count     50     90     95   median error / its wanted value")
+    print("               count     50     90     95   median error / expected")
     print(row("all", errors))
     for k in range(6):
         print(row(f"direction {k + 1}", errors[:, k]))
@@ -163,7 +163,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for noise in arguments.noise:
         found: list[Outcome] = []
-        refused = 0
+        rejected = 0
         for kind, seed, made in chains(arguments, noise):
             frames = made.frames
             if arguments.compensate:
@@ -173,16 +173,17 @@ def main() -> None:
             for pair in PAIRS:
                 got = outcome(kind, seed, views, made.T_room_camera, pair)
                 if got is None:
-                    refused += 1
+                    rejected += 1
                 else:
                     found.append(got)
         directions = sum(len(f.unobservable) for f in found)
         print(
-            f"\n{arguments.camera}, noise {noise}: {len(found)} pairs, {refused} refused, ", end=""
+            f"\n{arguments.camera}, noise {noise}: {len(found)} pairs, {rejected} rejected, ",
+            end="",
         )
         print(f"{directions} directions unobservable; % within the 50, 90, 95 % interval")
         report(found, 0)
-        print(" with the plain information instead")
+        print(" with the plain information matrix instead")
         report(found, 1)
 
 

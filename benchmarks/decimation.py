@@ -1,11 +1,11 @@
-"""How far a surface moves when it is decimated, by vertex clustering and by collapsing edges.
+"""Geometric error of mesh decimation, by vertex clustering and by edge collapse.
 
 Each result folder's `mesh.ply` is reduced to the same number of triangles by `Mesh.clustered`, by
 `Mesh.decimated` (quadric edge collapse, by fast-simplification), and, if it is installed, by Open3D
 (the same, with a priority queue). Printed are the mean, 99th percentile and maximum of the
-distances in mm between 400,000 points of one surface and the other, both ways; the share of the
-area that faces away from the normal of the nearest vertex of the whole surface; and the processor
-time.
+distances in mm between 400,000 points of one surface and the other, in both directions; the
+fraction of the area whose normal is flipped relative to the nearest vertex of the original; and the
+CPU time.
 
     pip install tofuse[bench]
     tofuse demo --out room
@@ -30,7 +30,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.kernels.kdtree import KdTree
 
 _POINTS = 400_000
-_SAMPLES = 4_000_000  # of a surface to which distances are measured
+_SAMPLES = 4_000_000  # of the surface to which distances are measured
 
 Shape = tuple[NDArray[np.floating], NDArray[np.integer]]  # vertices and faces
 
@@ -57,8 +57,8 @@ METHODS: dict[str, Callable[[Mesh, int], Shape]] = {
 }
 
 
-def opened(folder: Path) -> Mesh:
-    """The surface of a result."""
+def loaded(folder: Path) -> Mesh:
+    """Load the mesh of a result."""
     ply = read_ply(folder / "mesh.ply")
     assert ply.faces is not None
     assert ply.normals is not None
@@ -69,8 +69,8 @@ def opened(folder: Path) -> Mesh:
     )  # fmt: skip
 
 
-def turned_away(mesh: Mesh, shape: Shape) -> float:
-    """Share of the area of a shape that faces away from the surface."""
+def flipped(mesh: Mesh, shape: Shape) -> float:
+    """Fraction of the area of a decimated mesh with flipped normals."""
     corners = shape[0][shape[1]].astype(float)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
@@ -79,9 +79,9 @@ def turned_away(mesh: Mesh, shape: Shape) -> float:
     return float(area[away].sum() / area.sum())
 
 
-def words(off: Float64 | Float32) -> str:
+def statistics(distances_m: Float64 | Float32) -> str:
     """Mean, 99th percentile and maximum in mm."""
-    mm = 1000 * off
+    mm = 1000 * distances_m
     return f"{mm.mean():.2f} / {np.percentile(mm, 99):.1f} / {mm.max():.0f}"
 
 
@@ -91,10 +91,12 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=60_000)
     given = parser.parse_args()
     for folder in given.results:
-        mesh = opened(folder)
+        mesh = loaded(folder)
         whole = Surface(mesh.vertices.astype(float), mesh.faces)
         print(f"{folder.name}: {len(mesh.faces)} triangles, reduced to {given.faces}\n")
-        print("| method | triangles | whole to reduced | reduced to whole | turned away | CPU s |")
+        print(
+            "| method | triangles | original to reduced | reduced to original | flipped | CPU s |"
+        )
         print("|---|---|---|---|---|---|")
         for name, reduce in METHODS.items():
             if name == "open3d" and importlib.util.find_spec(name) is None:
@@ -109,8 +111,8 @@ def main() -> None:
             there = distances(whole.samples(_POINTS)[0], reduced, _SAMPLES)
             back = distances(reduced.samples(_POINTS)[0], whole, _SAMPLES)
             print(
-                f"| {name} | {len(shape[1])} | {words(there)} | {words(back)} "
-                f"| {turned_away(mesh, shape):.1%} | {seconds:.1f} |",
+                f"| {name} | {len(shape[1])} | {statistics(there)} | {statistics(back)} "
+                f"| {flipped(mesh, shape):.1%} | {seconds:.1f} |",
                 flush=True,
             )
         print()

@@ -1,18 +1,20 @@
-"""Does the tracker know which directions it can't see? ROC over scenes with and without them.
+"""Detection of degenerate directions by the tracker: ROC over scenes with and without them.
 
-Truth: the noise-free information of a pair of views (exact normals and albedo of the simulated
-scene, the camera's known noise, pixels within its ambiguity and seen by both views) leaves a sigma
-above 1 cm or 1 degree in an eigen-direction. Score: the sigma that the estimate states for that
-direction, from views with all effects. Pooled over empty room, wall, corridor, corner and
-furnished room, each with uniform and with textured albedo; for geometry alone, and with amplitude.
+Ground truth: a direction is degenerate if the noise-free information of the pair of views (exact
+normals and albedo of the simulated scene, the camera's noise model, pixels within its ambiguity
+range and seen by both views) gives a sigma above 1 cm or 1 degree along this eigenvector. Score:
+the stated sigma along it, estimated from views with all camera effects. Pooled over empty room,
+wall, corridor, corner and furnished room, each with uniform and with textured albedo; for geometry
+alone, and with amplitude.
 
-Exact surfaces are not all that holds a camera: dark and light surfaces err differently in range,
-and that relief moves with the surface. Of the directions that the exact geometry leaves open it is
-therefore looked whether an alignment that begins 3 cm or 3 degrees off, on either side, and holds
-nothing at its guess, comes back to within 1. The ROC area is printed once more without those.
+Exact surfaces are not all that constrains a camera: range errors differ between dark and bright
+surfaces, and that relief is fixed to the surface. For each direction that is degenerate by the
+exact geometry, alignments therefore start 3 cm or 3 degrees off, on either side, without a prior;
+if they return to within 1, the images constrain it. The ROC area is also printed without these
+directions.
 
-"cross" is the symmetrised cross-information less what can be faked, "plain" the information matrix,
-"covariance" the calibrated covariance. Multipath is compensated first, as by default.
+"cross" is the symmetrised cross-information minus spurious information, "plain" the information
+matrix, "covariance" the calibrated covariance. Multipath is compensated first, as by default.
 
     python benchmarks/degeneracy.py [--seeds 12] [--first 2000]
 """
@@ -45,7 +47,7 @@ from tofuse.sensor.noise import of_camera
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree
 PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
-# Neighbours further off the plane than this lie on another surface.
+# Neighbours farther from the plane lie on another surface.
 SAME_PLANE_M = 0.01
 
 
@@ -87,8 +89,8 @@ def true_information(
         )
     seen &= cosine > 0.05
     contrast, gain = model.modulation_contrast, model.counts_per_electron
-    light = albedo * cosine / distance**2 * model.transmission
-    amplitude = np.maximum(model.signal_electrons * contrast * gain * light, 1e-3)
+    returned = albedo * cosine / distance**2 * model.transmission
+    amplitude = np.maximum(model.signal_electrons * contrast * gain * returned, 1e-3)
     law = of_camera(model).amplitude
     assert law is not None
     sigma = np.sqrt(law.floor**2 + law.shot**2 / amplitude + law.dark**2 / amplitude**2)
@@ -107,8 +109,8 @@ def true_information(
     for axis, out in ((1, du), (0, dv)):
         for sign in (-1, 1):
             near = np.roll(points, -sign, axis)
-            off = np.abs(((near - points) * normal).sum(-1))
-            whole &= (off < SAME_PLANE_M) & np.roll(seen, -sign, axis)
+            plane_distance = np.abs(((near - points) * normal).sum(-1))
+            whole &= (plane_distance < SAME_PLANE_M) & np.roll(seen, -sign, axis)
             out += sign * np.roll(log_albedo, -sign, axis) / 2
     xu = (np.roll(rays[..., 0], -1, 1) - np.roll(rays[..., 0], 1, 1)) / 2
     yv = (np.roll(rays[..., 1], -1, 0) - np.roll(rays[..., 1], 1, 0)) / 2
@@ -118,22 +120,22 @@ def true_information(
     K = np.concatenate([m, np.cross(points, m), -np.ones((height, width, 1))], -1)
     sigma_log = sigma * 2 * np.pi / model.period_m
     weight = np.where(whole, 1 / (2 * sigma_log**2), 0)
-    photo = np.einsum("ij,ijk,ijl->kl", weight, K, K)
-    if photo[6, 6] > 0:
-        photo[:6, :6] -= np.outer(photo[:6, 6], photo[6, :6]) / photo[6, 6]
-    return geometry, geometry + photo[:6, :6]
+    photometric = np.einsum("ij,ijk,ijl->kl", weight, K, K)
+    if photometric[6, 6] > 0:
+        photometric[:6, :6] -= np.outer(photometric[:6, 6], photometric[6, :6]) / photometric[6, 6]
+    return geometry, geometry + photometric[:6, :6]
 
 
 def sigma_along(information: Float64, direction: Float64) -> float:
-    """Sigma along a unit direction, the others known, in units of 1 cm and 1 degree."""
+    """Conditional sigma along a unit direction, in units of 1 cm and 1 degree."""
     along = direction @ (information * np.outer(UNITS, UNITS)) @ direction
     return float(1 / np.sqrt(max(along, 1e-6)))
 
 
-def comes_back(
+def returns(
     views: Sequence[PreparedView], T: Float64, direction: Float64, options: ProjectiveOptions
 ) -> bool:
-    """Whether the images themselves hold a direction: see above."""
+    """Whether the images themselves constrain a direction, see above."""
     free = replace(
         options, levels=PATIENT, constrained=1e6, common_tilt=0.0, prior_m=3.0, prior_rad=3.0
     )
@@ -147,7 +149,7 @@ def comes_back(
 
 
 def roc_area(score: Float64, positive: Bool) -> float:
-    """Share of pairs of a positive and a negative that the score ranks rightly."""
+    """Area under the ROC curve: fraction of positive-negative pairs in the right order."""
     ranks = np.argsort(np.argsort(score)) + 1.0
     n, m = positive.sum(), (~positive).sum()
     if not n or not m:
@@ -199,14 +201,14 @@ def main() -> None:
                     v = vectors[:, k]
                     scores = {n: sigma_along(H, v) for n, H in estimates.items()}
                     scores["covariance"] = float(np.sqrt(v @ C @ v))
-                    back = sigma > 1 and comes_back(views, T, v, options)
+                    back = sigma > 1 and returns(views, T, v, options)
                     rows[term].append((name, sigma, scores, float(weak[k]), back))
     for term, found in rows.items():
         truth = np.array([sigma > 1 for _, sigma, _, _, _ in found])
         back = np.array([back for *_, back in found])
         print(
             f"\n{term}: {len(found)} directions, {truth.sum()} unobservable, "
-            f"{back.sum()} of which the images hold"
+            f"{back.sum()} of which the images constrain"
         )
         for score in ("cross", "plain", "covariance"):
             values = np.array([scores[score] for _, _, scores, _, _ in found])
@@ -219,9 +221,9 @@ def main() -> None:
             )
         flagged = np.array([weak > 0.5 for _, _, _, weak, _ in found])
         print(f"  reported as unobservable: right {np.mean(flagged == truth):.1%}")
-        # A sigma of 0.7 to 1.4 units is neither held nor free.
+        # A sigma of 0.7 to 1.4 units is ambiguous.
         clear = np.array([not 0.7 < sigma < 1.4 for _, sigma, _, _, _ in found])
-        print(f"  of the {clear.sum()} clear ones right {np.mean((flagged == truth)[clear]):.1%}")
+        print(f"  of the {clear.sum()} unambiguous: right {np.mean((flagged == truth)[clear]):.1%}")
         for name in sorted({name for name, *_ in found}):
             mine = np.array([n == name for n, *_ in found])
             print(

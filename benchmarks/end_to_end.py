@@ -1,10 +1,9 @@
-"""Whole runs, as a person starts them: seconds of each stage, ms a frame, and peak memory.
+"""Whole runs from the command line: seconds per stage, ms per frame, and peak memory.
 
-Each run is a process of its own, `tofuse run` with nothing but its defaults, from the first file
-read to the report. It is run once before, which compiles what is not compiled yet and leaves the
-files in the system's memory, and that is not counted. Where Open3D is installed, its dense SLAM
-gets the same frames by the same reader, and ends with a mesh in a file: neither loops nor a report
-are in that. Its process counts from the first frame, not from its start.
+Each run is a separate process, `tofuse run` with its defaults, from the first file read to the
+report. An untimed run before it fills the kernel cache and the file cache. If Open3D is installed,
+its dense SLAM processes the same frames from the same reader and writes a mesh, without loop
+closures or a report. Its time starts at the first frame, not at the start of the process.
 
     python benchmarks/end_to_end.py [--inputs kitchen room] [--end 1000] [--repeats 3]
 """
@@ -25,15 +24,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-# Nothing large is imported here: a process that is started counts what its parent held.
+# No large imports here: a child's peak memory includes that of its parent at the fork.
 HERE = Path(__file__).resolve().parent
 DATA = HERE.parents[1] / "shared" / "data"
 INPUTS = ("kitchen", "room")
 
 
 @dataclass(frozen=True)
-class Spent:
-    """What a process took: seconds, of all threads together too, peak memory, and its stages."""
+class Usage:
+    """Resources used by a process: wall and CPU time, peak memory, and seconds per stage."""
 
     wall_s: float
     cpu_s: float
@@ -42,49 +41,49 @@ class Spent:
     stages: dict[str, float]
 
     @property
-    def ms_a_frame(self) -> float:
-        """Of the whole, from start to end."""
+    def ms_per_frame(self) -> float:
+        """Wall time per frame."""
         return 1e3 * self.wall_s / max(1, self.frames)
 
 
 def measured(command: Sequence[str], allowed: Sequence[int] = (0,)) -> tuple[float, float, float]:
-    """Run a process to its end: seconds, CPU seconds and peak MB; RuntimeError if it fails."""
-    with tempfile.TemporaryFile() as said:
+    """Run a process; return seconds, CPU seconds and peak MB. RuntimeError if it fails."""
+    with tempfile.TemporaryFile() as stderr:
         start = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr)
         _, status, used = os.wait4(process.pid, 0)
         wall = time.perf_counter() - start
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode not in allowed:
-            said.seek(0)
-            raise RuntimeError(said.read().decode(errors="replace").strip()[-500:])
+            stderr.seek(0)
+            raise RuntimeError(stderr.read().decode(errors="replace").strip()[-500:])
     unit = 1 if sys.platform == "darwin" else 1024
     return wall, used.ru_utime + used.ru_stime, used.ru_maxrss * unit / 1e6
 
 
-def tofuse_run(source: Path, chosen: Sequence[str], threads: int) -> Spent:
+def tofuse_run(source: Path, chosen: Sequence[str], threads: int) -> Usage:
     """Run `tofuse run` on a recording."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result"
         command = [sys.executable, "-m", "tofuse", "run", str(source), "--out", str(out), *chosen]
-        # Frames without a pose are a result as well.
+        # Status 3: a result in which frames have no pose.
         wall, cpu, peak = measured([*command, "--threads", str(threads)], (0, 3))
         written = json.loads((out / "run.json").read_text())
-    return Spent(wall, cpu, peak, written["input"]["frames"], dict(written["seconds"]))
+    return Usage(wall, cpu, peak, written["input"]["frames"], dict(written["seconds"]))
 
 
-def peer_run(source: Path, chosen: Sequence[str], threads: int) -> Spent:
-    """Run Open3D's dense SLAM on the same frames, in a process of its own."""
+def peer_run(source: Path, chosen: Sequence[str], threads: int) -> Usage:
+    """Run Open3D's dense SLAM on the same frames, in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, __file__, "--peer", str(source), "--peer-out", folder, *chosen]
         _, cpu, peak = measured([*command, "--threads", str(threads)])
         written = json.loads((Path(folder) / "peer.json").read_text())
     stages = written["seconds"]
-    return Spent(sum(stages.values()), cpu, peak, written["frames"], stages)
+    return Usage(sum(stages.values()), cpu, peak, written["frames"], stages)
 
 
 def peer(source: str, out: Path, start: int, end: int | None, every: int, threads: int) -> None:
-    """Be that process."""
+    """Entry point of that process."""
     from peers.o3d import DenseSlam
     from tofuse.recordings.frames import RangeFrame
     from tofuse.recordings.open import open_recording
@@ -114,7 +113,7 @@ def peer(source: str, out: Path, start: int, end: int | None, every: int, thread
 
 
 def located(name: str, data: Path) -> Path:
-    """Return where an input is; one that is simulated is made first, by another process."""
+    """Return the path of an input; a simulated one is created first, by another process."""
     if name == "kitchen":
         return data / "sevenscenes_kitchen"
     if name not in INPUTS:
@@ -126,32 +125,35 @@ def located(name: str, data: Path) -> Path:
     return path
 
 
-def table(rows: Sequence[tuple[str, Sequence[Spent]]]) -> Iterator[str]:
-    """Medians of the runs of each method, and below it the stages of the median run."""
-    yield f"{'':<20}{'frames':>8}{'s':>8}{'ms a frame':>12}{'CPU s':>8}{'peak MB':>9}"
+def table(rows: Sequence[tuple[str, Sequence[Usage]]]) -> Iterator[str]:
+    """Yield the medians over the runs of each method, and the stages of the median run."""
+    yield f"{'':<20}{'frames':>8}{'s':>8}{'ms/frame':>12}{'CPU s':>8}{'peak MB':>9}"
     for name, runs in rows:
         wall = statistics.median(run.wall_s for run in runs)
-        middle = min(runs, key=lambda run: abs(run.wall_s - wall))
+        median_run = min(runs, key=lambda run: abs(run.wall_s - wall))
         yield (
-            f"{name:<20}{middle.frames:>8}{wall:>8.1f}{1e3 * wall / max(1, middle.frames):>12.1f}"
+            f"{name:<20}{median_run.frames:>8}{wall:>8.1f}"
+            f"{1e3 * wall / max(1, median_run.frames):>12.1f}"
             f"{statistics.median(run.cpu_s for run in runs):>8.1f}"
             f"{max(run.peak_mb for run in runs):>9.0f}"
         )
-        rest = middle.wall_s - sum(middle.stages.values())
-        for part, s in {**middle.stages, "start, writing": max(0.0, rest)}.items():
+        rest = median_run.wall_s - sum(median_run.stages.values())
+        for part, s in {**median_run.stages, "start, writing": max(0.0, rest)}.items():
             if s >= 0.05:
-                fraction = s / max(middle.wall_s, 1e-9)
-                each = 1e3 * s / max(1, middle.frames)
+                fraction = s / max(median_run.wall_s, 1e-9)
+                each = 1e3 * s / max(1, median_run.frames)
                 yield f"  {part:<26}{s:>8.1f}{each:>12.1f}{fraction:>8.0%}"
     if len(rows) > 1:
-        ours, theirs = (statistics.median(r.ms_a_frame for r in runs) for _, runs in rows[:2])
+        ours, theirs = (statistics.median(r.ms_per_frame for r in runs) for _, runs in rows[:2])
         yield f"{rows[1][0]} takes {theirs / ours:.1f} times as long"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--inputs", nargs="+", default=list(INPUTS), help="or any recording")
-    parser.add_argument("--data", type=Path, default=DATA, help="where recorded sequences are")
+    parser.add_argument(
+        "--inputs", nargs="+", default=list(INPUTS), help="sequences, or paths of recordings"
+    )
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded sequences")
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--end", type=int)
     parser.add_argument("--every", type=int, default=1)
@@ -172,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options.threads,
         )
         return
-    if hasattr(os, "sched_setaffinity"):  # peers take what they get
+    if hasattr(os, "sched_setaffinity"):  # peers use all that are available
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[: options.threads])
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -193,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         source = located(name, options.data)
         print(f"\n{name}", flush=True)
         if not source.exists():
-            print("  its data is not there")
+            print("  no data")
             continue
         if not options.no_first:
             tofuse_run(source, chosen, options.threads)

@@ -2,9 +2,9 @@
 
     python benchmarks/filters_sr4000.py [folder of sr4000_corridor]
 
-The camera stands still at each position, so what varies at a pixel is noise: the standard
-deviation of z over the frames there. It is taken over the pixels that a filter keeps in every
-frame of the position. The temporal filter is given the same frames that it is judged by.
+The camera is static at each position, so the standard deviation of z over the frames there is
+noise. It is computed for pixels that a filter keeps in every frame of the position. The temporal
+filter is evaluated on the frames that it filters.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ class Noise:
 
 
 def temporal_noise(positions: Sequence[Sequence[RangeFrame]], filters: Sequence[Filter]) -> Noise:
-    """Pool the temporal standard deviation of z over still frames of several positions."""
+    """Pool the temporal standard deviation of z over static frames at several positions."""
     deviations, seen = [], 0
     for frames in positions:
         kept = np.all([f.valid for f in frames], axis=0)
         seen += int(kept.sum())
         for k, frame in enumerate(frames):
-            # All the others stand in for history, as the first frames have none.
+            # The other frames serve as history, as the first frames have none.
             others = [*frames[k + 1 :], *frames[:k]]
             kept &= apply_filters(filters, frame, others)[0].valid
         deviations.append(z_deviation([f.z for f in frames])[kept])
@@ -83,7 +83,7 @@ def still_frames(folder: Path) -> list[list[RangeFrame]]:
 def main() -> None:
     positions = still_frames(Path(sys.argv[1]) if len(sys.argv) > 1 else DATA)
     before = temporal_noise(positions, [])
-    print(f"{'':36}{'median':>9}{'rms':>9}{'kept':>8}{'median lowered':>16}")
+    print(f"{'':36}{'median':>9}{'rms':>9}{'kept':>8}{'median reduced':>16}")
     for name, filters in CASES.items():
         noise = temporal_noise(positions, filters)
         lowered = before.median_m / noise.median_m

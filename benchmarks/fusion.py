@@ -1,20 +1,19 @@
-"""How near the fused surface is to the truth, and what fusion costs.
+"""Accuracy and completeness of the fused surface, and cost of fusion.
 
-The simulated room is taken by the SR4000, by default with noise, mixed pixels, phase wraps and
-saturation only (`--all`: with all errors of the camera). The surface is made at the true
-poses, and (`--estimated`) at those of the default method; errors are the distances to the true
-surface. Completeness is the fraction of the truth within 1 cm of the model: of what was seen by a
-pixel that is valid (this camera gives noise where there is too little light), and of what the
-filters keep. Where Open3D is installed, its own fusion gets the same frames, filtered, at the same
-poses, with voxels of the same size; it is shown with all surfaces and with those of three views.
-Then one pass over the views
-is fused again and again, to see whether a frame costs the same in a volume that has been filled.
-Times are of one thread, process time.
+The simulated room is recorded by the SR4000, by default with noise, mixed pixels, phase wraps and
+saturation only (`--all`: with all errors of the camera). Views are fused at the true poses, and
+(`--estimated`) at those of the default method; errors are distances to the true surface.
+Completeness is the fraction of the true surface within 1 cm of the model: of the surface seen by
+valid pixels (this camera outputs noise where the signal is too weak), and of that kept by the
+filters. If Open3D is installed, its fusion gets the same filtered frames and poses and the same
+voxel size; results are for surfaces with a weight of one and of three views. The pass over the
+views is then repeated, to see whether the cost per frame is constant in a volume that is already
+filled. Times are CPU times on one thread.
 
-With `--frames` it is shown instead what a frame costs, and how much is kept of all, while more and
-more are taken in the same room. With `--memory` so many frames of the flat, walked through once,
-are fused within several bounds of memory, each in a process of its own: how many regions that
-makes, the most memory that the process held before and in all, and a digest of the surface.
+`--frames` prints instead the cost per frame and the memory of the stored views, as more and more
+frames of one room are added. With `--memory`, `--frames` frames of one walk through the flat are
+fused within several memory limits, each in its own process: number of regions, peak memory before
+fusion and in total, and a digest of the surface.
 
     python benchmarks/fusion.py [--every 1] [--all] [--estimated] [--repeat 4] [--frames 5000]
     python benchmarks/fusion.py --memory 600 200 50 10 --frames 400
@@ -61,12 +60,12 @@ from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_FRACTION = 0.01  # of the range
-_ELSEWHERE = np.repeat([0.05, 0.03], 3)  # m and radians off the path
-_CELL_M = 0.01  # of the points that were seen, one is taken in each
+_ELSEWHERE = np.repeat([0.05, 0.03], 3)  # deviation from the path, m and rad
+_CELL_M = 0.01  # one observed point is kept in each cell
 
 
 def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
-    """The plan and its frames, with the factory correction applied."""
+    """The plan and its frames, after factory correction."""
     made = plan("room", effects=Effects() if everything else _NOISE)
     made = replace(made, raw=made.raw[::every])
     frames = []
@@ -78,7 +77,7 @@ def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
 
 
 def seen_by(made: Plan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
-    """True points (N, 3) behind the pixels of the masks, one in each voxel."""
+    """True surface points (N, 3) of the pixels in the masks, one per cell."""
     seen = []
     rate = made.sequence.frame_rate_hz
     for raw, T_world, mask, frame in zip(made.raw, made.poses, masks, frames, strict=True):
@@ -94,7 +93,7 @@ def seen_by(made: Plan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
 
 
 def method(everything: bool) -> Config:
-    """The default, without compensating for indirect light where there is none."""
+    """The default method, without multipath compensation if there is no multipath."""
     config = from_method("default")
     corrections = (c for c in config.corrections if everything or not isinstance(c, Multipath))
     return replace(config, corrections=tuple(corrections))
@@ -103,7 +102,7 @@ def method(everything: bool) -> Config:
 def views_of(
     frames: list[RangeFrame], config: Config
 ) -> tuple[list[RangeView], list[Bool], list[RangeFrame]]:
-    """What the method keeps of frames, which pixels its filters leave, and the corrected frames."""
+    """Stored views, masks of the pixels that pass the filters, and the corrected frames."""
     correctors = [correction.start() for correction in config.corrections]
     views, masks, corrected = [], [], []
     for frame in frames:
@@ -119,7 +118,7 @@ def views_of(
 
 
 def shape_of(mesh: Mesh) -> Surface:
-    """The mesh as what is compared."""
+    """The mesh as a surface for comparison."""
     return Surface(mesh.vertices, mesh.faces)
 
 
@@ -138,10 +137,10 @@ def row(label: str, shape: Surface, truth: Surface, seen: Float64, kept: Float64
 def around_the_room(
     count: int, seed: int = 0, *, scene: str = "room", step: int = 1
 ) -> Iterator[tuple[RangeFrame, Float64]]:
-    """Frames with their poses: laps of a simulated scene, each from slightly other places.
+    """Frames with their poses: laps through a simulated scene, each on a slightly different path.
 
-    Ranges are exact but for noise of 1 % that pixels do not share: rendering every frame with all
-    that the camera does would take hours.
+    Ranges are exact except for independent noise of 1 %: rendering every frame with all camera
+    effects would take hours.
     """
     made = plan(scene)
     camera = made.model.camera
@@ -159,14 +158,14 @@ def around_the_room(
 
 
 def long_run(count: int) -> None:
-    """Print what views of one room cost while there are more and more of them."""
+    """Print the cost per view of one room as the number of views grows."""
     builder = ModelBuilder(Fusion())
     poses: dict[int, Float64] = {}
     marks = {round(count * fraction) for fraction in (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
     kept_s: list[float] = []
     print(
-        f"{'frames':>7} {'views':>6} {'views MB':>9} {'keep ms a view':>16} "
-        f"{'fuse ms a view':>15} {'fuse ms a frame':>16} {'vertices':>9} {'peak MB':>8}"
+        f"{'frames':>7} {'views':>6} {'views MB':>9} {'store ms/view':>16} "
+        f"{'fuse ms/view':>15} {'fuse ms/frame':>16} {'vertices':>9} {'peak MB':>8}"
     )
     for frame, T in around_the_room(count):
         poses[frame.index] = T
@@ -191,7 +190,7 @@ def long_run(count: int) -> None:
 
 
 def memories(count: int, bounds: list[int]) -> None:
-    """Print what fusing one walk through the flat takes within several bounds of memory."""
+    """Print the cost of fusing one walk through the flat within several memory limits."""
     step = max(1, len(plan("flat").raw) // count)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames"
@@ -203,7 +202,7 @@ def memories(count: int, bounds: list[int]) -> None:
             f"{'CPU s':>7} {'vertices':>9} {'before MB':>10} {'peak MB':>8}  surface"
         )
         for bound in bounds:
-            # A process of its own: what the largest one held says nothing of the others.
+            # A process each: peak memory is that of the process, not of the call.
             spawned = multiprocessing.get_context("spawn").Process(
                 target=within, args=(path, count, bound)
             )
@@ -212,7 +211,7 @@ def memories(count: int, bounds: list[int]) -> None:
 
 
 def within(path: Path, count: int, memory_mb: int) -> None:
-    """Fuse the frames of a file within so much memory, and print what that took."""
+    """Fuse the frames of a file within a memory limit, and print the cost."""
     options = Fusion(memory_mb=memory_mb)
     store: Spill[RangeView] = Spill(memory_mb * 500_000)
     views = StoredViews(store)
@@ -228,13 +227,13 @@ def within(path: Path, count: int, memory_mb: int) -> None:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         started = time.process_time()
         mesh = fuse_surface(views, T_world, options)
-        spent = time.process_time() - started
+        cpu_s = time.process_time() - started
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     columns = (mesh.vertices, mesh.faces, mesh.normals, mesh.sigma, mesh.views)
     digest = hashlib.sha256(b"".join(each.tobytes() for each in columns)).hexdigest()[:8]
     print(
         f"{memory_mb:>9} {len(layout.keys):>8,} {regions:>8} {store.nbytes / 1e6:>9.0f} "
-        f"{store.spilled_bytes / 1e6:>8.0f} {spent:>7.1f} {len(mesh):>9,} {before:>10.0f} "
+        f"{store.spilled_bytes / 1e6:>8.0f} {cpu_s:>7.1f} {len(mesh):>9,} {before:>10.0f} "
         f"{peak:>8.0f}  {digest}",
         flush=True,
     )
@@ -246,8 +245,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--all", action="store_true", help="all errors of the camera")
     parser.add_argument("--estimated", action="store_true", help="also at estimated poses")
     parser.add_argument("--repeat", type=int, default=4)
-    parser.add_argument("--frames", type=int, help="only the cost of so many frames of one room")
-    parser.add_argument("--memory", type=int, nargs="+", help="bounds, MB, for frames of the flat")
+    parser.add_argument("--frames", type=int, help="only the cost of this many frames of one room")
+    parser.add_argument(
+        "--memory", type=int, nargs="+", help="memory limits, MB, for frames of the flat"
+    )
     options = parser.parse_args(arguments)
     if options.memory:
         memories(options.frames or 400, options.memory)
@@ -274,9 +275,9 @@ def main(arguments: list[str] | None = None) -> int:
         from peers import o3d
 
         clean = [frame.keep(mask) for frame, mask in zip(corrected, masks, strict=True)]
-        for least in (1.0, 3.0):
-            peer = Surface(*o3d.fused(clean, made.poses, fitting_voxel(views), least))
-            print(row(f"Open3D, weight {least:.0f}", peer, truth, seen, kept), flush=True)
+        for min_weight in (1.0, 3.0):
+            peer = Surface(*o3d.fused(clean, made.poses, fitting_voxel(views), min_weight))
+            print(row(f"Open3D, weight {min_weight:.0f}", peer, truth, seen, kept), flush=True)
     if options.estimated:
         mapper = Mapper(config)
         for frame in frames:
@@ -285,15 +286,15 @@ def main(arguments: list[str] | None = None) -> int:
         assert result.mesh is not None
         print(row("estimated", shape_of(result.mesh), truth, seen, kept))
         seconds = result.diagnostics.seconds["fusion"]
-        print(f"fusion took {1e3 * seconds / len(frames):.0f} ms a frame, all included")
+        print(f"fusion took {1e3 * seconds / len(frames):.0f} ms/frame in total")
     with threads(1):
         volume = Volume.around(views, made.poses, fitting_voxel(views), Fusion())
         print(f"voxels of {1e3 * volume.voxel_m:.1f} mm, {len(volume.keys):,} blocks")
         for turn in range(options.repeat):
             started = time.process_time()
             volume.add(views, made.poses)
-            spent = time.process_time() - started
-            print(f"pass {turn + 1}: {1e3 * spent / len(views):.1f} ms a frame")
+            cpu_s = time.process_time() - started
+            print(f"pass {turn + 1}: {1e3 * cpu_s / len(views):.1f} ms/frame")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     print(f"peak memory {peak:.0f} MB")
     return 0

@@ -1,16 +1,16 @@
-"""Ghost surfaces: how much of the model of a flat is where nothing is, and how much is missing.
+"""Spurious and missing surface in models of a simulated flat.
 
-Walks through simulated flats of four rooms, taken with every error of the camera that the simulator
-knows (`direct`: without indirect light) and its factory correction, are fused at the true poses,
-corrected and filtered by the default method; with `--estimated` they are reconstructed by it as
-well, and the result is aligned with the truth by its trajectory. Printed of each are
+Walks through simulated flats of four rooms, with all simulated camera errors (`direct`: without
+multipath) and factory correction, are corrected and filtered by the default method and fused at the
+true poses; with `--estimated` they are also reconstructed by it, and the result is aligned with the
+ground truth by its trajectory. Printed for each:
 
-- the rms error of the poses after that: it displaces what is no ghost;
-- the fractions of the mesh's vertices (the points of the cloud are the same) that are farther than
-  5, 10 and 20 cm from the nearest true surface;
-- completeness: the fraction of the true surface that was measured that the mesh has within 5 cm, by
-  places of 2 cm: of all, of floors, and of what is dark (albedo below 0.3). A place was measured if
-  at least 3 valid pixels hit it, and at least half of them are right to 5 cm.
+- the rms error of the poses after alignment, which displaces real surfaces too;
+- the fractions of mesh vertices (the same points as those of the cloud) farther than 5, 10 and 20
+  cm from the nearest true surface;
+- completeness: the fraction of the measured true surface, in cells of 2 cm, within 5 cm of the
+  mesh: of all cells, of floors, and of dark surfaces (albedo below 0.3). A cell is measured if at
+  least 3 valid pixels hit it, and at least half of them are accurate to 5 cm.
 
     python benchmarks/ghosts.py [--walks flat/sr4000/31/6 flat/sr4000/54/10/direct] [--estimated]
 """
@@ -55,10 +55,10 @@ WALKS = (
     "flat-alike/ifm-o3r/55/10/direct",
 )
 NEAR_M = 0.05
-CELL_M = 0.02  # of the places that were measured, one stands for each such cube
+CELL_M = 0.02  # one measured point is kept per cell
 PIXELS, RIGHT = 3, 0.5
 DARK = 0.3
-SAMPLES = 600_000  # of a surface: of a flat's 2.5 cm apart, and the triangles around each
+SAMPLES = 600_000  # per surface: 2.5 cm apart in a flat, with the triangles around each
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class Walk:
     Attributes
     ----------
     scene, camera
-        Of `simulation.scene.SCENES` and `sensor.models.CAMERAS`.
+        Names in `simulation.scene.SCENES` and `sensor.models.CAMERAS`.
     seed
-        Of scene, path and noise.
+        Random seed of scene, path and noise.
     every
-        Every so-many-th of 1140 raw frames is taken.
+        Stride over the 1140 raw frames.
     direct
-        Whether there is no indirect light.
+        Whether multipath is left out.
     """
 
     scene: str
@@ -85,9 +85,9 @@ class Walk:
 
     @classmethod
     def named(cls, name: str) -> Walk:
-        """The walk called scene/camera/seed/every, or with /direct."""
-        scene, camera, seed, every, *light = name.split("/")
-        return cls(scene, camera, int(seed), int(every), light == ["direct"])
+        """Parse scene/camera/seed/every, optionally with /direct."""
+        scene, camera, seed, every, *options = name.split("/")
+        return cls(scene, camera, int(seed), int(every), options == ["direct"])
 
     def __str__(self) -> str:
         name = f"{self.scene}/{self.camera}/{self.seed}/{self.every}"
@@ -95,7 +95,7 @@ class Walk:
 
     @cached_property
     def plan(self) -> Plan:
-        """What is recorded."""
+        """The plan of the simulation."""
         return plan(
             self.scene,
             camera=self.camera,
@@ -105,7 +105,7 @@ class Walk:
         )
 
     def recording(self) -> Recording:
-        """The recording, made unless it was before."""
+        """The recording, simulated if it does not exist yet."""
         folder = OUT / str(self).replace("/", "_")
         if not folder.is_dir():
             unfinished = folder.with_suffix(".part")
@@ -116,7 +116,7 @@ class Walk:
 
     @cached_property
     def surface(self) -> Surface:
-        """The true surface, in the world of the true poses."""
+        """The true surface, in the world frame of the true poses."""
         vertices, faces = self.plan.scene.truth_mesh()
         start = self.plan.raw[0] / self.plan.sequence.frame_rate_hz
         return Surface(se3.transform(self.plan.sequence.T_world_truth(start), vertices), faces)
@@ -124,7 +124,7 @@ class Walk:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Places (P, 3) of the true surface that were measured, in the world, and of what kind."""
+    """Measured points (P, 3) of the true surface in the world frame, with masks by kind."""
 
     points: Float64
     floor: Bool
@@ -132,7 +132,7 @@ class Places:
 
 
 def measured(walk: Walk, recording: Recording) -> Places:
-    """The true surface that pixels saw, see above."""
+    """The measured part of the true surface, see above."""
     scene, sequence = walk.plan.scene, walk.plan.sequence
     floors = [k for k, m in enumerate(scene.materials) if m.name.startswith("floor")]
     albedo = np.array([m.albedo for m in scene.materials])
@@ -160,7 +160,7 @@ def measured(walk: Walk, recording: Recording) -> Places:
 
 
 def at_true_poses(recording: Recording) -> Mesh:
-    """What the default method makes of the recording if its poses are known."""
+    """Mesh of the default method at the true poses."""
     assert recording.reference is not None
     config = adapted(from_method("default"), recording)
     preparation, views = Preparation(config), []
@@ -177,9 +177,9 @@ def at_true_poses(recording: Recording) -> Mesh:
 def row(label: str, mesh: Mesh, T_true_world: Float64, walk: Walk, seen: Places, ate: float) -> str:
     """One line of the table."""
     vertices = se3.transform(T_true_world, mesh.vertices.astype(float))
-    off = distances(vertices, walk.surface, SAMPLES)
+    distance_m = distances(vertices, walk.surface, SAMPLES)
     found = distances(seen.points, Surface(vertices, mesh.faces), SAMPLES) <= NEAR_M
-    ghosts = " | ".join(f"{100 * (off > limit).mean():.3f}" for limit in (0.05, 0.10, 0.20))
+    ghosts = " | ".join(f"{100 * (distance_m > limit).mean():.3f}" for limit in (0.05, 0.10, 0.20))
     complete = " | ".join(f"{100 * found[m].mean():.1f}" for m in (..., seen.floor, seen.dark))
     return f"| {walk}, {label} | {1e3 * ate:.0f} | {len(mesh):,} | {ghosts} | {complete} |"
 
@@ -194,7 +194,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args(arguments)
     print(
-        "| walk, poses | poses off mm | vertices | > 5 cm % | > 10 cm % | > 20 cm % "
+        "| walk, poses | ATE mm | vertices | > 5 cm % | > 10 cm % | > 20 cm % "
         "| complete % | floors % | dark % |\n|---|---|---|---|---|---|---|---|---|"
     )
     with threads(options.threads):

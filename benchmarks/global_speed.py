@@ -1,15 +1,15 @@
-"""What the global part costs: loops, the pose graph and the refinement of all views together.
+"""Cost of the back end: loop closure, pose graph and joint refinement of all views.
 
-Images of 640 x 480 (the recorded kitchen) go there and back again, as often as it takes, so that
-there are loops. Printed are
+Images of 640 x 480 (the recorded kitchen) are played forwards and backwards, so that there are
+loops. Printed are
 
-- how fast pairs of views that overlap are aligned and verified: there and back, with covariance,
-  from the poses that the tracker gave them,
-- for so many frames, the seconds of each part, the views and pairs that took part, and the
-  refinement's time for each pair.
+- the speed of aligning and verifying pairs of overlapping views: in both directions, with
+  covariance, from the tracker's poses,
+- for each number of frames, the seconds of each stage, the number of views and pairs, and the
+  refinement's time per pair.
 
-Times are wall clock on the given number of threads, with the processors' time beside them, which a
-busy machine changes little. The kernels have been compiled before.
+Times are wall-clock times on the given number of threads, and CPU times, which depend less on other
+load. All kernels are compiled beforehand.
 
     python benchmarks/global_speed.py [--frames 250 500 1000] [--pairs 1000] [--threads 2]
 """
@@ -42,7 +42,7 @@ from tofuse.results.types import Reconstruction
 
 
 def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]:
-    """So many frames, from the first to the last and back again, as often as it takes."""
+    """`count` frames: the sequence forwards, backwards, and so on."""
     order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
     for k in range(count):
         yield replace(frames[order[k % len(order)]], index=k, timestamp=k / 30)
@@ -50,7 +50,7 @@ def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]
 
 @dataclass
 class BothTimes(Stopwatch):
-    """Keeps the time of the processors beside the wall's."""
+    """Stopwatch that also records CPU time."""
 
     cpu: dict[str, float] = field(default_factory=dict)
 
@@ -65,7 +65,7 @@ class BothTimes(Stopwatch):
 
 
 def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTimes]:
-    """The default method, all but the model: voxels are coarse, and nothing is filtered for it."""
+    """Run the default method with a minimal model: coarse voxels, no filters."""
     config = replace(from_method("default"), model_filters=(), fusion=Fusion(voxel_m=0.1))
     mapper = Mapper(config)
     mapper.watch = BothTimes()
@@ -74,8 +74,8 @@ def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTi
     return mapper.finish(), mapper.watch
 
 
-def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
-    """Align and verify pairs of views that overlap by a half, as if they were loops."""
+def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> str:
+    """Align and verify pairs of views with an overlap of one half, as for loop closures."""
     closer = Spacing(0.03, 0.015, 200)
     store: ViewStore[PreparedView] = ViewStore(closer)
     loops = Revisits().start(0, (), store, spacing=closer)
@@ -89,7 +89,9 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     views = [KeptView.of(posed.view, 600) for posed in store.views]
     at = np.array([view.surface.index for view in views])
     found = overlaps(views, poses[at], 0.5)[0]
-    chosen = found[np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).astype(int))]
+    chosen = found[
+        np.unique(np.linspace(0, len(found) - 1, min(max_pairs, len(found))).astype(int))
+    ]
 
     def work(a: int, _: int) -> bool:
         i, j = chosen[a]
@@ -101,8 +103,8 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     n = max(len(chosen), 1)
     return (
-        f"{n} pairs in {wall:.1f} s: {1e3 * wall / n:.1f} ms a pair, {1e3 * cpu / n:.1f} ms of "
-        f"process time; {accepted} accepted"
+        f"{n} pairs in {wall:.1f} s: {1e3 * wall / n:.1f} ms per pair, {1e3 * cpu / n:.1f} ms of "
+        f"CPU time; {accepted} accepted"
     )
 
 
@@ -110,7 +112,7 @@ PARTS = ("loops", "optimisation", "refinement")
 
 
 def row(result: Reconstruction, watch: BothTimes) -> str:
-    """One line of the table: seconds of the wall / of the processors."""
+    """One line of the table: wall / CPU seconds."""
     d = result.diagnostics
     wall, cpu = ([of.get(part, 0.0) for part in PARTS] for of in (watch.seconds, watch.cpu))
     count = d.refinement.pairs
@@ -132,15 +134,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         recording = sequences.KINDS["kitchen"].open(options.data)
     except FileNotFoundError as missing:
-        print(f"{missing}: not there, so nothing is measured", file=sys.stderr)
+        print(f"{missing}: no data, nothing is measured", file=sys.stderr)
         return 0
     half = recording.select(end=max(options.frames) // 2 + 1)
     frames = [f for f in half if isinstance(f, RangeFrame)]
     with threads(options.threads):
         print(
-            "seconds of the wall / of the processors; ms of the processors a pair\n"
-            f"{'frames':>6} {'loops':>6} {'finding them':>12} {'graph':>12} {'views':>6} "
-            f"{'pairs':>6} {'refinement':>13} {'ms a pair':>10} {'all':>13}"
+            "wall / CPU seconds; CPU ms per pair\n"
+            f"{'frames':>6} {'loops':>6} {'detection':>12} {'graph':>12} {'views':>6} "
+            f"{'pairs':>6} {'refinement':>13} {'ms/pair':>10} {'all':>13}"
         )
         mapped(frames, 30)
         ends = [prepare_view(frames[k], Keyframes().views.surface) for k in (0, -1)]

@@ -1,18 +1,17 @@
-"""Long recordings: whether whole runs stay right, closed, quick and small, however long they are.
+"""Long recordings: accuracy, loop closure, time per frame and memory over the length of a run.
 
 `building` walks through a simulated building: rooms on both sides of a corridor, each with a door,
-furniture, and walls of its own. The walk goes along the corridor and into every room, and comes
-back to the corridor at the same door; at its end it returns along the corridor and looks into some
-rooms again. Images are small, and the simulator's camera here has noise and nothing else: it is
-about length. Runs of the first N frames are compared: the error of the path after the best rigid
-alignment, the revisits, seconds a frame of the whole command (the program's start and all files
-included), and the most memory that its process held.
+furniture and distinct walls. The walk follows the corridor, enters every room and leaves it by the
+same door; at the end it returns along the corridor and visits some rooms again. Images are small,
+and the simulated camera has noise only: the subject is the length. For runs of the first N frames
+it prints the ATE, the revisits, wall time per frame of the whole command (including start-up and
+output), and peak memory.
 
-A revisit is a stretch of the walk in which the camera sees a place that it had left for at least
-20 s: it stands within 0.5 m and 20 degrees of where it was. It is closed where the result
-has the two poses where they are to each other, to 5 cm and 1 degree, for the pair nearest.
+A revisit is a segment of the walk in which the camera returns to within 0.5 m and 20 degrees of an
+earlier pose after at least 20 s elsewhere. It is closed if the estimated relative pose of the
+closest pair is accurate to 5 cm and 1 degree.
 
-`there-and-back` plays a recording forwards and backwards, as often as it takes for so many frames.
+`there-and-back` plays a recording forwards and backwards until it has the required length.
 
     python benchmarks/hours.py building [--rooms 20] [--frames 20000] [--counts 1000 20000]
     python benchmarks/hours.py there-and-back RECORDING [--counts 1000 5000 20000]
@@ -53,11 +52,11 @@ OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96
 FOCAL = 0.65 * COLUMNS  # 75 by 60 degrees
 RATE_HZ = 30.0
-# Of a room, m: half its width and depth; the corridor's half width; walls, doors and ceiling.
+# Dimensions, m: half width and depth of a room, half width of the corridor, walls, doors, ceiling.
 HALF, CORRIDOR, WALL, HEIGHT = 2.2, 0.9, 0.12, 2.5
 DOOR, DOOR_TOP, EYE = 0.45, 2.05, 1.3
-PITCH = 2 * HALF + WALL  # from one room to the next along the corridor
-# A revisit: near in m and rad, after so many seconds elsewhere; and what counts as closed.
+PITCH = 2 * HALF + WALL  # between rooms along the corridor
+# A revisit: distance in m and rad, and seconds elsewhere before; thresholds for closed.
 NEAR_M, NEAR_RAD, AWAY_S = 0.5, np.radians(20), 20.0
 CLOSED_M, CLOSED_RAD = 0.05, np.radians(1)
 
@@ -65,7 +64,7 @@ PATTERNS = ("noise", "print", "wood", "tiles", "speckle")
 
 
 def place_of(room: int) -> tuple[float, float]:
-    """Where along the corridor a room is, and on which side (1 or -1)."""
+    """Position of a room along the corridor, and its side (1 or -1)."""
     return PITCH * (room // 2), 1.0 if room % 2 == 0 else -1.0
 
 
@@ -78,7 +77,7 @@ def T_room(room: int) -> Float64:
 
 
 def material(rng: np.random.Generator, name: str) -> Material:
-    """Of a wall or floor: no two are alike."""
+    """Unique material of a wall or floor."""
     size = rng.uniform(0.25, 0.9)
     return Material(
         name,
@@ -149,7 +148,7 @@ def _room(assembly: Assembly, room: int, rng: np.random.Generator) -> None:
 
 
 def _corridor(assembly: Assembly, rooms: int, rng: np.random.Generator) -> None:
-    """Walls between the doors, floor, ceiling, both ends, and what stands and hangs there."""
+    """Walls between the doors, floor, ceiling, both ends, boxes and pictures."""
     last = PITCH * ((rooms + 1) // 2 - 1)
     low, high = -HALF - WALL, last + HALF + WALL
     quad, length = meshes.quad, high - low
@@ -196,10 +195,10 @@ def waypoints(rooms: int, seed: int) -> Float64:
         out.append((x + rng.normal(0, 0.03), y + rng.normal(0, 0.03), yaw + rng.normal(0, 0.05)))
 
     def visit(room: int, heading: float) -> None:
-        """From the corridor in, once round, and out; goes on in the direction of `heading`."""
+        """Enter from the corridor, walk a circle, and leave in the direction of `heading`."""
         along, side = place_of(room)
         inward = side * np.pi / 2
-        middle = side * (CORRIDOR + WALL + HALF)
+        centre = side * (CORRIDOR + WALL + HALF)
         go(along - 0.2 * np.cos(heading), 0.0, inward - side * np.cos(heading) * 0.9)
         go(along, side * (CORRIDOR - 0.25), inward)
         go(along, side * (CORRIDOR + WALL + 0.4), inward)
@@ -208,7 +207,7 @@ def waypoints(rooms: int, seed: int) -> Float64:
             # A small circle, looking across the room, from the door round to it.
             angle = inward + np.pi + turn * 2 * np.pi * k / 8
             r = 0.55
-            go(along + r * np.cos(angle), middle + r * np.sin(angle), angle + np.pi)
+            go(along + r * np.cos(angle), centre + r * np.sin(angle), angle + np.pi)
         go(along, side * (CORRIDOR + WALL + 0.4), inward + np.pi)
         go(along, side * (CORRIDOR - 0.25), inward + np.pi)
         go(along + 0.2 * np.cos(heading), 0.0, heading + side * np.cos(heading) * 0.5)
@@ -250,12 +249,12 @@ def walk(rooms: int, frames: int, seed: int) -> Float64:
 
 
 def record(rooms: int, frames: int, count: int, seed: int) -> Path:
-    """Write the first images of the walk, unless that has been done."""
+    """Write the first images of the walk, unless they exist."""
     folder = OUT / f"building-{rooms}-{frames}-{count}-{seed}"
     if (folder / "camera.json").exists():
         return folder
     scene, poses = building(rooms, seed), walk(rooms, frames, seed)[:count]
-    print(f"{scene.triangles} triangles; taking {count} images", flush=True)
+    print(f"{scene.triangles} triangles; rendering {count} images", flush=True)
     camera = Pinhole(COLUMNS, ROWS, FOCAL, FOCAL, COLUMNS / 2 - 0.5, ROWS / 2 - 0.5)
     rays = np.concatenate([camera.rays().astype(float), np.ones((ROWS, COLUMNS, 1))], -1)
     rays = rays.reshape(-1, 3)
@@ -267,29 +266,29 @@ def record(rooms: int, frames: int, count: int, seed: int) -> Path:
         hits = scene.cast(T[:3, 3], directions)
         distance = hits.distance.astype(float)
         cosine = np.abs(np.einsum("ni,ni->n", hits.normal, directions))
-        light = 3e4 * hits.albedo * cosine / distance**2
-        light = light + (0.5 + 0.01 * light) * rng.standard_normal(len(light))
-        # Noise of a phase camera: the less light, the more.
-        sigma = 0.03 / np.sqrt(np.maximum(light, 1.0))
-        measured = distance + sigma * rng.standard_normal(len(light))
-        seen = np.isfinite(distance) & (distance < 9.0) & (light > 20)
+        amplitude = 3e4 * hits.albedo * cosine / distance**2
+        amplitude = amplitude + (0.5 + 0.01 * amplitude) * rng.standard_normal(len(amplitude))
+        # Noise of a phase camera grows as the signal falls.
+        sigma = 0.03 / np.sqrt(np.maximum(amplitude, 1.0))
+        measured = distance + sigma * rng.standard_normal(len(amplitude))
+        seen = np.isfinite(distance) & (distance < 9.0) & (amplitude > 20)
         z = np.where(seen, measured / lengths, 0).reshape(ROWS, COLUMNS).astype(np.float32)
-        light = np.where(seen, light, 0).reshape(ROWS, COLUMNS).astype(np.float32)
-        writer.add(RangeFrame(k, k / RATE_HZ, camera, z, amplitude_image=light))
+        amplitude = np.where(seen, amplitude, 0).reshape(ROWS, COLUMNS).astype(np.float32)
+        writer.add(RangeFrame(k, k / RATE_HZ, camera, z, amplitude_image=amplitude))
     writer.finish(groundtruth=se3.inverse(poses[0]) @ poses)
     return folder
 
 
 @dataclass(frozen=True)
 class Visit:
-    """Frames of one place: an earlier one, and the later one that is nearest to it."""
+    """A revisit: an earlier frame, and the closest later one."""
 
     i: int
     j: int
 
 
 def revisits(poses: Float64) -> list[Visit]:
-    """Where the walk comes back to, one for each stretch."""
+    """Revisits of the walk, one per segment."""
     away = round(AWAY_S * RATE_HZ)
     found: list[tuple[int, int, float]] = []
     some = np.arange(0, len(poses), 10)
@@ -300,24 +299,24 @@ def revisits(poses: Float64) -> list[Visit]:
         between = se3.inverse(poses[j]) @ poses[earlier]
         far = np.linalg.norm(between[:, :3, 3], axis=1) / NEAR_M
         turned = np.asarray(se3.angle(between)) / NEAR_RAD
-        off = np.maximum(far, turned)
-        # It has left in between: nothing near in the whole time.
-        k = int(np.argmin(off))
-        if off[k] <= 1 and _left(poses, int(earlier[k]), int(j)):
-            found.append((int(earlier[k]), int(j), float(off[k])))
+        gap = np.maximum(far, turned)
+        # Only if the camera was elsewhere in between.
+        k = int(np.argmin(gap))
+        if gap[k] <= 1 and _was_away(poses, int(earlier[k]), int(j)):
+            found.append((int(earlier[k]), int(j), float(gap[k])))
     visits: list[Visit] = []
     best = np.inf
-    for n, (i, j, off) in enumerate(found):
+    for n, (i, j, gap) in enumerate(found):
         same = n > 0 and j - found[n - 1][1] <= RATE_HZ and abs(i - found[n - 1][0]) <= 3 * RATE_HZ
         if not same:
             visits.append(Visit(i, j))
-            best = off
-        elif off < best:
-            visits[-1], best = Visit(i, j), off
+            best = gap
+        elif gap < best:
+            visits[-1], best = Visit(i, j), gap
     return visits
 
 
-def _left(poses: Float64, i: int, j: int) -> bool:
+def _was_away(poses: Float64, i: int, j: int) -> bool:
     """Whether the camera was elsewhere for long enough between two frames."""
     between = se3.inverse(poses[i]) @ poses[i + 1 : j : 5]
     elsewhere = np.linalg.norm(between[:, :3, 3], axis=1) > 2 * NEAR_M
@@ -326,18 +325,18 @@ def _left(poses: Float64, i: int, j: int) -> bool:
 
 
 def closed(visit: Visit, truth: Float64, found: dict[int, Float64]) -> bool:
-    """Whether the result has both poses where they are to each other."""
+    """Whether the estimated relative pose of a revisit is accurate."""
     if visit.i not in found or visit.j not in found:
         return False
     true = se3.inverse(truth[visit.i]) @ truth[visit.j]
-    off = se3.inverse(true) @ se3.inverse(found[visit.i]) @ found[visit.j]
-    far, turned = float(np.linalg.norm(off[:3, 3])), float(se3.angle(off))
+    error = se3.inverse(true) @ se3.inverse(found[visit.i]) @ found[visit.j]
+    far, turned = float(np.linalg.norm(error[:3, 3])), float(se3.angle(error))
     return far <= CLOSED_M and turned <= CLOSED_RAD
 
 
 @dataclass(frozen=True)
-class Spent:
-    """Seconds of a run, those of its processors, the most bytes that it held, its exit status."""
+class Usage:
+    """Wall and CPU time of a run, peak memory in bytes, and exit status."""
 
     seconds: float
     cpu_s: float
@@ -345,8 +344,8 @@ class Spent:
     status: int
 
 
-def run(folder: Path, out: Path, frames: int, more: list[str]) -> Spent:
-    """Run the first frames, in a process of its own."""
+def run(folder: Path, out: Path, frames: int, more: list[str]) -> Usage:
+    """Run on the first frames, in a separate process."""
     command = [sys.executable, "-m", "tofuse", "run", str(folder), "--out", str(out)]
     command += ["--overwrite", "--end", str(frames), *more]
     start = time.perf_counter()
@@ -354,27 +353,27 @@ def run(folder: Path, out: Path, frames: int, more: list[str]) -> Spent:
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     seconds, cpu = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
-    return Spent(seconds, cpu, 1024.0 * usage.ru_maxrss, child.returncode)
+    return Usage(seconds, cpu, 1024.0 * usage.ru_maxrss, child.returncode)
 
 
 def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> Iterator[str]:
     """One line for each length."""
     yield (
         f"{'frames':>7}{'metres':>8}{'posed':>7}{'ATE, cm':>9}{'revisits':>10}{'closed':>8}"
-        f"{'ms a frame':>12}{'CPU ms':>8}{'of the first':>14}{'peak, MB':>10}  verdict"
+        f"{'ms/frame':>12}{'CPU ms':>8}{'CPU ratio':>14}{'peak, MB':>10}  verdict"
     )
     first = np.nan
     for count in counts:
         out = OUT / f"hours-{folder.name}-{count}"
-        spent = run(folder, out, count, more)
-        if spent.status not in (0, 3):
-            yield f"{count:>7}  failed with status {spent.status}"
+        used = run(folder, out, count, more)
+        if used.status not in (0, 3):
+            yield f"{count:>7}  failed with status {used.status}"
             continue
-        each, cpu = 1e3 * spent.seconds / count, 1e3 * spent.cpu_s / count
+        each, cpu = 1e3 * used.seconds / count, 1e3 * used.cpu_s / count
         first = cpu if np.isnan(first) else first
         about = json.loads((out / "run.json").read_text())
         posed = sum(f["status"] in ("tracked", "predicted") for f in about["frames"]) / count
-        told = [np.nan] * 4
+        figures = [np.nan] * 4
         if truth:
             times, estimate = read_tum(out / "trajectory.txt")
             true_times, poses = (part[:count] for part in read_tum(folder / "groundtruth.txt"))
@@ -382,11 +381,11 @@ def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> It
             known = dict(zip(np.round(times * RATE_HZ).astype(int).tolist(), estimate, strict=True))
             visits = revisits(poses)
             metres = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-            told = [metres, 100 * score.ate_rms_m, len(visits)]
-            told.append(sum(closed(visit, poses, known) for visit in visits))
+            figures = [metres, 100 * score.ate_rms_m, len(visits)]
+            figures.append(sum(closed(visit, poses, known) for visit in visits))
         yield (
-            f"{count:>7}{told[0]:>8.0f}{posed:>7.1%}{told[1]:>9.2f}{told[2]:>10.0f}{told[3]:>8.0f}"
-            f"{each:>12.1f}{cpu:>8.1f}{cpu / first:>14.2f}{spent.peak / 1e6:>10.0f}"
+            f"{count:>7}{figures[0]:>8.0f}{posed:>7.1%}{figures[1]:>9.2f}{figures[2]:>10.0f}{figures[3]:>8.0f}"
+            f"{each:>12.1f}{cpu:>8.1f}{cpu / first:>14.2f}{used.peak / 1e6:>10.0f}"
             f"  {about['verdict']}"
         )
         stages = {name: 1e3 * s / count for name, s in about["seconds"].items()}
@@ -427,7 +426,7 @@ def main() -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     made = kinds.add_parser("building")
     made.add_argument("--rooms", type=int, default=20)
-    made.add_argument("--frames", type=int, default=20_000, help="of the whole walk")
+    made.add_argument("--frames", type=int, default=20_000, help="length of the whole walk")
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--counts", type=int, nargs="+", default=[1000, 20_000])
     made.add_argument("--only-record", action="store_true")

@@ -1,10 +1,10 @@
-"""How many pairs of neighbouring views a second Algorithm 1 registers, beside its peers.
+"""Throughput of Algorithm 1 on pairs of consecutive views, compared with its peers.
 
-The views are those of the simulated room, after the filters of the thesis; a recording may be
-given instead. Simulating, reading and filtering are not timed; drawing the points, building the
-tree and all iterations are. Every row is warm: one pair was registered before. Peers get the same
-drawn points, the same distance and the same guess, and keep their own criteria to stop. Rows of
-one run can be compared with each other, not with those of another machine.
+The views are those of the simulated room, or of a recording, after the filters of the thesis.
+Simulation, reading and filtering are not timed; sampling the points, building the tree and all
+iterations are. Every row is measured after a warm-up pair. Peers get the same sampled points,
+distance threshold and initial guess, and use their own stopping criteria. Rows of one run are
+comparable with each other, not with those of another machine.
 
     python benchmarks/icp_speed.py [RECORDING] [--frames 128] [--threads 1 2]
 """
@@ -97,7 +97,7 @@ def generator(k: int) -> np.random.Generator:
 
 
 def drawn(views: Sequence[Frame], k: int) -> tuple[Float64, Float64]:
-    """Return the points of source and target that our own method draws for the pair."""
+    """Return the points of source and target that tofuse samples for the pair."""
     rng, selector = generator(k), Random(POINTS)
     source = views[k].points[selector.select(views[k], rng)]
     target = views[k - 1].points[selector.select(views[k - 1], rng)]
@@ -105,7 +105,7 @@ def drawn(views: Sequence[Frame], k: int) -> tuple[Float64, Float64]:
 
 
 def filtered_views(path: str | None, frames: int) -> tuple[list[Frame], Float64 | None]:
-    """Return the views after the thesis's filters, and their true poses if known."""
+    """Return the views after the filters of the thesis, and their true poses if known."""
     if path is None:
         from tofuse.lab.simulation.record import simulate_recording
 
@@ -150,7 +150,7 @@ def main() -> None:
     sizes = [len(view) for view in views]
     print(f"{options.recording or 'simulated room'}: {len(views)} views of {np.median(sizes):.0f}")
     print(f"points after filters (median); res {RESOLUTION_M} m, epsilon {EPSILON}, warm,")
-    print(f"guess identity; {platform.machine()}, Python {platform.python_version()}\n")
+    print(f"initial guess: identity; {platform.machine()}, Python {platform.python_version()}\n")
     print(
         f"{'method':<30}{'threads':>8}{'points':>8}{'iterations':>12}"
         f"{'pairs/s: median':>16}{'mean':>8}{'median error, mm':>17}"

@@ -1,15 +1,15 @@
-"""Faults of recordings, and whether `tofuse inspect` names them.
+"""Faults of recordings, and whether `tofuse inspect` reports them.
 
     python benchmarks/inspection.py [--cache DIR] [--seeds 10] [--clean 100] [--only FAULT,...]
 
-Four simulated cameras see rooms, a corridor and an office, with noise and flying pixels (but
-without indirect light and smear, which take long to simulate). Each of 20 faults is put into 10
-recordings of each camera, most of them into the finished recording, as a wrong file or setting
-would; 100 recordings of each camera are left as they are. Prints, for each fault, how often it was
-named and what else was said; and what was said of the clean ones. Rendering takes most of the
-time; with --cache it is done once. What shows at the edges of things alone (mirrored or smoothed
-depth, colour beside it) is put into views of furniture: a mirrored bare corridor is the same
-corridor. A recording is taken for saturated only where a tenth of it is.
+Four simulated cameras record rooms, a corridor and an office, with noise and flying pixels (but
+without multipath and smear, which are slow to simulate). Each of 20 faults is injected into 10
+recordings of each camera, most of them into the finished recording, as by a wrong file or setting;
+100 recordings of each camera are left clean. Prints, for each fault, how often it was reported and
+which other findings there were; and the findings for the clean recordings (false alarms). Rendering
+takes most of the time; --cache keeps its results. Faults that show at depth edges only (mirrored or
+smoothed depth, unregistered colour) are injected into views of furniture: a mirrored bare corridor
+is a valid corridor. A recording counts as saturated only if a tenth of its pixels are.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from tofuse.sensor.models import CameraModel, camera_model
 Frames = list[RangeFrame]
 
 EFFECTS = Effects().without("multipath", "smear")
-# Smaller angle between the first and the last column, degrees, and electrons that a bucket holds
-# so that much of a room saturates.
+# Horizontal field of view in degrees, and full-well capacity in electrons with which much of a room
+# saturates.
 CAMERAS = {"sr4000": (42, 5000.0), "kinect2": (70, 9000.0), "pico-flexx": (56, 700.0),
            "ifm-o3r": (62, 3000.0)}  # fmt: skip
 STEP_DEG = 360 / SCENES["room"].frames
@@ -48,13 +48,13 @@ STEP_DEG = 360 / SCENES["room"].frames
 
 def model_of(camera: str) -> CameraModel:
     model = camera_model(camera)
-    # At 3/8 of its resolution, which is what the checks look at, rendering takes a seventh.
+    # At 3/8 of the resolution, which is what the checks use, rendering takes a seventh of the time.
     small = scaled(model.camera, 192, 159)
     return replace(model, camera=small) if camera == "kinect2" else model
 
 
 def film(scene: str, camera: str, seed: int, raw, *, still=False, well=None, walk=None) -> Frames:
-    """Take raw frames of a scene, corrected as the factory does."""
+    """Simulate raw frames of a scene, with factory correction."""
     model = model_of(camera)
     if well is not None:
         model = replace(model, full_well_electrons=well)
@@ -66,7 +66,7 @@ def film(scene: str, camera: str, seed: int, raw, *, still=False, well=None, wal
     if walk is not None:
         sequence = walk(sequence)
     if scene == "corridor" or walk is not None:
-        effects = effects.without("wrap")  # they are longer than some cameras' period
+        effects = effects.without("wrap")  # longer than the ambiguity range of some cameras
     plan = Plan(built, sequence, model, effects, seed, np.asarray(raw))
     factory = plan.correction
     return [
@@ -76,15 +76,15 @@ def film(scene: str, camera: str, seed: int, raw, *, still=False, well=None, wal
 
 
 def clean(camera: str, k: int) -> Frames:
-    """One of many recordings with nothing wrong: a room, an office, a corridor, an empty room."""
+    """One of the clean recordings: a room, an office, a corridor or an empty room."""
     scene = ("room", "rail", "room", "corridor", "empty-room")[k % 5]
     rng = np.random.default_rng([k, 5])
     stride = {"rail": 8}.get(scene, 4)
     count = 6 if k < 10 else 4
     start = int(rng.integers(0, SCENES[scene].frames - count * stride))
-    if scene == "rail":  # where it moves
+    if scene == "rail":  # the part with motion
         start = int(rng.choice([rng.integers(25, 50), rng.integers(150, 230)]))
-    if scene == "empty-room":  # towards a corner, as a bare wall is a finding
+    if scene == "empty-room":  # facing a corner, as a bare wall is a finding
         corner = np.degrees(np.arctan2(1.6, 3.0)) * np.array([1, -1])
         at = rng.choice(np.concatenate([corner, 180 + corner])) + rng.uniform(-8, 8)
         at -= np.degrees(np.arctan2(0.2, 1))
@@ -93,7 +93,7 @@ def clean(camera: str, k: int) -> Frames:
 
 
 def turn(camera: str, k: int) -> Frames:
-    """Four stretches of five frames each in a turn of the camera."""
+    """Four segments of five frames each of a camera rotation."""
     raw = (11 * k + np.concatenate([96 * q + 6 * np.arange(5) for q in range(4)])) % 384
     return film("room", camera, k, raw)
 
@@ -123,7 +123,7 @@ def rendered_fault(fault: str) -> Callable[[str, int], Frames]:
 
 
 def walking(camera: str, k: int, rng: np.random.Generator) -> Frames:
-    """Somebody moves to the side at 1 m/s; half of the times the camera moves as well."""
+    """A person moves sideways at 1 m/s; in half of the recordings the camera moves too."""
     begin = rng.integers(0, 60) / 30
     side = 1 if k % 4 < 2 else -1
 
@@ -172,7 +172,7 @@ def wrong_focal(frames: Frames, k: int) -> Frames:
 
 
 def rectified(frames: Frames) -> Frames:
-    """Without distortion, as many drivers give depth; the nearest pixel, no mean of several."""
+    """Undistorted depth, as many drivers output it; by nearest pixels."""
     c = frames[0].camera
     plain = Pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
     rays = np.concatenate([plain.rays(), np.ones((c.height, c.width, 1))], -1)
@@ -197,7 +197,7 @@ def color_intrinsics(frames: Frames, k: int) -> Frames:
 
 def undistorted(frames: Frames, k: int) -> Frames:
     c = frames[0].camera
-    if c.width == 176:  # this lens bends by 3 % only: with the sign of the other convention
+    if c.width == 176:  # this lens distorts by only 3 %: use the opposite sign convention
         flipped = BrownConrady(c.width, c.height, c.fx, c.fy, c.cx, c.cy, k1=-c.k1, k2=-c.k2)
         return with_camera(frames, flipped)
     return with_camera(frames, Pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy))
@@ -209,12 +209,12 @@ def mirrored(frames: Frames, k: int) -> Frames:
 
 
 def colored(frames: Frames, k: int, shift: float = 0.0) -> Frames:
-    """Colour made of the light that came back, at other pixels by a fraction of the width."""
+    """Colour from the amplitude, shifted by a fraction of the image width."""
     out = []
     for f in frames:
-        light = np.log1p(np.minimum(f.amplitude_image, 60000))
-        low, high = np.percentile(light, [1, 99])
-        grey = (np.clip((light - low) / (high - low), 0, 1) * 255).astype(np.uint8)
+        amplitude = np.log1p(np.minimum(f.amplitude_image, 60000))
+        low, high = np.percentile(amplitude, [1, 99])
+        grey = (np.clip((amplitude - low) / (high - low), 0, 1) * 255).astype(np.uint8)
         moved = np.float32([[1, 0, shift * f.camera.width], [0, 1, -shift * f.camera.width / 3]])
         grey = cv2.warpAffine(grey, moved, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
         out.append(replace(f, color_image=np.repeat(grey[..., None], 3, -1)))
@@ -247,25 +247,27 @@ def frozen(frames: Frames, k: int) -> Frames:
 
 
 def wrapped(frames: Frames, k: int) -> Frames:
-    """Of a camera with a period so short that a quarter of the image lies beyond it."""
+    """Depth of a camera with an ambiguity range that a quarter of the image exceeds."""
     period = float(np.percentile(np.concatenate([f.radial_range[f.valid] for f in frames]), 75))
     out = []
     for f in frames:
         r = f.radial_range
         short = np.where(f.valid, np.mod(r, period), 0).astype(np.float32)
-        light = f.amplitude_image
+        amplitude = f.amplitude_image
         if f.amplitude_kind == "range_compensated":
-            light = np.where(f.valid, light * (short / np.maximum(r, 1e-6)) ** 2, light)
+            amplitude = np.where(f.valid, amplitude * (short / np.maximum(r, 1e-6)) ** 2, amplitude)
         depth = short if f.depth_kind == "range" else short / ray_lengths(f.camera)
         depth = np.where(f.valid, depth, 0).astype(np.float32)
         out.append(
-            replace(f, depth=depth, amplitude_image=light.astype(np.float32), ambiguity_m=period)
+            replace(
+                f, depth=depth, amplitude_image=amplitude.astype(np.float32), ambiguity_m=period
+            )
         )
     return out
 
 
 def smoothed(frames: Frames, k: int) -> Frames:
-    """As a driver does that scales or smooths depth across edges."""
+    """Depth as from a driver that resamples or smooths across edges."""
     out = []
     for f in frames:
         known = f.valid.astype(np.float32)
@@ -280,7 +282,7 @@ def as_it_is(frames: Frames, k: int) -> Frames:
     return frames
 
 
-# Fault: what to film, what to do with it, and the code that names it.
+# Fault: what to record, how to corrupt it, and the code that reports it.
 FAULTS: dict[str, tuple[str, Callable[[Frames, int], Frames], str]] = {
     "depth in another unit": ("clean", unit, "depth_unit"),
     "range taken for z": ("turn", range_as_z, "range_taken_for_z"),
@@ -307,7 +309,7 @@ FAULTS: dict[str, tuple[str, Callable[[Frames, int], Frames], str]] = {
 
 def recording_of(frames: Frames, name: str) -> Recording:
     parts = {}
-    if len(frames) == 20:  # stretches of a turn that may go on where it began
+    if len(frames) == 20:  # segments of a rotation that may end where it began
         parts = {"parts": [{"frames": 5}] * 4}
         frames = [replace(f, timestamp=k / 10) for k, f in enumerate(frames)]
     return Recording.of(ArraySource(frames, metadata=parts), name, "simulated")
@@ -326,7 +328,7 @@ def taken(kind: str, camera: str, k: int, cache: Path | None) -> Frames:
     return frames
 
 
-def said(frames: Frames, name: str) -> set[str]:
+def finding_codes(frames: Frames, name: str) -> set[str]:
     return {f.code for f in inspect_recording(recording_of(frames, name)).findings}
 
 
@@ -340,7 +342,7 @@ def main() -> None:
     if chosen.cache is not None:
         chosen.cache.mkdir(parents=True, exist_ok=True)
     begin = time.process_time()
-    print("| fault | " + " | ".join(CAMERAS) + " | what else was said |")
+    print("| fault | " + " | ".join(CAMERAS) + " | other findings |")
     print("|---|" + "---|" * (len(CAMERAS) + 1))
     total = hit = 0
     for fault, (kind, put, code) in FAULTS.items():
@@ -350,9 +352,9 @@ def main() -> None:
         for camera in CAMERAS:
             found = 0
             for k in range(chosen.seeds):
-                # Where walls in all directions are seen, if what is wrong is the geometry.
+                # Geometric faults: in views of walls in all directions.
                 frames = put(taken(kind, camera, k, chosen.cache), k)
-                codes = said(frames, fault)
+                codes = finding_codes(frames, fault)
                 found += code in codes
                 others.update(codes - {code})
             cells.append(f"{found} of {chosen.seeds}")
@@ -360,10 +362,10 @@ def main() -> None:
         also = ", ".join(f"{name} {count}" for name, count in others.most_common())
         print(f"| {fault} | " + " | ".join(cells) + f" | {also or '-'} |", flush=True)
     if total:
-        print(f"\nnamed: {hit} of {total}, {hit / total:.1%}")
+        print(f"\nreported: {hit} of {total}, {hit / total:.1%}")
     if not chosen.only or "clean" in chosen.only:
         clean_ones(chosen.clean, chosen.cache)
-    print(f"{time.process_time() - begin:.0f} s of one processor")
+    print(f"{time.process_time() - begin:.0f} s of CPU time")
 
 
 def clean_ones(count: int, cache: Path | None) -> None:
@@ -373,7 +375,7 @@ def clean_ones(count: int, cache: Path | None) -> None:
             if cache is not None and not (cache / f"clean-{camera}-{k:03d}.pkl").exists():
                 continue
             frames = taken("clean", camera, k, cache)
-            codes = said(colored(frames, k) if k % 2 else frames, "clean")
+            codes = finding_codes(colored(frames, k) if k % 2 else frames, "clean")
             wrong += bool(codes)
             total += 1
             alarms.update(codes)

@@ -1,11 +1,10 @@
-"""Large steps between views: how often the pose is found, by which method, and what that tells.
+"""Wide baselines: success rates of methods that need no initial guess.
 
-`steps` takes pairs of views that are turned against each other by 10 to 60 degrees, and gives them
-to every method that needs no guess: the exhaustive search, SIFT, ORB and FAST features, planes, and
-histograms of normals. `search` looks at the exhaustive search alone, with albedo and without it:
-neighbours of recordings of which only every so many-th view is taken are searched for without a
-hint, beside pairs that share nothing, which are views of different scenes, and views of one scene
-that look elsewhere. What is right is known from the reference: within 0.15 m and 4 degrees.
+`steps` registers pairs of views with relative rotations of 10 to 60 degrees by every method that
+needs no initial guess: exhaustive search, SIFT, ORB and FAST features, planes, and FPFH. `search`
+tests the exhaustive search alone, with and without albedo, on consecutive views of subsampled
+recordings and on pairs without overlap: views of different scenes, and of different parts of one
+scene. A pose is right within 0.15 m and 4 degrees of the reference.
 
     python benchmarks/large_steps.py steps [--sequences room kitchen] [--pairs 8]
     python benchmarks/large_steps.py search [--sequences kinect kitchen room] [--mode both auto]
@@ -42,32 +41,32 @@ from tofuse.registration.view_pair import register_pair
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RIGHT_M, RIGHT_DEG = 0.15, 4.0
-# Views that share less than this see different places.
-APART = 0.02
+# Views with less overlap than this show different places.
+MIN_OVERLAP = 0.02
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Which views of a sequence are taken: by index, or by how far the camera has moved."""
+    """Subsampling of a sequence: by index, or by camera motion."""
 
     sequence: str
     title: str
     every: int | None = None
     degrees: float = 13.0
     metres: float = 0.5
-    most: int = 17
+    max_views: int = 17
     closing: bool = False
 
     def choose(self, reference: Float64) -> list[int]:
         if self.every:
-            return list(range(0, len(reference), self.every))[: self.most]
+            return list(range(0, len(reference), self.every))[: self.max_views]
         chosen = [0]
         for k in range(len(reference)):
             step = se3.inverse(reference[chosen[-1]]) @ reference[k]
             far = np.linalg.norm(step[:3, 3]) >= self.metres
             if far or np.degrees(se3.angle(step)) >= self.degrees:
                 chosen.append(k)
-        return chosen[: self.most]
+        return chosen[: self.max_views]
 
 
 TAKEN = [
@@ -85,7 +84,7 @@ TAKEN = [
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one pair: does the best pose agree with the reference, and what was said of it."""
+    """Result for one pair: correctness, stated probability, acceptance, and CPU seconds."""
 
     right: bool
     probability: float
@@ -111,7 +110,7 @@ def load(steps: Steps, data: Path) -> Views:
 
 
 def without_albedo(taken: Views) -> Views:
-    """The same views, as a camera that measures nothing but ranges would give them."""
+    """The same views as of a camera without amplitude."""
     bare = [
         replace(view, albedo=np.full_like(view.albedo, np.nan), has_albedo=False)
         for view in taken.views
@@ -119,10 +118,10 @@ def without_albedo(taken: Views) -> Views:
     return replace(taken, views=bare)
 
 
-def look(
+def search_pair(
     source: PreparedView, target: PreparedView, true: Float64 | None, options: SearchOptions
 ) -> Outcome:
-    """Search for one pair on one core."""
+    """Search for the pose of one pair on one core."""
     with threads(1):
         start = time.process_time()
         found = register_pair(source, target, options=options, always_search=True)
@@ -139,14 +138,15 @@ def neighbours(taken: Views, options: SearchOptions) -> list[Outcome]:
     n = len(taken.views)
     pairs = [(k + 1, k) for k in range(n - 1)] + ([(n - 1, 0)] if taken.steps.closing else [])
     T = taken.reference
-    look(taken.views[0], taken.views[0], None, options)  # warm
+    search_pair(taken.views[0], taken.views[0], None, options)  # warm
     return [
-        look(taken.views[i], taken.views[j], se3.inverse(T[j]) @ T[i], options) for i, j in pairs
+        search_pair(taken.views[i], taken.views[j], se3.inverse(T[j]) @ T[i], options)
+        for i, j in pairs
     ]
 
 
-def decoys(all_taken: list[Views], options: SearchOptions, most: int) -> list[Outcome]:
-    """Pairs of different scenes, and of views of one scene that share nothing; `most` of a kind."""
+def decoys(all_taken: list[Views], options: SearchOptions, max_pairs: int) -> list[Outcome]:
+    """Search pairs without overlap, of different scenes and of one; `max_pairs` of each kind."""
     rng = np.random.default_rng([1, 2])
     outcomes = []
     for a, first in enumerate(all_taken):
@@ -161,24 +161,24 @@ def decoys(all_taken: list[Views], options: SearchOptions, most: int) -> list[Ou
                 u, v = first.views[i], second.views[j]
                 if same:
                     T = se3.inverse(second.reference[j]) @ first.reference[i]
-                    if i <= j or agreement(u, v, T).overlap > APART:
+                    if i <= j or agreement(u, v, T).overlap > MIN_OVERLAP:
                         continue
-                outcomes.append(look(u, v, None, options))
+                outcomes.append(search_pair(u, v, None, options))
                 taken += 1
-                if taken == most:
+                if taken == max_pairs:
                     break
     return outcomes
 
 
 def roc_area(right: list[Outcome], wrong: list[Outcome]) -> float:
-    """Share of pairs of a right and a wrong answer that the probability ranks rightly."""
+    """Area under the ROC curve of the probability."""
     a = np.array([outcome.probability for outcome in right])[:, None]
     b = np.array([outcome.probability for outcome in wrong])[None]
     return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
 
 
-def counted(outcomes: list[Outcome]) -> str:
-    """How many are right, how many of those are accepted, and what is accepted and wrong."""
+def summary(outcomes: list[Outcome]) -> str:
+    """Summarise how many are right, right and accepted, and wrong but accepted."""
     right = sum(o.right for o in outcomes)
     accepted = sum(o.right and o.accepted for o in outcomes)
     wrong = sum(o.accepted and not o.right for o in outcomes)
@@ -187,17 +187,17 @@ def counted(outcomes: list[Outcome]) -> str:
 
 def print_row(title: str, bare: list[Outcome], full: list[Outcome]) -> None:
     seconds = np.median([o.seconds for o in full])
-    print(f"| {title} | {counted(bare)} | {counted(full)} | {seconds:.2f} |", flush=True)
+    print(f"| {title} | {summary(bare)} | {summary(full)} | {seconds:.2f} |", flush=True)
 
 
-# Turns between the views of a pair, degrees, and what a pair may be off.
-TURNS, TURN_SLACK = (10, 20, 30, 40, 50, 60), 4.0
+# Relative rotations of the pairs and their tolerance, degrees.
+TURNS, TURN_TOLERANCE = (10, 20, 30, 40, 50, 60), 4.0
 
 Method = Callable[[RangeFrame, RangeFrame], Float64 | None]
 
 
 def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
-    """The pose that the exhaustive search finds, if it is accepted."""
+    """The accepted pose of the exhaustive search, if any."""
     options = SurfaceOptions()
     views = prepare_view(source, options), prepare_view(target, options)
     found = register_pair(*views, options=SearchOptions(mode="auto"), always_search=True)
@@ -205,7 +205,7 @@ def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
 
 
 def by_part(part: Features | Fpfh | PlaneSets) -> Method:
-    """The pose that a part finds, if it finds any."""
+    """A method that returns the pose found by a part, if any."""
 
     def found(source: RangeFrame, target: RangeFrame) -> Float64 | None:
         try:
@@ -228,23 +228,23 @@ METHODS: dict[str, Method] = {
 }
 
 
-def turned(reference: Float64, degrees: float, most: int) -> list[tuple[int, int]]:
-    """Pairs of views turned against each other by about so much, evenly over the recording."""
+def turned(reference: Float64, degrees: float, max_pairs: int) -> list[tuple[int, int]]:
+    """Pairs of views with about this relative rotation, evenly over the recording."""
     found = []
     for k in range(len(reference)):
         angles = np.degrees(se3.angle(se3.inverse(reference[k]) @ reference[k + 1 :]))
-        near = np.flatnonzero(np.abs(angles - degrees) < TURN_SLACK)
+        near = np.flatnonzero(np.abs(angles - degrees) < TURN_TOLERANCE)
         if len(near):
             found.append((k, k + 1 + int(near[0])))
-    return found[:: max(1, -(-len(found) // most))]
+    return found[:: max(1, -(-len(found) // max_pairs))]
 
 
-def print_steps(name: str, data: Path, frames: int | None, most: int) -> None:
-    """Of each method and turn: poses that are right, those that are wrong, and how many pairs."""
+def print_steps(name: str, data: Path, frames: int | None, max_pairs: int) -> None:
+    """Print right and wrong poses, and the number of pairs, by method and rotation."""
     sequence = sequences.load(name, data, frames)
-    pairs = {degrees: turned(sequence.reference, degrees, most) for degrees in TURNS}
+    pairs = {degrees: turned(sequence.reference, degrees, max_pairs) for degrees in TURNS}
     print(f"\n{sequence.title}\n")
-    print(f"| Method | {' | '.join(f'{d} degrees' for d in TURNS)} | s a pair, one core |")
+    print(f"| Method | {' | '.join(f'{d} degrees' for d in TURNS)} | s/pair, one core |")
     print(f"|---|{'---|' * (len(TURNS) + 1)}")
     T = sequence.reference
     for title, method in METHODS.items():
@@ -265,9 +265,9 @@ def print_steps(name: str, data: Path, frames: int | None, most: int) -> None:
 
 
 def is_right(found: Float64, true: Float64) -> bool:
-    off = se3.inverse(true) @ found
-    near = np.linalg.norm(off[:3, 3]) < RIGHT_M
-    return bool(near and np.degrees(se3.angle(off)) < RIGHT_DEG)
+    error = se3.inverse(true) @ found
+    near = np.linalg.norm(error[:3, 3]) < RIGHT_M
+    return bool(near and np.degrees(se3.angle(error)) < RIGHT_DEG)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -275,11 +275,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("what", choices=["steps", "search"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--sequences", nargs="*", default=None)
-    parser.add_argument("--frames", type=int, default=None, help="of each sequence, in 'steps'")
-    parser.add_argument("--pairs", type=int, default=8, help="of each turn, in 'steps'")
+    parser.add_argument(
+        "--frames", type=int, default=None, help="frames of each sequence, in 'steps'"
+    )
+    parser.add_argument("--pairs", type=int, default=8, help="pairs per rotation, in 'steps'")
     parser.add_argument("--mode", nargs="*", default=["both"], help="in 'search'")
     parser.add_argument(
-        "--decoys", type=int, default=2, help="pairs that share nothing, of each kind, in 'search'"
+        "--decoys", type=int, default=2, help="pairs without overlap, of each kind, in 'search'"
     )
     given = parser.parse_args(arguments)
     if given.what == "steps":
@@ -293,8 +295,8 @@ def main(arguments: list[str] | None = None) -> None:
     print_search(names, given.data, given.mode, given.decoys)
 
 
-def print_search(names: list[str], data: Path, modes: list[str], most: int) -> None:
-    """How often the exhaustive search is right, and what its figures are worth."""
+def print_search(names: list[str], data: Path, modes: list[str], max_pairs: int) -> None:
+    """Print success rates of the exhaustive search, and the ROC area of its probability."""
     taken = []
     for steps in TAKEN:
         if steps.sequence in names:
@@ -305,7 +307,7 @@ def print_search(names: list[str], data: Path, modes: list[str], most: int) -> N
     for mode in modes:
         options = SearchOptions(mode=mode)
         print(f"\nMode {mode}\n")
-        print("| Neighbours | geometry alone | with albedo | s a pair, one core |")
+        print("| Neighbours | geometry alone | with albedo | s/pair, one core |")
         print("|---|---|---|---|")
         outcomes = []
         for views in taken:
@@ -314,11 +316,11 @@ def print_search(names: list[str], data: Path, modes: list[str], most: int) -> N
             title = sequences.KINDS[views.steps.sequence].title
             bare = neighbours(without_albedo(views), options)
             print_row(f"{title}: {views.steps.title}", bare, mine)
-        bare = decoys([without_albedo(views) for views in taken], options, most)
-        nothing = decoys(taken, options, most)
-        print_row("pairs that share nothing", bare, nothing)
+        bare = decoys([without_albedo(views) for views in taken], options, max_pairs)
+        decoy_outcomes = decoys(taken, options, max_pairs)
+        print_row("pairs without overlap", bare, decoy_outcomes)
         right = [o for o in outcomes if o.right]
-        wrong = [o for o in outcomes if not o.right] + nothing
+        wrong = [o for o in outcomes if not o.right] + decoy_outcomes
         print(f"\n{len(right)} right answers, {len(wrong)} wrong ones; ROC area:", end=" ")
         print(f"probability {roc_area(right, wrong):.3f}")
 

@@ -1,9 +1,9 @@
-"""Every method on the same views, graphs and recordings: a page of tables, by merit.
+"""Ranking of all methods on the same views, graphs and recordings, as a page of tables.
 
-A part that is registered anywhere in the package is a row by itself. What a method makes of a case
-is kept in benchmarks/out/leaderboard, one file each, so that the same command goes on where it was
-stopped; `--fresh` forgets it. Cases are spread over processes of this machine, or over the workers
-of a Dask cluster (which see the same files). Peers take part as far as they are installed.
+Every part registered in the package is a row. The result of each method for each case is a file in
+benchmarks/out/leaderboard, so that the command continues where it was stopped; `--fresh` starts
+over. Cases are distributed over processes of this machine, or over the workers of a Dask cluster
+(with a shared file system). Peers take part if they are installed.
 
     python benchmarks/leaderboard.py [--boards pairs graphs sequences] [--seeds 4] [--workers 2]
     python benchmarks/leaderboard.py --scheduler tcp://host:8786
@@ -43,14 +43,14 @@ _BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 
 
 def kept(board: str, method: str, case: str) -> Path:
-    """Return the file with what a method made of a case."""
+    """Return the file with the result of a method for a case."""
     plain = re.sub(r"[^\w.-]+", "_", f"{method} {case}")
     mark = hashlib.sha256(f"{method}\0{case}".encode()).hexdigest()[:8]
     return KEPT / board / f"{plain}-{mark}.json"
 
 
 def done(board: str, method: str, case: str, data: Path) -> None:
-    """Let a method do a case, on one thread, and keep what it gives."""
+    """Run a method on a case, on one thread, and store the result."""
     with threads(1):
         score = BOARDS[board].run(method, case, data)
     file = kept(board, method, case)
@@ -61,7 +61,7 @@ def done(board: str, method: str, case: str, data: Path) -> None:
 def run_missing(
     names: Sequence[str], seeds: int, data: Path, executor: Executor, methods: Sequence[str]
 ) -> None:
-    """Do what has not been done yet."""
+    """Run the cases without a result."""
     todo = [
         (board, method, case)
         for board in names
@@ -80,7 +80,7 @@ def run_missing(
 
 
 def scores_of(board: Board, seeds: int) -> dict[str, dict[str, list[Score]]]:
-    """What there is, by method and group of cases."""
+    """Stored scores by method and group of cases."""
     out: dict[str, dict[str, list[Score]]] = {}
     for method in board.methods():
         for case in board.cases(seeds):
@@ -101,7 +101,7 @@ def table(board: Board, scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> 
     def every(method: str) -> list[Score]:
         return [s for some in scores[method].values() for s in some]
 
-    # A mean over groups: one that a method does not take counts for nothing.
+    # Mean over groups; groups that a method does not support count as zero.
     order = sorted(
         scores,
         key=lambda m: (
@@ -124,13 +124,13 @@ def page(names: Sequence[str], seeds: int) -> str:
     out = []
     for name in names:
         out += [f"## {BOARDS[name].title}", "", table(BOARDS[name], found[name]), ""]
-    out += ["## What the papers say", "", "| Paper | It says | Here |", "|---|---|---|"]
+    out += ["## Claims of the papers", "", "| Paper | Claim | Result |", "|---|---|---|"]
     out += [f"| {paper} | {claim} | {here} |" for paper, claim, here in statements(found)]
     return "\n".join(out) + "\n"
 
 
 def executor_of(scheduler: str | None, workers: int) -> Executor:
-    """Processes of this machine, or a cluster's workers."""
+    """Processes of this machine, or workers of a cluster."""
     if scheduler is None:
         return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     from distributed import Client
@@ -144,12 +144,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--boards", nargs="+", choices=[*BOARDS], default=[*BOARDS])
-    parser.add_argument("--methods", nargs="+", default=[], help="only these rows are run")
+    parser.add_argument("--methods", nargs="+", default=[], help="run only these methods")
     parser.add_argument("--seeds", type=int, default=4, help="of each case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--scheduler")
     parser.add_argument("--fresh", action="store_true")
-    parser.add_argument("--page", type=Path, help="a page whose tables are written anew")
+    parser.add_argument("--page", type=Path, help="page whose tables are updated")
     parser.add_argument("--data", type=Path, default=DATA)
     options = parser.parse_args(arguments)
     if options.fresh:

@@ -1,11 +1,10 @@
 """Accuracy of whole reconstructions: the six simulated cases of the thesis, end to end.
 
-Each case is recorded by a simulated SR4000 with every error that the simulator knows and its
-factory correction, and reconstructed by `default` and by `thesis`, with no hint but that torso and
-box are turned objects (`--object`; for `thesis` the depth at which the scene states that the
-background begins). ATE is after rigid alignment. Printed are the poses of the tracker alone and
-the final ones, how the final ones compare with those of the thesis's method, the verdict, and what
-is measured on the model of the objects.
+Each case is recorded by a simulated SR4000 with all simulated camera errors and factory correction,
+and reconstructed by `default` and by `thesis`. The only hint is that torso and box are rotating
+objects (`--object`; for `thesis` the depth of the background from the scene). Printed are the ATE
+(after rigid alignment) of the tracker and of the final poses, its ratio to that of `thesis`, the
+verdict, and dimensions measured on the models of the objects.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--seeds", type=int, default=1, help="recordings of each case")
-    parser.add_argument("--every", type=int, default=1, help="take every N-th frame alone")
+    parser.add_argument("--every", type=int, default=1, help="use every N-th frame only")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--no-thesis", action="store_true", help="only the default method")
     parser.add_argument("--no-correction", action="store_true", help="no factory correction")
@@ -73,7 +72,7 @@ def _case(name: str, seed: int, args: argparse.Namespace) -> None:
     final = _errors(result.trajectory, recording)
     thesis = (np.nan, np.nan)
     if not args.no_thesis:
-        # The simulator's stride is that of the thesis, unless others are left out.
+        # The simulator's stride is that of the thesis unless `--every` is given.
         other = reconstruct(recording, _config(scene, "thesis", args), threads=args.threads)
         thesis = _errors(other.trajectory, recording)
     accepted = sum(loop.accepted for loop in result.diagnostics.loops)
@@ -115,7 +114,7 @@ def _text(errors: tuple[float, float]) -> str:
 
 
 def _model(scene: str, recording: Recording, result: Reconstruction) -> str:
-    """What is measured on the model, in the frame in which the scene's surface is upright."""
+    """Dimensions measured on the model, in the upright frame of the scene."""
     if scene not in OBJECTS:
         return ""
     made = plan(scene, every=1)
@@ -126,7 +125,7 @@ def _model(scene: str, recording: Recording, result: Reconstruction) -> str:
         w, h = fit.widths_m * 1e3, fit.height_m * 1e3
         return f"{w[0]:.1f} x {w[1]:.1f} x {h:.1f} mm, {np.abs(fit.angles_deg - 90).max():.2f} deg"
     girth, true = (measures.girth_m(p, *CHEST) for p in (points, recorded.surface))
-    return f"girth {girth * 1e3:.0f} mm, {100 * (girth / true - 1):+.1f} %"
+    return f"circumference {girth * 1e3:.0f} mm, {100 * (girth / true - 1):+.1f} %"
 
 
 if __name__ == "__main__":

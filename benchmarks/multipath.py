@@ -1,23 +1,23 @@
-"""Errors of range before and after the compensation of multipath, and when it stays.
+"""Range errors before and after multipath compensation, and the trial that decides on it.
 
     python benchmarks/multipath.py errors [--corridor folder of sr4000_corridor]
     python benchmarks/multipath.py trial [--scenes room rail] [--first-seed 5] [--frames 40]
         [--no-runs] [--recordings folder ...]
 
-`errors`. Simulated scenes: |error| against the truth over the pixels that no other gross error
-hits (mixed, wrapped, saturated, smeared), median and 90th percentile, and the median of the signed
-error. Under "all effects" the noise of single pixels is in the first two. The gain is found from
-the frames themselves; that of the simulated camera is 3482. Of the corner, the angles between the
-planes through its surfaces, whose truth is 90 degrees.
+`errors`. Simulated scenes: median and 90th percentile of the absolute range error, and median of
+the signed error, over pixels without other gross errors (mixed, wrapped, saturated, smeared). With
+"all effects", the first two include pixel noise. The gain is estimated from the frames; that of the
+simulated camera is 3482. For the corner also the angles between the fitted planes, which should be
+90 degrees.
 
-The recording has no truth. Its corridor has flat walls that stand at right angles: printed is how
-far the pixels lie from the planes of its large surfaces, and the angles between them.
+The real recording has no ground truth. Its corridor has flat walls at right angles: printed are the
+distances of the pixels from the planes of the large surfaces, and the angles between these.
 
-`trial`. Simulated recordings with all effects, and with all but multipath: the strength of indirect
-light that the trial sees, with its standard error, and what it decides; the same in five parts of
-the recording (halves, the middle half, and either every second frame), and the final error of whole
-runs (ATE rms) that apply the compensation and that leave it out. `--recordings` are real ones, of
-which only the first is printed.
+`trial`. Simulated recordings with all effects, and with all except multipath: the strength of
+multipath that the trial estimates, with its standard error, and the decision; the decision in five
+parts of the recording (halves, the middle half, and both sets of alternate frames), and the ATE of
+whole runs with and without the compensation. For `--recordings`, real ones, only strength and
+decision are printed.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Case:
 def simulated(scene: str, effects: Effects, albedo: float | None = None) -> Case:
     plan = record.plan(scene, effects=effects, texture=albedo is None)
     if albedo is not None:
-        # All surfaces are plain; the rows hold what the renderer is told of them.
+        # All surfaces have uniform albedo; the rows are the parameters of the renderer.
         plan.scene._rows[:, 0] = albedo
     correction = plan.correction
     corrector = Multipath().start()
@@ -93,7 +93,7 @@ def simulated(scene: str, effects: Effects, albedo: float | None = None) -> Case
 
 
 def apply(corrector: MultipathCorrector, frame: RangeFrame, case: Case) -> RangeFrame:
-    """Correct a frame, and time it once the gain is known."""
+    """Correct a frame; timed once the gain is known."""
     corrector.apply(frame)
     known = Multipath(gain=corrector.gain).start()
     known.apply(frame)
@@ -111,7 +111,7 @@ def apply(corrector: MultipathCorrector, frame: RangeFrame, case: Case) -> Range
 def planes_of(depth: Float32, frame: RangeFrame) -> list[Bool]:
     """Masks of the flat surfaces in a noise-free image with at least 300 pixels.
 
-    Pixels on one plane share the normal there, as its components tell.
+    Pixels on one plane have the same normal.
     """
     rays = frame.camera.rays().astype(float)
     points = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
@@ -122,9 +122,9 @@ def planes_of(depth: Float32, frame: RangeFrame) -> list[Bool]:
 
 
 def grouped(
-    normals: Float64, points: Float64, free: Bool, alike: float, off_m: float
+    normals: Float64, points: Float64, free: Bool, alike: float, max_distance_m: float
 ) -> list[Bool]:
-    """Take the largest planes one after another, seeded by a fixed grid of pixels."""
+    """Extract the largest planes one by one, seeded by a fixed grid of pixels."""
     found: list[Bool] = []
     free = free.copy()
     seeds = [(i, j) for i in range(6, free.shape[0], 12) for j in range(6, free.shape[1], 12)]
@@ -133,8 +133,8 @@ def grouped(
         for i, j in seeds:
             if not free[i, j]:
                 continue
-            off = np.abs((points - points[i, j]) @ normals[i, j])
-            mask = free & (normals @ normals[i, j] > alike) & (off < off_m)
+            distance = np.abs((points - points[i, j]) @ normals[i, j])
+            mask = free & (normals @ normals[i, j] > alike) & (distance < max_distance_m)
             best = mask if mask.sum() > best.sum() else best
         if best.sum() < 300:
             break
@@ -144,19 +144,19 @@ def grouped(
 
 
 def plane(points: Float64) -> tuple[Float64, Float64]:
-    """Unit normal of the plane through points, and their distances from it; outliers count less."""
+    """Robustly fitted plane: unit normal, and distances of the points."""
     weight = np.ones(len(points))
     for _ in range(5):
         centre = (weight[:, None] * points).sum(0) / weight.sum()
         moment = ((points - centre) * weight[:, None]).T @ (points - centre)
         normal = np.linalg.eigh(moment)[1][:, 0]
-        off = (points - centre) @ normal
-        weight = 1 / (1 + (off / max(1.5 * float(np.median(np.abs(off))), 1e-6)) ** 2)
-    return normal, off
+        distance = (points - centre) @ normal
+        weight = 1 / (1 + (distance / max(1.5 * float(np.median(np.abs(distance))), 1e-6)) ** 2)
+    return normal, distance
 
 
 def angles(frame: RangeFrame, surfaces: list[Bool]) -> Float64:
-    """Angles in degrees between every two surfaces."""
+    """Angles in degrees between all pairs of surfaces."""
     normals = [plane(frame.point_image[m & frame.valid].astype(float))[0] for m in surfaces]
     pairs = [abs(a @ b) for k, a in enumerate(normals) for b in normals[:k]]
     return np.degrees(np.arccos(np.clip(pairs, 0, 1)))
@@ -199,12 +199,12 @@ def real(folder: Path) -> None:
     right = (np.abs(old - 90) < 12) & (np.abs(new - 90) < 12)
     print(f"{len(before)} surfaces, gain {corrector.gain:.0f}")
     print(
-        f"off the plane, median: {np.median(before) * 1e3:.2f} mm before, "
+        f"distance from the plane, median: {np.median(before) * 1e3:.2f} mm before, "
         f"{np.median(after) * 1e3:.2f} after"
     )
     print(
-        f"{right.sum()} right angles, median |off 90|: {np.median(np.abs(old[right] - 90)):.2f} "
-        f"deg before, {np.median(np.abs(new[right] - 90)):.2f} after; "
+        f"{right.sum()} right angles, median |angle - 90|: "
+        f"{np.median(np.abs(old[right] - 90)):.2f} deg before, {np.median(np.abs(new[right] - 90)):.2f} after; "
         f"mean {old[right].mean():.2f} and {new[right].mean():.2f}"
     )
 
@@ -223,8 +223,8 @@ def surfaces_of(frame: RangeFrame, trusted: Bool) -> list[Bool]:
     return [mask for mask in grouped(normals, points, free, 0.94, 0.06) if mask.sum() > 700]
 
 
-def decided(config: Config, recording: Recording) -> Multipath | None:
-    """The compensation as it is after its trial; None where the configuration has none."""
+def after_trial(config: Config, recording: Recording) -> Multipath | None:
+    """The compensation after its trial; None if the configuration has none."""
     config = adapted(config, recording, 1)
     return next((item for item in config.corrections if isinstance(item, Multipath)), None)
 
@@ -232,24 +232,24 @@ def decided(config: Config, recording: Recording) -> Multipath | None:
 def in_words(part: Multipath | None) -> tuple[str, str]:
     """Strength and decision."""
     if part is None or (part.applied and part.strength is None):
-        return "", "nothing that it works on"
+        return "", "not applicable"
     seen = (
-        "too little"
+        "too little data"
         if part.strength is None
         else f"{part.strength[0]:.2f} ± {part.strength[1]:.2f}"
     )
-    return seen, "applied" if part.applied else "left out"
+    return seen, "applied" if part.applied else "not applied"
 
 
 def parts(recording: Recording) -> list[Recording]:
-    """Halves, the middle half, and either every second frame."""
+    """Halves, the middle half, and both sets of alternate frames."""
     n = len(recording)
     cuts = [(0, n // 2, 1), (n // 2, n, 1), (n // 4, n - n // 4, 1), (0, n, 2), (1, n, 2)]
     return [recording.select(*cut) for cut in cuts]
 
 
 def final_error(config: Config, recording: Recording, keep: bool) -> str:
-    """ATE rms in mm of a whole run that keeps the compensation or leaves it out."""
+    """ATE rms in mm of a whole run with or without the compensation."""
     chosen = [
         replace(item, trial=False, applied=keep) if isinstance(item, Multipath) else item
         for item in config.corrections
@@ -275,11 +275,11 @@ def tried(scene: str, seed: int, multipath: bool, runs: bool, frames: int | None
         every = made.sequence.stride * max(1, round(len(made.raw) / frames))
     recording = record.simulate_recording(name, seed=seed, every=every, effects=effects, **options)
     config = resolve(Options(Path("unused"), object=scene in OBJECTS))
-    strength, outcome = in_words(decided(config, recording))
+    strength, outcome = in_words(after_trial(config, recording))
     cells = [f"{scene}, seed {seed}", "yes" if multipath else "no", strength, outcome]
     if runs:
         pieces = parts(recording)
-        found = [decided(config, piece) for piece in pieces]
+        found = [after_trial(config, piece) for piece in pieces]
         applied = sum(part is not None and part.applied for part in found)
         errors = [final_error(config, recording, keep) for keep in (True, False)]
         cells += [f"{applied} of {len(pieces)}", *errors]
@@ -287,14 +287,16 @@ def tried(scene: str, seed: int, multipath: bool, runs: bool, frames: int | None
 
 
 def tried_real(path: Path) -> str:
-    """The same of a real recording, of which nobody knows."""
+    """The same for a real recording, without ground truth."""
     config = resolve(Options(Path("unused")))
-    return f"| {path.name} | ? | {' | '.join(in_words(decided(config, open_recording(path))))} |"
+    return (
+        f"| {path.name} | ? | {' | '.join(in_words(after_trial(config, open_recording(path))))} |"
+    )
 
 
 def print_trial(given: argparse.Namespace) -> None:
     runs = not given.no_runs
-    more = "| applied in parts | final, applied | left out |" if runs else "|"
+    more = "| applied in parts | ATE with | ATE without |" if runs else "|"
     print(f"| recording | multipath | strength | compensation {more}")
     print("|---" * (7 if runs else 4) + "|")
     for there in {"with": [True], "without": [False], "both": [False, True]}[given.effect]:
@@ -312,7 +314,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=TRIED, help="in 'trial'")
     parser.add_argument("--seeds", type=int, default=1, help="in 'trial'")
     parser.add_argument("--first-seed", type=int, default=0, help="in 'trial'")
-    parser.add_argument("--frames", type=int, help="in 'trial': about so many, spread evenly")
+    parser.add_argument("--frames", type=int, help="in 'trial': approximate number, evenly spread")
     parser.add_argument("--recordings", nargs="*", type=Path, default=[], help="in 'trial'")
     parser.add_argument("--effect", choices=["with", "without", "both"], default="both")
     parser.add_argument("--no-runs", action="store_true", help="'trial' without the final errors")
@@ -341,7 +343,7 @@ def print_errors(folder: Path) -> None:
         old, new = (np.concatenate(x) for x in zip(*corner.angles, strict=True))
         print(
             "corner, all effects: angles between its planes "
-            f"{old.min():.1f} to {old.max():.1f} deg before (median |off 90| "
+            f"{old.min():.1f} to {old.max():.1f} deg before (median |angle - 90| "
             f"{np.median(np.abs(old - 90)):.2f}), {new.min():.1f} to {new.max():.1f} after "
             f"({np.median(np.abs(new - 90)):.2f})"
         )

@@ -1,12 +1,11 @@
-"""Noise of still recordings, measured and as the models have it.
+"""Noise of static recordings, measured and modelled.
 
     python benchmarks/noise_fit.py [folder of recordings]
 
-Prints, for a real SR4000 (four frames at each of two places) and a real Pico Zense (ten frames),
-the standard deviation of the range over time beside the model of the camera's family and the model
-fitted to these very frames; the same for simulated cameras, whose frames are taken again with
-other noise to test the fit; and what averaging a still stretch gains. Real recordings that are
-not there are left out.
+Prints, for a real SR4000 (four frames at each of two positions) and a real Pico Zense (ten frames),
+the temporal standard deviation of range, the model of the camera family, and the model fitted to
+these frames; the same for simulated cameras, where the fit is tested on frames with independent
+noise; and the gain from averaging static frames. Missing real recordings are skipped.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ def main() -> None:
         show("SR4000, real", open_recording(data / "sr4000_corridor"))
     if (data / "pico_zense_static").is_dir():
         show("Pico Zense, real", zense(data / "pico_zense_static"))
-    print("simulated cameras, a corner, 8 frames; tested on 8 others\n")
-    print("| camera | fit: rms over bins | untold frames: 5, 50, 95 % of bins, model / true |")
+    print("simulated cameras, a corner, 8 frames; tested on 8 other frames\n")
+    print("| camera | fit: rms over bins | test frames: 5, 50, 95 % of bins, model / true |")
     print("|---|---|---|")
     for name in CAMERAS:
         simulated(name)
@@ -51,7 +50,7 @@ def main() -> None:
 def show(title: str, recording: Recording) -> None:
     fit = estimate_noise(recording)
     prior = noise_model_for(recording)
-    print(f"{title}: {fit.frames} frames in {fit.stretches} stretches, by {fit.law}\n")
+    print(f"{title}: {fit.frames} frames in {fit.stretches} static segments, by {fit.law}\n")
     print("| " + fit.law + " | pixels | measured (mm) | family (mm) | fitted (mm) |")
     print("|---|---|---|---|---|")
     step = max(1, len(fit.bins) // 12)
@@ -74,19 +73,19 @@ def show(title: str, recording: Recording) -> None:
 
 
 def family_sigma(prior: object, fit: NoiseFit, k: int) -> float:
-    """Sigma of the family's model in the middle of a bin."""
+    """Sigma of the family's model at the centre of a bin."""
     from tofuse.sensor.noise import NoiseModel
 
     assert isinstance(prior, NoiseModel)
-    middle = float(np.sqrt(fit.bins[k].low * fit.bins[k].high))
+    centre = float(np.sqrt(fit.bins[k].low * fit.bins[k].high))
     if fit.law == "amplitude" and prior.amplitude is not None:
         law = prior.amplitude
-        return float(np.sqrt(law.floor**2 + law.shot**2 / middle + (law.dark / middle) ** 2))
-    return prior.range.a + prior.range.b * middle**2
+        return float(np.sqrt(law.floor**2 + law.shot**2 / centre + (law.dark / centre) ** 2))
+    return prior.range.a + prior.range.b * centre**2
 
 
 def roughness(frame: RangeFrame) -> float:
-    """Robust standard deviation in m of a pixel, from second differences along rows."""
+    """Robust standard deviation of a pixel in m, from second differences along rows."""
     r, ok = frame.radial_range.astype(float), frame.valid
     second = np.abs(np.diff(r, n=2, axis=1))[ok[:, :-2] & ok[:, 1:-1] & ok[:, 2:]]
     return float(np.median(second) / 0.6745 / np.sqrt(6))
@@ -111,7 +110,7 @@ def simulated(name: str) -> None:
 
     def take(seed: int) -> RangeFrame:
         frame = render(scene, sequence, camera_model(name), 0, effects=effects, seed=seed).frame
-        # What the camera says itself would win.
+        # Remove the camera's own noise, which would take precedence.
         return replace(frame, index=seed, timestamp=seed / 30, sigma_image=None)
 
     recording = Recording.of(ArraySource([take(k) for k in range(8)]), name, "simulated")
@@ -124,10 +123,10 @@ def simulated(name: str) -> None:
     ratios = []
     for low, high in itertools.pairwise(edges):
         inside = valid & (predicted >= low) & (predicted <= high)
-        # 0.907: median of chi squared with 7 degrees of freedom over them.
+        # 0.907: median of chi squared with 7 degrees of freedom, divided by 7.
         ratios.append(np.sqrt(np.median(predicted[inside] / variance[inside]) * 0.907))
-    told = ", ".join(f"{q:.2f}" for q in np.quantile(ratios, [0.05, 0.5, 0.95]))
-    print(f"| {name} | {fit.rms_log_error:.3f} | {told} |")
+    quantiles = ", ".join(f"{q:.2f}" for q in np.quantile(ratios, [0.05, 0.5, 0.95]))
+    print(f"| {name} | {fit.rms_log_error:.3f} | {quantiles} |")
 
 
 if __name__ == "__main__":

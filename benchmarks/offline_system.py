@@ -1,9 +1,9 @@
-"""A whole `tofuse run` beside Open3D's offline reconstruction system: seconds and ATE, once.
+"""A whole `tofuse run` compared with Open3D's offline reconstruction system: time and ATE.
 
-Both read the same frames of a recording and end with a mesh in a file. What Open3D's system does
-and which options it has is said in `peers/o3d_offline.py`; it works in as many processes as tofuse
-has threads. tofuse runs with nothing but its defaults, once before to compile (not counted), and
-its time is that of the process, start and report included; Open3D's counts from its first frame.
+Both read the same frames of a recording and write a mesh. `peers/o3d_offline.py` describes Open3D's
+system and its options; it uses as many processes as tofuse has threads. tofuse runs with its
+defaults, after an untimed run to compile; its time is that of the process, including start-up and
+report; Open3D's starts at its first frame.
 
     python benchmarks/offline_system.py [--input kitchen] [--end 1000] [--every 1] [--threads 2]
 """
@@ -25,14 +25,14 @@ TARGET = 25  # times faster
 
 
 def ours(source: Path, chosen: Sequence[str], threads: int, out: Path) -> tuple[float, float]:
-    """Run tofuse into a folder: seconds and peak MB."""
+    """Run tofuse; return seconds and peak MB."""
     command = [sys.executable, "-m", "tofuse", "run", str(source), "--out", str(out), *chosen]
     wall, _, peak = measured([*command, "--overwrite", "--threads", str(threads)], (0, 3))
     return wall, peak
 
 
 def ate(times: Sequence[float], poses: object, recording: object) -> str:
-    """Of a trajectory, in words."""
+    """Errors of a trajectory as text."""
     import numpy as np
 
     from tofuse.evaluation.trajectory import evaluate_trajectory
@@ -54,18 +54,18 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--input", default="kitchen", help="or any recording")
-    parser.add_argument("--data", type=Path, default=DATA, help="where recorded sequences are")
+    parser.add_argument("--input", default="kitchen", help="sequence, or path of a recording")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded sequences")
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--end", type=int)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--fragment", type=int, default=100, help="frames in each, of Open3D's")
+    parser.add_argument("--fragment", type=int, default=100, help="frames per fragment of Open3D")
     parser.add_argument("--no-first", action="store_true", help="count the first run as well")
     options = parser.parse_args(arguments)
     source = located(options.input, options.data)
     if not source.exists():
-        parser.error(f"{source} is not there")
+        parser.error(f"{source} does not exist")
     if hasattr(os, "sched_setaffinity"):  # for both
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[: options.threads])
@@ -104,10 +104,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{made.fragments} fragments, {made.loops} loops between them, "
             f"{made.triangles:,} triangles"
         )
-        for name, spent in made.seconds.items():
-            print(f"  {name:<14}{spent:>8.1f} s")
+        for name, elapsed in made.seconds.items():
+            print(f"  {name:<14}{elapsed:>8.1f} s")
         print(f"  {ate(recording.timestamps[: len(made.poses)].tolist(), made.poses, recording)}")
-        print(f"tofuse is {total / seconds:.1f} times faster (wanted: {TARGET})")
+        print(f"tofuse is {total / seconds:.1f} times faster (target: {TARGET})")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Boards of the leaderboard: what methods are compared on. Each file is one board."""
+"""Boards of the leaderboard: tasks on which methods are compared. Each file is one board."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Score = Mapping[str, float]
 
 
 class Board(Protocol):
-    """Methods, cases, and what a method makes of a case.
+    """Methods, cases, and the evaluation of a method on a case.
 
     Attributes
     ----------
     name, title
-        Short, for files; and for people.
+        Short name for files, and title of the section.
     columns
-        Titles of the table by the names of groups of cases.
+        Column titles by the names of groups of cases.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Board(Protocol):
     columns: Mapping[str, str]
 
     def methods(self) -> Sequence[str]:
-        """Labels of all methods that can run here; new parts are among them by themselves."""
+        """Labels of all methods that can run here, including newly registered parts."""
         ...
 
     def cases(self, seeds: int) -> Sequence[str]:
@@ -37,15 +37,15 @@ class Board(Protocol):
         ...
 
     def run(self, method: str, case: str, data: Path) -> Score | None:
-        """Return numbers; None where the method doesn't take such views, or the data is absent."""
+        """Return scores; None if the method does not support the case, or data is missing."""
         ...
 
     def cell(self, scores: Sequence[Score]) -> str:
-        """Say in a few characters how a method did in a group of cases."""
+        """Summarise the scores of a method in a group of cases."""
         ...
 
     def merit(self, scores: Sequence[Score]) -> float:
-        """Return how good that is, more is better: the order of the rows."""
+        """Return the figure of merit by which rows are sorted; more is better."""
         ...
 
 
@@ -56,12 +56,12 @@ def _discover() -> None:
 
 
 def default_made(kind: str) -> dict[str, Any]:
-    """All parts of a kind that need no options, made with their defaults, by name."""
+    """All parts of a kind that need no options, with their defaults, by name."""
     _discover()
     out = {}
     for name, cls in parts.known(kind).items():
         try:
             out[name] = cls()
         except TypeError:
-            continue  # it is put together from others
+            continue  # it is composed of other parts
     return out

@@ -1,4 +1,4 @@
-"""Pose graphs: where optimisers end, with and without false loops, beside GTSAM."""
+"""Pose graphs: accuracy of optimisers with and without false loops, compared with GTSAM."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Graphs(Board):
     columns: ClassVar[dict[str, str]] = {
         "noise1": "noise as stated",
         "noise4": "noise x 4",
-        "false0.1": "10 % of the loops false",
-        "false0.4": "40 % of the loops false",
+        "false0.1": "10 % false loops",
+        "false0.4": "40 % false loops",
     }
 
     def methods(self) -> Sequence[str]:

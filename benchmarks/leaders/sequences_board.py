@@ -1,4 +1,4 @@
-"""Whole recordings: odometries, and refinements after the default method's tracker."""
+"""Whole recordings: odometry, refinement and optimiser parts within the default method."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Sequences(Board):
     columns: ClassVar[dict[str, str]] = SCENES
 
     def methods(self) -> Sequence[str]:
-        """See `Board`: the named configurations, and `default` with another part in one place."""
+        """See `Board`: the named configurations, and `default` with one part replaced."""
         out = [*_METHODS]
         for kind in ("odometry", "refinement", "optimiser"):
             out += [f"{kind} {name}" for name in default_made(kind)]
         return out
 
     def cases(self, seeds: int) -> Sequence[str]:
-        """See `Board`: a recording is one case, whatever the seeds."""
+        """See `Board`: a recording is one case, for any number of seeds."""
         return [f"{scene}/0" for scene in SCENES]
 
     def run(self, method: str, case: str, data: Path) -> Score | None:
@@ -46,7 +46,7 @@ class Sequences(Board):
         else:
             kind, name = method.split()
             if name == "given":
-                return None  # it takes poses that are stated beside the images
+                return None  # it needs poses given with the images
             config = changed(from_method("default"), {kind: {"part": name}}, where=method)
         began = time.process_time()
         try:

@@ -1,4 +1,4 @@
-"""Two views: where registrations end, over the error of the guess, overlap, noise and outliers."""
+"""Two views: registration success over initial error, overlap, noise and outliers."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
 
-# Guesses are off by so much: m and degrees.
+# Errors of the initial guess, m and degrees.
 STARTS = ((0.02, 1.0), (0.1, 5.0), (0.2, 10.0), (0.4, 20.0), (0.8, 40.0))
 NEAR = (0.05, 2.0)
 NOISE_M = (0.01, 0.03)
 OUTLIERS = (0.1, 0.3)
 APART = (2, 4)
 SCENES = ("room", "flat", "rail", "torso", "kitchen")
-# What is right: of the median depth, and degrees.
+# Tolerance of a right pose: fraction of the median depth, and degrees.
 RIGHT_FRACTION, RIGHT_DEG = 0.02, 1.5
 POINTS = 1000
-_SEED = 7  # of nothing else
+_SEED = 7  # of the benchmark's own random numbers
 
 
 @dataclass(frozen=True)
 class _Peer(Registrar):
-    """A registration of another program."""
+    """Registration by another program."""
 
     align: Callable[[Float64, Float64, Float64, float], Float64]
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
@@ -54,9 +54,9 @@ class TwoViews(Board):
     name = "pairs"
     title = "Two views"
     columns: ClassVar[dict[str, str]] = {
-        **{f"start{k}": f"guess off {m:g} m, {d:g} deg" for k, (m, d) in enumerate(STARTS)},
-        **{f"apart{k}": f"{k} views apart" for k in APART},
-        **{f"noise{s:g}": f"noise + {1000 * s:g} mm" for s in NOISE_M},
+        **{f"start{k}": f"initial error {m:g} m, {d:g} deg" for k, (m, d) in enumerate(STARTS)},
+        **{f"apart{k}": f"gap of {k} views" for k in APART},
+        **{f"noise{s:g}": f"added noise {1000 * s:g} mm" for s in NOISE_M},
         **{f"outliers{s:g}": f"{100 * s:g} % outliers" for s in OUTLIERS},
     }
 
@@ -102,20 +102,22 @@ class TwoViews(Board):
         except RegistrationError:
             T = np.full((4, 4), np.nan)
         seconds = time.process_time() - began
-        middle = np.median(source.points, 0)[None].astype(float)
-        off = np.linalg.norm(se3.transform(T, middle) - se3.transform(true, middle))
-        angle = np.degrees(se3.angle((se3.inverse(true) @ T)[:3, :3])) if np.isfinite(off) else 180
+        centre = np.median(source.points, 0)[None].astype(float)
+        error = np.linalg.norm(se3.transform(T, centre) - se3.transform(true, centre))
+        angle = (
+            np.degrees(se3.angle((se3.inverse(true) @ T)[:3, :3])) if np.isfinite(error) else 180
+        )
         depth = float(np.median(np.linalg.norm(source.points, axis=1)))
-        right = bool(off < RIGHT_FRACTION * depth and angle < RIGHT_DEG)
+        right = bool(error < RIGHT_FRACTION * depth and angle < RIGHT_DEG)
         return {
             "right": float(right),
-            "off": float(np.nan_to_num(off, nan=1e3)),
+            "off": float(np.nan_to_num(error, nan=1e3)),
             "degrees": float(angle),
             "seconds": seconds,
         }
 
     def cell(self, scores: Sequence[Score]) -> str:
-        """See `Board`: share that is right, and the median error of those."""
+        """See `Board`: fraction of right poses, and their median error."""
         right = [s for s in scores if s["right"]]
         text = f"{100 * len(right) / len(scores):.0f} %"
         return f"{text} {1000 * np.median([s['off'] for s in right]):.1f}" if right else text
@@ -126,7 +128,7 @@ class TwoViews(Board):
 
 
 def registration(name: str, resolution: float) -> Registrar:
-    """Return a method by its label; distances in it are in the views' own spacing."""
+    """Return a method by its label; its distances are multiples of the point spacing."""
     if name in peers():
         return _Peer(peers()[name])
     plain = Icp(
@@ -179,7 +181,7 @@ def views(
         if group.startswith("noise"):
             source = _noisy(source, float(group[5:]), rng)
         elif group.startswith("outliers"):
-            source = _spoilt(source, float(group[8:]), rng)
+            source = _with_outliers(source, float(group[8:]), rng)
     return source, target, true, guess
 
 
@@ -196,11 +198,11 @@ def _apart(scene: str) -> int:
     return 10 if scene == "kitchen" else 1
 
 
-def _about(middle: Float64, metres: float, degrees: float, rng: np.random.Generator) -> Float64:
-    """A motion (4, 4) by a length and an angle about the middle of the points."""
+def _about(centre: Float64, metres: float, degrees: float, rng: np.random.Generator) -> Float64:
+    """A motion (4, 4) by a length and an angle about the centre of the points."""
     shift, axis = rng.normal(size=(2, 3))
     to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = middle, -middle
+    to[:3, 3], back[:3, 3] = centre, -centre
     turn = np.radians(degrees) * axis / np.linalg.norm(axis)
     step = se3.exp(np.r_[0, 0, 0, turn])
     step[:3, 3] = metres * shift / np.linalg.norm(shift)
@@ -208,7 +210,7 @@ def _about(middle: Float64, metres: float, degrees: float, rng: np.random.Genera
 
 
 def _object(view: RangeFrame) -> RangeFrame:
-    """Without the background, which does not move with the object."""
+    """Remove the background, which does not move with the object."""
     ranges = view.depth * (ray_lengths(view.camera) if view.depth_kind == "z" else 1)
     return view.keep(ranges < OBJECT_M)
 
@@ -218,8 +220,8 @@ def _noisy(view: RangeFrame, sigma: float, rng: np.random.Generator) -> RangeFra
     return replace(view, depth=np.where(view.depth > 0, np.maximum(depth, 0.01), 0))
 
 
-def _spoilt(view: RangeFrame, fraction: float, rng: np.random.Generator) -> RangeFrame:
-    """So many pixels with any depth between the nearest and the farthest."""
+def _with_outliers(view: RangeFrame, fraction: float, rng: np.random.Generator) -> RangeFrame:
+    """Replace a fraction of the pixels by random depths between the nearest and the farthest."""
     good = view.depth > 0
     low, high = np.percentile(view.depth[good], [1, 99])
     wrong = good & (rng.uniform(size=good.shape) < fraction)

@@ -77,7 +77,7 @@ def test_whole_run_as_a_process(scripts, small_room):
     assert 0 < sum(spent.stages.values()) < spent.wall_s
     assert spent.peak_mb > 50  # what it imports alone
     lines = list(end_to_end.table([("tofuse run", [spent])]))
-    assert f"{spent.ms_a_frame:.1f}" in lines[1]
+    assert f"{spent.ms_per_frame:.1f}" in lines[1]
     slow = dataclasses.replace(spent, stages={"tracking": 1.3, "loops": 0.01})
     stages = [line.split() for line in list(end_to_end.table([("tofuse run", [slow])]))[2:]]
     fraction = f"{1.3 / slow.wall_s:.0%}"

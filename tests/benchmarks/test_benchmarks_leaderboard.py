@@ -111,6 +111,6 @@ def test_statements_compare_shares_and_errors(board):
         }
     }
     out = {paper: here for paper, _, here in statements(found)}
-    assert out["Magnusson 2009"] == "agrees: 100 % against 0 %"
-    assert out["Segal et al. 2009"].startswith("alike")
+    assert out["Magnusson 2009"] == "confirmed: 100 % vs. 0 %"
+    assert out["Segal et al. 2009"].startswith("comparable")
     assert "Yang et al. 2020" not in out  # not run
