@@ -65,7 +65,7 @@ class Sequences(Board):
 
     def cell(self, scores: Sequence[Score]) -> str:
         """See `Board`: error in mm, and the fraction of the frames that have a pose."""
-        return f"{1000 * scores[0]['ate']:.1f} mm, {100 * scores[0]['share']:.0f} %"
+        return f"{1000 * scores[0]['ate']:.1f} mm, {100 * scores[0]['posed']:.0f} %"
 
     def merit(self, scores: Sequence[Score]) -> float:
         """See `Board`: lost frames first, then the error."""
