@@ -204,7 +204,8 @@ def real(folder: Path) -> None:
     )
     print(
         f"{right.sum()} right angles, median |angle - 90|: "
-        f"{np.median(np.abs(old[right] - 90)):.2f} deg before, {np.median(np.abs(new[right] - 90)):.2f} after; "
+        f"{np.median(np.abs(old[right] - 90)):.2f} deg before, "
+        f"{np.median(np.abs(new[right] - 90)):.2f} after; "
         f"mean {old[right].mean():.2f} and {new[right].mean():.2f}"
     )
 

@@ -1,23 +1,23 @@
-"""Is the covariance of an accepted pair right? Errors of `tofuse.register` beside what it states.
+"""Is the covariance of an accepted pair consistent? Errors of `tofuse.register` against its bounds.
 
-Simulated pairs without a guess, by family: views of three ToF cameras with all their effects (light
-by way of other surfaces, scattering, wiggling, motion) as range images, as bare clouds, moved to
-any other frame, and with fewer points in one of them; objects that turn before a camera; and
-spherical scans whose noise, error over range and density are drawn at random. Of the poses that are
-accepted and right (within 5 % of the extent and 4 degrees) the table says
+Simulated pairs without an initial guess, by family: views of three ToF cameras with all effects
+(multipath, scattering, wiggling, motion) as range images, as bare clouds, as clouds in arbitrary
+frames, and with fewer points in one view; objects that rotate in front of a camera; and spherical
+scans with random noise, range errors and density. For poses that are accepted and right (within 5 %
+of the extent and 4 degrees) the table gives
 
-- how many errors lie in the 95 % ellipsoid of the stated covariance, without the directions that
-  are stated to be unobservable;
-- the median ratio of the 95 % bound to the error: the ellipsoid's radius over the error in the
-  metric of the covariance, and that of the rms distance by which the error moves the source's
-  points (its bound is the 95 % quantile of a sum of squares, Satterthwaite 1946);
-- the median of that distance, mm;
-- of the pairs with unobservable directions, for how many any of these is bounded to within the size
-  of the view: none should be.
+- the coverage of the 95 % ellipsoid of the stated covariance, without the directions stated to be
+  unobservable;
+- the median ratio of the 95 % bound to the error: of the Mahalanobis distance, and of the rms
+  displacement of the source's points (bounded by the 95 % quantile of a sum of squares,
+  Satterthwaite 1946);
+- the median of that displacement, mm;
+- among pairs with unobservable directions, how many state a sigma below the size of the view along
+  one of these ("leaks"): none should.
 
     python benchmarks/pair_covariance.py [--seeds 8] [--first 1008] [--families scans]
 
-The constants were chosen on the recordings of `pairs.py` (seed 0), scans of seeds 0 to 9, and seeds
+The constants were tuned on the recordings of `pairs.py` (seed 0), scans of seeds 0 to 9, and seeds
 1000 to 1007 (camera clouds: to 1009). Views are kept in benchmarks/out/pair_covariance.
 """
 
@@ -52,7 +52,7 @@ from tofuse.sensor.models import camera_model
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
 POINTS = 20_000
-# Scenes and cameras, and how many raw frames views are apart.
+# Scenes, cameras, and ranges of the gap between views in raw frames.
 ROOMS = (
     ("room", "sr4000", (4, 20)),
     ("empty-room", "sr4000", (4, 20)),
@@ -62,7 +62,7 @@ ROOMS = (
     ("corner", "pico-flexx", (5, 30)),
 )
 OBJECTS = (("torso", "sr4000", (3, 12)), ("box", "sr4000", (5, 20)))
-# What moves by itself stands before a background that does not.
+# A rotating object stands in front of a static background.
 _OBJECT_M = 1.6
 FAMILIES = (
     "range images",
@@ -77,7 +77,7 @@ FAMILIES = (
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One pair and what it is of."""
+    """One pair, with its family and kind."""
 
     family: str
     kind: str
@@ -93,7 +93,7 @@ class Case:
 
 
 def cases(seed: int) -> list[Case]:
-    """All pairs of one seed, made once."""
+    """All pairs of one seed, simulated once."""
     kept = OUT / f"{seed}.pickle"
     if kept.exists():
         made: list[Case] = pickle.loads(kept.read_bytes())
@@ -105,9 +105,9 @@ def cases(seed: int) -> list[Case]:
 
 
 def _of_rooms(seed: int) -> Iterator[Case]:
-    for kind, camera, apart in ROOMS:
+    for kind, camera, gap in ROOMS:
         rng = np.random.default_rng([seed, 11, len(kind), len(camera)])
-        (a, b), true = _views(kind, camera, apart, seed, rng)
+        (a, b), true = _views(kind, camera, gap, seed, rng)
         name = f"{kind}, {camera}"
         if min(len(a), len(b)) < 1000:
             continue
@@ -122,9 +122,9 @@ def _of_rooms(seed: int) -> Iterator[Case]:
 
 
 def _of_objects(seed: int) -> Iterator[Case]:
-    for kind, camera, apart in OBJECTS:
+    for kind, camera, gap in OBJECTS:
         rng = np.random.default_rng([seed, 12, len(kind)])
-        views, true = _views(kind, camera, apart, seed, rng)
+        views, true = _views(kind, camera, gap, seed, rng)
         near = [v.points[np.linalg.norm(v.points, axis=1) < _OBJECT_M] for v in views]
         if min(map(len, near)) < 300:
             continue
@@ -173,12 +173,12 @@ def _of_scans(seed: int) -> Iterator[Case]:
 
 
 def _views(
-    kind: str, camera: str, apart: tuple[int, int], seed: int, rng: np.random.Generator
+    kind: str, camera: str, gap: tuple[int, int], seed: int, rng: np.random.Generator
 ) -> tuple[list[RangeFrame], Float64]:
     """Target and source, and the true T_target_source."""
     model, effects = camera_model(camera), Effects()
     built, sequence = scenes.build(kind, seed=seed, texture=bool(rng.random() > 0.2))
-    step = int(rng.integers(apart[0], apart[1] + 1))
+    step = int(rng.integers(gap[0], gap[1] + 1))
     first = int(rng.integers(0, sequence.frames - step))
     factory = sensor.calibrated(model, effects)
     frames = []
@@ -190,8 +190,8 @@ def _views(
     return frames, np.asarray(sequence.T_world_camera(s, t))
 
 
-def _thinned(points: Float32, rng: np.random.Generator, most: int = POINTS) -> Float32:
-    return points[np.sort(rng.permutation(len(points))[:most])]
+def _thinned(points: Float32, rng: np.random.Generator, max_points: int = POINTS) -> Float32:
+    return points[np.sort(rng.permutation(len(points))[:max_points])]
 
 
 def _cloud(
@@ -224,18 +224,18 @@ def _moved(
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Of an accepted pose.
+    """An accepted pose.
 
     Attributes
     ----------
     error
         (6,) right perturbation from the pose to the truth, m and rad.
     information
-        (6, 6) as stated.
+        Stated information (6, 6).
     unobservable
-        (k, 6).
+        Stated unobservable directions (k, 6).
     moments
-        (6, 6) mean J^T J of the source's points: error^T moments error is their mean square
+        (6, 6) mean J^T J of the source's points: error^T moments error is their mean squared
         displacement.
     """
 
@@ -250,7 +250,7 @@ class Outcome:
 
     @property
     def observed(self) -> Float64:
-        """(6, 6 - k) basis of what is not unobservable, in units in which turns move the points."""
+        """Basis (6, 6 - k) of the observable directions, rotations scaled by the size."""
         size = self.size
         unit = np.array([1, 1, 1, size, size, size])
         if not len(self.unobservable):
@@ -263,8 +263,8 @@ class Outcome:
         """Rms distance of the points from the origin, m."""
         return max(float(np.sqrt(np.trace(self.moments[3:, 3:]) / 2)), 1e-6)
 
-    def said(self) -> tuple[float, float, float, float]:
-        """Nees over its 95 % quantile, bound over displacement, displacement in m, leak."""
+    def consistency(self) -> tuple[float, float, float, float]:
+        """NEES over its 95 % quantile, bound over displacement, displacement in m, leak."""
         basis = self.observed
         if not basis.shape[1]:
             return np.nan, np.nan, np.nan, self.leak
@@ -283,18 +283,18 @@ class Outcome:
 
     @property
     def leak(self) -> float:
-        """Least sigma that is stated along an unobservable direction, in sizes of the view."""
+        """Smallest stated sigma along an unobservable direction, over the size of the view."""
         if not len(self.unobservable):
             return np.inf
         unit = np.array([1, 1, 1, *[self.size] * 3])
         free = self.unobservable * unit
         free = free / np.linalg.norm(free, axis=1, keepdims=True) / unit
-        told = np.einsum("ki,ij,kj->k", free, self.information, free)
-        return float(1 / np.sqrt(max(told.max(), 1e-30)) / self.size)
+        stated = np.einsum("ki,ij,kj->k", free, self.information, free)
+        return float(1 / np.sqrt(max(stated.max(), 1e-30)) / self.size)
 
 
 def outcome(case: Case) -> Outcome | None:
-    """Register; None where the pose is not accepted."""
+    """Register a pair; None if the pose is not accepted."""
     try:
         found: Registration = tofuse.register(case.source, case.target)
     except RegistrationError:
@@ -320,15 +320,15 @@ def outcome(case: Case) -> Outcome | None:
 
 def row(name: str, some: list[Outcome]) -> str:
     right = [o for o in some if o.is_right]
-    said = np.array([o.said() for o in right]).reshape(-1, 4)
-    said = said[np.isfinite(said[:, 0])]
-    if not len(said):
+    figures = np.array([o.consistency() for o in right]).reshape(-1, 4)
+    figures = figures[np.isfinite(figures[:, 0])]
+    if not len(figures):
         return f"| {name} | 0 | {len(some) - len(right)} | | | | | |"
-    nees, ratio, moved, _ = said.T
+    nees, ratio, moved, _ = figures.T
     leaks = sum(o.leak < 1.0 for o in right)
     free = sum(len(o.unobservable) > 0 for o in right)
     return (
-        f"| {name} | {len(said)} | {len(some) - len(right)} | {100 * np.mean(nees < 1):.0f}"
+        f"| {name} | {len(figures)} | {len(some) - len(right)} | {100 * np.mean(nees < 1):.0f}"
         f" | {np.median(nees**-0.5):.1f} | {100 * np.mean(ratio > 1):.0f} | {np.median(ratio):.1f}"
         f" | {1e3 * np.median(moved):.1f} | {leaks} of {free} |"
     )
@@ -353,9 +353,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--first", type=int, default=1008)
     parser.add_argument("--families", nargs="*", choices=FAMILIES, default=list(FAMILIES))
-    parser.add_argument("--kinds", action="store_true", help="a row for each scene too")
+    parser.add_argument("--kinds", action="store_true", help="also a row for each scene")
     parser.add_argument("--make", action="store_true", help="only simulate the views")
-    parser.add_argument("--keep", type=Path, help="file for the outcomes")
+    parser.add_argument("--keep", type=Path, help="file to write the outcomes to")
     given = parser.parse_args()
     found: list[Outcome] = []
     tried = 0

@@ -1,6 +1,6 @@
 """Views of simulated cameras and scenes that are not in the tables of `pairs.py`.
 
-Other seeds and motions, and cameras of different resolution, field of view, noise and kind of
+Other seeds and motions, and cameras with other resolution, field of view, noise and kind of
 amplitude. Part of `pairs.py`.
 """
 
@@ -35,12 +35,12 @@ _CAMERAS: dict[str, CameraModel] = {
 
 @dataclass(frozen=True)
 class Taken:
-    """Some views of a scene by a camera.
+    """A set of views of a scene by a camera.
 
     Attributes
     ----------
     scene
-        Of the simulator, or of `unusual`.
+        Name in the simulator, or in `unusual`.
     hz
         Views per second of the scene's own motion.
     """
@@ -53,7 +53,7 @@ class Taken:
 
     @property
     def place(self) -> str:
-        """Scenes of one kind, whatever their seed, may look alike."""
+        """Place shown: scenes of one kind may look alike, whatever their seed."""
         return "room" if "room" in self.scene else self.scene.removesuffix("-alike")
 
     def __str__(self) -> str:

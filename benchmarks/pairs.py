@@ -1,14 +1,14 @@
-"""Two range images far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
+"""Global registration of two range images: success of `tofuse.register`, and its calibration.
 
-`table` gives, over the frames between the two, how many poses are right (within 0.1 m and 4
-degrees), how many of those are accepted, and how many are accepted and wrong; beside it Open3D's
-RANSAC over FPFH with point-to-plane ICP, if it is installed. `fit` fits the logistic models of
-`tofuse.registration.confidence` to simulated pairs, some of which share nothing, and prints their
-coefficients, with area under the ROC curve and calibration on scenes that took no part in the fit.
-For them a pose is right within 5 % of the depth and 4 degrees. `cameras` gives what the models are
-worth for the other cameras and scenes of `pair_views`, beside models fitted to all of these but the
-camera's own. `methods` compares what `tofuse.register` chooses for each pair with each of the ways
-that it chooses from, and with an oracle that takes a right one where there is any.
+`table` prints, by the gap in frames, how many poses are right (within 0.1 m and 4 degrees), how
+many of those are accepted, and how many are accepted and wrong; also for Open3D's RANSAC over FPFH
+with point-to-plane ICP, if installed. `fit` fits the logistic models of
+`tofuse.registration.confidence` to simulated pairs, some of them without overlap, and prints their
+coefficients, with area under the ROC curve and calibration on held-out scenes. For these models a
+pose is right within 5 % of the depth and 4 degrees. `cameras` tests the models on the other cameras
+and scenes of `pair_views`, compared with models fitted on all of these except the camera itself.
+`methods` compares the choice of `tofuse.register` for each pair with each of its candidate methods,
+and with an oracle that picks a right one if there is any.
 
     python benchmarks/pairs.py table [--data ../shared/data] [--scenes room kitchen]
     python benchmarks/pairs.py fit
@@ -63,20 +63,20 @@ from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prep
 from tofuse.registration.view_pair import follow, register_pair
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
-# Shrinks coefficients a little, so that few pairs that are told apart exactly make no certainty.
+# Ridge penalty: keeps coefficients finite where few pairs are perfectly separable.
 _RIDGE = 0.1
-# Views that share less than this see different places.
+# Views with less overlap than this show different places.
 _APART = 0.02
-# How far guesses are off, m and degrees, to which the model for followed poses is fitted.
+# Errors of the initial guesses, m and degrees, on which the model for followed poses is fitted.
 GUESSES = ((0.0, 0.0), (0.1, 4.0), (0.3, 12.0), (0.8, 30.0))
-# Views apart that `cameras` registers.
+# Gaps between the views that `cameras` registers.
 _STEPS = (1, 2, 3, 5)
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one scene, and how many views apart pairs are.
+    """Views of one scene, and the gaps between the views of its pairs.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Scene:
     title: str
     open: Callable[[Path], Recording] = field(repr=False)
     every: int
-    apart: tuple[int, ...]
+    gaps: tuple[int, ...]
     family: str
 
 
@@ -118,8 +118,8 @@ def _kitchen(data: Path) -> Recording:
 def _sim(name: str, title: str, scene: str, every: int, frames: int, **options: object) -> Scene:
     family = "room" if "room" in scene else scene.removesuffix("-alike")
     opened = _simulated(name, scene, every=every, frames=frames, **options)
-    apart = tuple(k for k in (1, 2, 3, 4, 6) if k < frames - 1)
-    return Scene(name, title, opened, every, apart, family)
+    gaps = tuple(k for k in (1, 2, 3, 4, 6) if k < frames - 1)
+    return Scene(name, title, opened, every, gaps, family)
 
 
 SCENES = {
@@ -136,7 +136,7 @@ SCENES = {
         Scene("kinect", "Loop round boxes, Kinect v2", kinect_loop, 1, (1, 2, 3), "boxes"),
     )
 }
-# What moves there is the object, before a background that does not.
+# A rotating object in front of a static background.
 OBJECTS = {
     scene.name: scene
     for scene in (
@@ -144,7 +144,7 @@ OBJECTS = {
         _sim("box", "Box, SR4000", "box", 6, 20),
     )
 }
-# The others take no part in the fit, and show what it is worth for other cameras.
+# The others are held out, and test how the fit generalises to other cameras.
 FITTED = ["room", "empty-room", "plain-room", "flat", "flat-alike"]
 
 
@@ -153,13 +153,13 @@ def opened(name: str, data: Path) -> Recording:
     return (SCENES | OBJECTS)[name].open(data)
 
 
-def chosen(count: int, apart: int, most: int) -> list[tuple[int, int]]:
-    """At most so many pairs, evenly over the recording."""
-    starts = np.linspace(0, count - apart - 1, min(most, max(count - apart, 0)))
-    return [(int(i), int(i) + apart) for i in starts]
+def chosen(count: int, gap: int, max_pairs: int) -> list[tuple[int, int]]:
+    """At most `max_pairs` pairs with a gap, evenly over the recording."""
+    starts = np.linspace(0, count - gap - 1, min(max_pairs, max(count - gap, 0)))
+    return [(int(i), int(i) + gap) for i in starts]
 
 
-def off(found: Float64, true: Float64) -> tuple[float, float]:
+def pose_error(found: Float64, true: Float64) -> tuple[float, float]:
     """Error of a pose, m and degrees."""
     gap = se3.inverse(true) @ found
     return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
@@ -167,7 +167,7 @@ def off(found: Float64, true: Float64) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one pair; without a pose the error is infinite."""
+    """Result for one pair; without a pose the error is infinite."""
 
     metres: float
     degrees: float
@@ -184,7 +184,7 @@ Method = Callable[[RangeFrame, RangeFrame], Registration | Float64]
 
 
 def outcome(method: Method, source: RangeFrame, target: RangeFrame, true: Float64) -> Outcome:
-    """Register one pair. Its preparation counts."""
+    """Register one pair, timed including its preparation."""
     start = time.perf_counter()
     try:
         found = method(source, target)
@@ -193,25 +193,25 @@ def outcome(method: Method, source: RangeFrame, target: RangeFrame, true: Float6
     seconds = time.perf_counter() - start
     if isinstance(found, Registration):
         accepted, probability = bool(found.believed), found.probability or 0.0
-        return Outcome(*off(found.T_target_source, true), seconds, accepted, probability)
-    return Outcome(*off(found, true), seconds)
+        return Outcome(*pose_error(found.T_target_source, true), seconds, accepted, probability)
+    return Outcome(*pose_error(found, true), seconds)
 
 
-def print_table(names: Sequence[str], data: Path, most: int) -> None:
-    """Rows of success over frames apart, and what the probability is worth over all of them."""
+def print_table(names: Sequence[str], data: Path, max_pairs: int) -> None:
+    """Print success by gap, and the calibration of the probability over all pairs."""
     ours: list[Outcome] = []
     peer = o3d_global.method()
     print(
-        "| Views | frames apart | right | of these accepted | accepted and wrong | s a pair"
-        " | Open3D right | s a pair |\n|---|---|---|---|---|---|---|---|"
+        "| Views | gap, frames | right | of these accepted | accepted and wrong | s/pair"
+        " | Open3D right | s/pair |\n|---|---|---|---|---|---|---|---|"
     )
     for name in names:
         if not _is_there(name, data):
             print(f"| {name}: no data |")
             continue
         recording = opened(name, data)
-        for apart in SCENES[name].apart:
-            pairs = chosen(len(recording), apart, most)
+        for gap in SCENES[name].gaps:
+            pairs = chosen(len(recording), gap, max_pairs)
             mine, theirs = [], []
             for i, j in pairs:
                 source, target = recording[j], recording[i]
@@ -227,20 +227,20 @@ def print_table(names: Sequence[str], data: Path, most: int) -> None:
                 ours.append(mine[-1])
                 if peer is not None:
                     theirs.append(outcome(peer, source, target, true))
-            print(_row(SCENES[name], apart, mine, theirs), flush=True)
+            print(_row(SCENES[name], gap, mine, theirs), flush=True)
     _print_worth(ours)
-    _print_decoys(names, data, most)
+    _print_decoys(names, data, max_pairs)
     if peer is None:
         print("\nOpen3D: not installed")
 
 
 def followed(source: RangeFrame, target: RangeFrame) -> Registration:
-    """Align from the identity alone."""
+    """Local alignment from the identity only."""
     return AnyPair(search=False).register(source, target, np.eye(4), np.random.default_rng(0))
 
 
 def searched(source: RangeFrame, target: RangeFrame) -> Registration:
-    """Search the images alone."""
+    """Exhaustive search on the images only."""
     maps = (prepare_view(frame, SurfaceOptions()) for frame in (source, target))
     found = register_pair(*maps, always_search=True)
     if found is None:
@@ -249,7 +249,7 @@ def searched(source: RangeFrame, target: RangeFrame) -> Registration:
 
 
 def by_shapes(source: RangeFrame, target: RangeFrame) -> Registration:
-    """Compare the points as clouds."""
+    """Global registration of the points as clouds."""
     return register_clouds(source, target, None, np.random.default_rng(0), always_search=True)
 
 
@@ -261,8 +261,8 @@ WAYS: dict[str, Method] = {
 }
 
 
-def print_methods(names: Sequence[str], data: Path, most: int) -> None:
-    """How many poses each way finds, of all pairs of each scene, and an oracle among them."""
+def print_methods(names: Sequence[str], data: Path, max_pairs: int) -> None:
+    """Print the successes of each method on all pairs of each scene, and of an oracle."""
     print(f"| Views | pairs | {' | '.join(WAYS)} | oracle |\n|---{'|---' * (len(WAYS) + 2)}|")
     total = np.zeros(len(WAYS) + 2, int)
     seconds: dict[str, list[float]] = {way: [] for way in WAYS}
@@ -271,8 +271,8 @@ def print_methods(names: Sequence[str], data: Path, most: int) -> None:
             continue
         recording = opened(name, data)
         counts = np.zeros(len(WAYS) + 2, int)
-        for apart in SCENES[name].apart:
-            for i, j in chosen(len(recording), apart, most):
+        for gap in SCENES[name].gaps:
+            for i, j in chosen(len(recording), gap, max_pairs):
                 source, target, T = recording[j], recording[i], recording.reference
                 assert isinstance(source, RangeFrame)
                 assert isinstance(target, RangeFrame)
@@ -288,34 +288,32 @@ def print_methods(names: Sequence[str], data: Path, most: int) -> None:
         print(f"| {SCENES[name].title} | {' | '.join(map(str, counts))} |", flush=True)
     print(f"| all | {' | '.join(map(str, total))} |")
     medians = (f"{np.median(s):.2f}" for s in seconds.values())
-    print(f"| s a pair | | {' | '.join(medians)} | |")
+    print(f"| s/pair | | {' | '.join(medians)} | |")
 
 
-def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
-    """How many pairs of views of different places are accepted; `most` of each two scenes."""
+def _print_decoys(names: Sequence[str], data: Path, max_pairs: int) -> None:
+    """Print acceptances among pairs of different places; `max_pairs` for each two scenes."""
     rng = np.random.default_rng([1, 4])
     there = [name for name in names if _is_there(name, data)]
     found: list[Registration] = []
-    refused = 0
+    failed = 0
     for k, name in enumerate(there):
         for other in there[k + 1 :]:
             if SCENES[name].family == SCENES[other].family:
                 continue
-            for _ in range(most):
+            for _ in range(max_pairs):
                 a, b = (opened(n, data) for n in (name, other))
                 try:
                     found.append(
                         tofuse.register(a[int(rng.integers(len(a)))], b[int(rng.integers(len(b)))])
                     )
                 except RegistrationError:
-                    refused += 1
+                    failed += 1
     if found:
         accepted = sum(bool(f.believed) for f in found)
         highest = max(f.probability or 0.0 for f in found)
-        print(
-            f"\nof {len(found) + refused} pairs of different places {accepted} accepted,", end=" "
-        )
-        print(f"{refused} refused, highest probability {highest:.2f}")
+        print(f"\nof {len(found) + failed} pairs of different places {accepted} accepted,", end=" ")
+        print(f"{failed} failed, highest probability {highest:.2f}")
 
 
 def _is_there(name: str, data: Path) -> bool:
@@ -326,13 +324,13 @@ def _is_there(name: str, data: Path) -> bool:
     return True
 
 
-def _row(scene: Scene, apart: int, mine: list[Outcome], theirs: list[Outcome]) -> str:
+def _row(scene: Scene, gap: int, mine: list[Outcome], theirs: list[Outcome]) -> str:
     right = sum(o.right for o in mine)
     sure = sum(o.right and o.accepted for o in mine)
     wrong = sum(o.accepted and not o.right for o in mine)
     cells = [
         scene.title,
-        apart * scene.every,
+        gap * scene.every,
         f"{right} of {len(mine)}",
         sure,
         wrong,
@@ -356,13 +354,13 @@ def _print_worth(found: list[Outcome]) -> None:
 
 
 def roc_area(p: Float64, right: Bool) -> float:
-    """Share of pairs of a right and a wrong answer that the probability ranks rightly."""
+    """Area under the ROC curve of the probability."""
     a, b = p[right][:, None], p[~right][None]
     return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
 
 
 def print_calibration(p: Float64, right: Bool) -> None:
-    """How often poses are right, over what was said of them."""
+    """Print the fraction of right poses by stated probability."""
     print("\n| probability | pairs | stated | right |\n|---|---|---|---|")
     for low, high in itertools.pairwise(_BINS):
         some = (p >= low) & ((p < high) | (high == 1))
@@ -373,36 +371,36 @@ def print_calibration(p: Float64, right: Bool) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Regressors (n, k) of poses, whether they are right, and which scene they are of."""
+    """Regressors (n, k) of poses, whether they are right, and indices of their scenes."""
 
     x: Float64
     right: Bool
     scene: Intp
 
 
-def samples(most: int, data: Path) -> tuple[Samples, Samples]:
-    """Poses that were searched, and poses that were followed from guesses."""
+def samples(max_pairs: int, data: Path) -> tuple[Samples, Samples]:
+    """Poses from the search, and poses aligned from initial guesses."""
     searched: list[tuple[Float64, bool, int]] = []
     followed: list[tuple[Float64, bool, int]] = []
     rng = np.random.default_rng([1, 3])
     views = {name: _views(opened(name, data)) for name in FITTED}
     for number, name in enumerate(FITTED):
         maps, T = views[name]
-        for apart in SCENES[name].apart:
-            for i, j in chosen(len(maps), apart, most):
+        for gap in SCENES[name].gaps:
+            for i, j in chosen(len(maps), gap, max_pairs):
                 true = se3.inverse(T[i]) @ T[j]
                 _add(searched, followed, maps[j], maps[i], true, number, rng)
         others = [n for n in FITTED if SCENES[n].family != SCENES[name].family]
-        for _ in range(most):
+        for _ in range(max_pairs):
             other = views[others[int(rng.integers(len(others)))]][0]
             source, target = (v[int(rng.integers(len(v)))] for v in (maps, other))
             _add(searched, followed, source, target, None, number, rng)
         print(f"{name}: {len(searched)} searched, {len(followed)} followed so far", flush=True)
-    # Joining and loops ask for views anywhere in one scene: its rooms and walls look alike.
+    # Loop candidates may be anywhere in a scene, whose rooms and walls look alike.
     rng = np.random.default_rng([5, 1])
     for number, name in enumerate(FITTED):
         maps, T = views[name]
-        for _ in range(3 * most):
+        for _ in range(3 * max_pairs):
             i, j = rng.choice(len(maps), 2, replace=False)
             _add(searched, followed, maps[j], maps[i], se3.inverse(T[i]) @ T[j], number, rng)
     return stacked(searched), stacked(followed)
@@ -423,12 +421,12 @@ def _add(
     scene: int,
     rng: np.random.Generator,
 ) -> None:
-    """Register a pair, from no guess and from several; without truth every answer is wrong."""
+    """Register a pair without and with initial guesses; without truth every pose is wrong."""
 
     def is_right(found: Registration) -> bool:
         if true is None or agreement(source, target, true).overlap < _APART:
             return False
-        metres, degrees = off(found.T_target_source, true)
+        metres, degrees = pose_error(found.T_target_source, true)
         near = metres < RIGHT_FRACTION * 0.5 * (source.depth + target.depth)
         return near and np.radians(degrees) < RIGHT_RAD
 
@@ -472,7 +470,7 @@ def fitted(x: Float64, right: Bool) -> Float64:
 
 
 def print_fit(title: str, all_of: Samples) -> None:
-    """The coefficients for all pairs, and how good those are of all scenes but the pair's."""
+    """Print coefficients from all pairs, and leave-one-scene-out results."""
     w = fitted(all_of.x, all_of.right)
     print(f"\n{title}: {len(all_of.right)} poses, {all_of.right.sum()} right")
     print(f"coefficients {', '.join(f'{v:.2f}' for v in w)}")
@@ -482,14 +480,14 @@ def print_fit(title: str, all_of: Samples) -> None:
         other = fitted(all_of.x[~mine], all_of.right[~mine])
         p[mine] = [logistic(float(v)) for v in all_of.x[mine] @ other]
     accepted = p >= ACCEPTED
-    print(f"area under the ROC curve {roc_area(p, all_of.right):.3f}, left out by scene")
+    print(f"area under the ROC curve {roc_area(p, all_of.right):.3f}, leave-one-scene-out")
     print(f"accepted {accepted.sum()}, of these wrong {(accepted & ~all_of.right).sum()}")
     print_calibration(p, all_of.right)
 
 
-def print_cameras(most: int) -> None:
-    """What the models in use are worth for each camera, and those fitted without it."""
-    searched, followed, cameras = samples_of_cameras(most)
+def print_cameras(max_pairs: int) -> None:
+    """Print results by camera of the models in use, and of those fitted without it."""
+    searched, followed, cameras = samples_of_cameras(max_pairs)
     for title, poses, coefficients in (
         ("Searched", searched, IMAGES.searched),
         ("Followed from a guess", followed, IMAGES.followed),
@@ -518,24 +516,24 @@ def _camera_row(title: str, right: Bool, *probabilities: Float64) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def samples_of_cameras(most: int) -> tuple[Samples, Samples, list[str]]:
-    """Poses that were searched, and that were followed from guesses, by camera."""
+def samples_of_cameras(max_pairs: int) -> tuple[Samples, Samples, list[str]]:
+    """Poses from the search, and poses aligned from initial guesses, by camera."""
     searched: list[tuple[Float64, bool, int]] = []
     followed: list[tuple[Float64, bool, int]] = []
     views = {taken: _views(recorded(taken)) for taken in TAKEN}
     cameras = sorted({taken.camera for taken in TAKEN})
     for taken, (maps, T) in views.items():
         number, rng = cameras.index(taken.camera), np.random.default_rng([7, taken.seed])
-        within = [pair for apart in _STEPS for pair in chosen(len(maps), apart, most)]
-        for _ in range(most):
+        within = [pair for gap in _STEPS for pair in chosen(len(maps), gap, max_pairs)]
+        for _ in range(max_pairs):
             i, j = rng.choice(len(maps), 2, replace=False)
             within.append((int(i), int(j)))
         for i, j in within:
             true = se3.inverse(T[i]) @ T[j]
             _add(searched, followed, maps[j], maps[i], true, number, rng)
         others = [other for other in TAKEN if other.place != taken.place]
-        for k in range(most):
-            # Half of them by the same camera.
+        for k in range(max_pairs):
+            # Half of them are from the same camera.
             alike = [other for other in others if other.camera == taken.camera]
             some = alike if k % 2 and alike else others
             other = views[some[int(rng.integers(len(some)))]][0]
@@ -550,7 +548,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("what", choices=["table", "fit", "cameras", "methods"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--scenes", nargs="*", choices=list(SCENES), default=list(SCENES))
-    parser.add_argument("--pairs", type=int, default=8, help="of each step")
+    parser.add_argument("--pairs", type=int, default=8, help="pairs for each gap")
     given = parser.parse_args(arguments)
     if given.what == "table":
         print_table(given.scenes, given.data, given.pairs)
@@ -562,8 +560,8 @@ def main(arguments: list[str] | None = None) -> None:
         print_cameras(given.pairs)
         return
     of_search, of_guesses = samples(given.pairs, given.data)
-    print_fit("Searched: constant, root of margin, root of contradiction, degenerate", of_search)
-    print_fit("Followed from a guess: constant, support, root of contradiction", of_guesses)
+    print_fit("Searched: constant, sqrt of margin, sqrt of contradiction, degenerate", of_search)
+    print_fit("Followed from a guess: constant, support, sqrt of contradiction", of_guesses)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,16 @@
-"""The peaks noise sweep beside an independent implementation of the 2010 method.
+"""The peaks noise sweep, compared with an independent implementation of the 2010 method.
 
     python benchmarks/peaks.py [seeds]
     python benchmarks/peaks.py default [seeds]
 
-Prints mean camera position and rotation errors for ten levels of noise (20 seeds unless told
-otherwise) with their ratio to the reference, which is a mean over 3 seeds. Then those of clouds
-registered from coarse to fine, and refined over all views, which are told nothing of the closing
-motion, beside the lowest error that any unbiased method can reach from the surface alone
-(Cramer-Rao). Draws all of them: docs/images/peaks.png.
+Prints mean camera position and rotation errors for ten noise levels (20 seeds by default) with
+their ratio to the reference, a mean over 3 seeds. Then those of coarse-to-fine registration and of
+joint refinement of all views, neither of which is given the loop closure, with the Cramer-Rao bound
+for unbiased estimates from the surface alone. Plots all of them: docs/images/peaks.png.
 
-`default` prints, at 0.10 m, the errors of what `tofuse run` makes of the views, beside the first
-camera's true pose, for five seeds (from 101 on) that no option was chosen by; and between which
-errors nine of ten recordings lie for a method that is at the bound.
+`default` prints, at 0.10 m, the errors of `tofuse run` relative to the true pose of the first
+camera, for five seeds (from 101 on) on which no option was tuned; and the 5 to 95 % range of errors
+of single recordings for a method that attains the bound.
 """
 
 from __future__ import annotations
@@ -43,9 +42,9 @@ REFERENCE = {
 
 
 def whole_runs(seeds: range) -> None:
-    """Print the errors of whole runs, and what single recordings allow."""
-    low, middle, high = peaks_bound_of_one(0.10, (0.05, 0.5, 0.95))
-    print(f"bound of one recording: median {middle:.3f} m, 5 to 95 %: {low:.3f} to {high:.3f} m")
+    """Print the errors of whole runs, and the bound for single recordings."""
+    low, median, high = peaks_bound_of_one(0.10, (0.05, 0.5, 0.95))
+    print(f"bound of one recording: median {median:.3f} m, 5 to 95 %: {low:.3f} to {high:.3f} m")
     for seed in seeds:
         errors, posed = reconstruct_peaks(0.10, seed)
         turned = np.degrees(errors.rotation.mean())
@@ -97,19 +96,19 @@ def main() -> None:
 
 
 def draw(sigmas: np.ndarray, thesis: np.ndarray, rows: np.ndarray) -> None:
-    """Draw the errors (S, 2) of the 2010 method and (S, 3) of clouds, start, end and bound."""
+    """Plot errors (S, 2) of the 2010 method, and (S, 3) of clouds: initial, refined, bound."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     fig, ax = plt.subplots(figsize=(6.4, 3.8), dpi=110, layout="constrained")
-    ax.semilogy(sigmas, thesis[:, 0], "o:", color="0.6", label="2010, in sequence")
+    ax.semilogy(sigmas, thesis[:, 0], "o:", color="0.6", label="2010, sequential")
     ax.semilogy(sigmas, thesis[:, 1], "o-", color="0.4", label="2010, optimised, loop given")
-    ax.semilogy(sigmas, rows[:, 0], "s:", color="#7aa6d8", label="coarse to fine, in sequence")
+    ax.semilogy(sigmas, rows[:, 0], "s:", color="#7aa6d8", label="coarse to fine, sequential")
     ax.semilogy(sigmas, rows[:, 1], "s-", color="#1f5fa8", label="refined over all views")
     ax.semilogy(sigmas, rows[:, 2], "k--", label="Cramér-Rao bound, surface alone")
-    ax.set_xlabel("noise of every coordinate (m)")
+    ax.set_xlabel("noise per coordinate (m)")
     ax.set_ylabel("mean error of the 20 positions (m)")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)

@@ -1,13 +1,13 @@
-"""Optimisers of pose graphs: beside GTSAM, with false loops, and by how rotations are written.
+"""Pose graph optimisers: compared with GTSAM, with false loops, and by rotation parametrisation.
 
     python benchmarks/pose_graphs.py [GRAPH.g2o ...] [--seeds 10] [--figure FILE.png]
 
-1. For each g2o file: half the squared error as GTSAM computes it, and the time of one thread, of
-   GTSAM's Levenberg-Marquardt and ours from the same start (needs gtsam).
-2. A camera that turns in a room and one that walks in a circle, with noise as the information says.
-   Loops join views that are near each other; of all loops 30 % are false, gross errors. ATE in mm,
-   mean over the seeds, with and without false loops, and the largest ratio of the two.
-3. The objective above its minimum at every iteration, for each way to write a rotation.
+1. For each g2o file: half the squared error as computed by GTSAM, and the time on one thread, of
+   GTSAM's Levenberg-Marquardt and ours from the same initial values (needs gtsam).
+2. A camera that rotates in a room and one that walks in a circle, with noise according to the
+   information matrices. Loops connect nearby views; 30 % of them are false, with gross errors. Mean
+   ATE in mm over the seeds, with and without false loops, and the largest ratio of the two.
+3. The objective relative to its minimum at every iteration, for each rotation parametrisation.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
 from tofuse.posegraph.robust import Settings
 
-FALSE = 0.3  # of all loops that are false
+FALSE = 0.3  # fraction of false loops
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad
 LOOPS = np.array([0.010] * 3 + [np.radians(0.4)] * 3)
 
 
 def path(scene: str) -> Float64:
-    """Poses of a camera that turns more than once (room), or walks a circle of 12 m (walk)."""
+    """Poses of a camera that rotates more than once (room), or walks a circle of 12 m (walk)."""
     n, radius = (120, 0.1) if scene == "room" else (150, 12 / (2 * np.pi))
     angle = 2 * np.pi * np.arange(n) / (n - 15)
     zero = np.zeros(n)
@@ -55,7 +55,7 @@ def path(scene: str) -> Float64:
 def make_graph(
     scene: str, seed: int, fraction: float, noise: float = 1.0
 ) -> tuple[PoseGraph, Float64]:
-    """Measure a path, with a `fraction` of the loops false; the true ones do not depend on it."""
+    """Simulate measurements, with a `fraction` of false loops; true ones do not depend on it."""
     rng = np.random.default_rng([seed, scene == "walk"])
     T = path(scene)
     n = len(T)
@@ -91,8 +91,8 @@ def ate(graph: PoseGraph, truth: Float64) -> float:
     return float(np.sqrt(((moved - truth[:, :3, 3]) ** 2).sum(1).mean()))
 
 
-def beside_gtsam(files: list[Path], repeats: int = 3) -> None:
-    """Print errors and times of GTSAM and of ours."""
+def compare_with_gtsam(files: list[Path], repeats: int = 3) -> None:
+    """Print errors and times of GTSAM and of our optimiser."""
     try:
         import gtsam
     except ImportError:
@@ -116,7 +116,7 @@ def beside_gtsam(files: list[Path], repeats: int = 3) -> None:
             done = LevenbergMarquardt().optimise(ours)
             times["ours"].append(time.process_time() - began)
         theirs = graph.error(found)
-        # Scored by GTSAM, from the file that is written.
+        # Evaluated by GTSAM, from the written file.
         mine = score(gtsam, graph, done.graph)
         a, b = statistics.median(times["gtsam"]), statistics.median(times["ours"])
         print(
@@ -127,7 +127,7 @@ def beside_gtsam(files: list[Path], repeats: int = 3) -> None:
 
 
 def score(gtsam: Any, factors: Any, graph: PoseGraph) -> float:
-    """GTSAM's error of our poses, by way of the file that `tofuse optimize` writes."""
+    """GTSAM's error of our poses, read from the file that `tofuse optimize` writes."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "optimised.g2o"
         write_g2o(file, graph)
@@ -136,7 +136,7 @@ def score(gtsam: Any, factors: Any, graph: PoseGraph) -> float:
 
 
 def with_false_loops(seeds: int) -> None:
-    """Print what false loops do to each optimiser."""
+    """Print the effect of false loops on each optimiser."""
     optimisers: dict[str, Optimiser | None] = {
         "odometry": None,
         "levenberg-marquardt": LevenbergMarquardt(),
@@ -151,7 +151,7 @@ def with_false_loops(seeds: int) -> None:
     }
     head = f"{'':<22}" + "".join(f"{s:^36}" for s in ("room", "walk"))
     print(head)
-    print(f"{'ATE in mm':<22}" + f"{'none false':>12}{'30 % false':>12}{'worst':>9}   " * 2)
+    print(f"{'ATE in mm':<22}" + f"{'no false':>12}{'30 % false':>12}{'worst':>9}   " * 2)
     for name, optimiser in optimisers.items():
         cells = ""
         for scene in ("room", "walk"):
@@ -167,7 +167,7 @@ def with_false_loops(seeds: int) -> None:
 
 
 def general_solver(graph: PoseGraph) -> list[float]:
-    """The objective at every step of BFGS over quaternions and positions, as a general solver."""
+    """Objective at every step of L-BFGS over quaternions and positions, a generic solver."""
     chart, i, j = Quaternion(), *graph.edges.T
     history = [graph.chi2()]
 
@@ -191,7 +191,7 @@ def general_solver(graph: PoseGraph) -> list[float]:
         np.add.at(g, i, -(np.swapaxes(A, 1, 2) @ pull)[..., 0])
         P, _ = chart.basis(T)
         by_numbers = (np.swapaxes(P, 1, 2) @ g[..., None])[1:, :, 0]
-        # Positions are unknowns in the world's frame here; q and -q are one rotation.
+        # Positions are in the world frame here; q and -q are the same rotation.
         by_numbers[:, :3] = (T[1:, :3, :3] @ by_numbers[:, :3, None])[..., 0]
         q = x.reshape(-1, 7)[:, 3:]
         sign = np.sign((quaternion.from_matrix(T[1:, :3, :3]) * q).sum(1))
@@ -209,26 +209,26 @@ def general_solver(graph: PoseGraph) -> list[float]:
 
 
 def convergence(figure: Path | None) -> None:
-    """Print, and draw, how fast the objective falls."""
+    """Print and plot the convergence of the objective."""
     graph, _ = make_graph("walk", 0, 0.0, noise=8.0)
     curves: dict[str, list[float]] = {}
     for rotation in ("tangent", "quaternion", "cosines"):
         settings = Settings("none", rotation=rotation, tolerance=1e-13)
         curves[f"Levenberg-Marquardt, {rotation}"] = list(minimise(graph, settings).objective)
     curves["Lu-Milios"] = list(LuMilios(tolerance=1e-13).optimise(graph).objective)
-    curves["general solver (L-BFGS), quaternion"] = general_solver(graph)
-    least = min(min(c) for c in curves.values())
+    curves["generic solver (L-BFGS), quaternion"] = general_solver(graph)
+    minimum = min(min(c) for c in curves.values())
     steps = (0, 1, 2, 3, 5, 10, 100, 1000)
-    print(f"{'objective above its minimum':<38}" + "".join(f"{k:>10}" for k in steps))
+    print(f"{'objective / minimum - 1':<38}" + "".join(f"{k:>10}" for k in steps))
     for name, curve in curves.items():
-        cells = "".join(f"{curve[k] / least - 1:>10.1e}" for k in steps if k < len(curve))
+        cells = "".join(f"{curve[k] / minimum - 1:>10.1e}" for k in steps if k < len(curve))
         print(f"{name:<38}{cells}   ({len(curve) - 1} steps)")
     if figure is not None:
-        draw(curves, least, figure)
+        draw(curves, minimum, figure)
 
 
-def draw(curves: dict[str, list[float]], least: float, file: Path) -> None:
-    """Draw the curves, the steps on a logarithmic scale."""
+def draw(curves: dict[str, list[float]], minimum: float, file: Path) -> None:
+    """Plot the curves, with a logarithmic axis of steps."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -237,7 +237,7 @@ def draw(curves: dict[str, list[float]], least: float, file: Path) -> None:
     fig, ax = plt.subplots(figsize=(6.4, 3.6), dpi=110, layout="constrained")
     styles = ("o-", "s--", "^:", "d-.", "-")
     for (name, curve), style in zip(curves.items(), styles, strict=True):
-        above = np.maximum(np.array(curve) / least - 1, 1e-12)
+        above = np.maximum(np.array(curve) / minimum - 1, 1e-12)
         ax.loglog(np.arange(1, len(above) + 1), above, style, label=name, markersize=4, lw=1.2)
     ax.set(xlabel="evaluation", ylabel="objective / minimum - 1")
     ax.legend(fontsize=8)
@@ -254,7 +254,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with threadpool_limits(1):
         if options.graphs:
-            beside_gtsam(options.graphs)
+            compare_with_gtsam(options.graphs)
             print()
         with_false_loops(options.seeds)
         print()

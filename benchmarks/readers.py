@@ -1,13 +1,12 @@
-"""Readers: damage of every kind, and how fast depth images are decoded.
+"""Readers: robustness to damaged files, and decoding speed of depth images.
 
     python benchmarks/readers.py [--mutations 10000] [--first 0] [--frames 400]
 
-Makes a small recording of each format as the tests do, damages it (cut off, flipped bits, swapped
-files, numbers changed, files gone or replaced by folders), and reads it through. Whatever comes out
-other than frames or the package's own errors on one line, or takes more than 20 s, is printed and
-makes the exit status 1. With --first another run goes on where one ended. Then decodes 640 x 480
-depth images with reading ahead, and prints frames a second. The peak memory of the whole process is
-printed at the end.
+Creates a small recording of each format as the tests do, damages it (truncation, flipped bits,
+swapped files, changed numbers, files missing or replaced by folders), and reads all of it. Any
+outcome other than frames or one-line errors of the package, or a time above 20 s, is printed and
+makes the exit status 1. --first continues a previous run. Then decodes 640 x 480 depth images with
+read-ahead, and prints frames per second. Finally prints the peak memory of the process.
 """
 
 from __future__ import annotations
@@ -74,21 +73,21 @@ def alarm(number: int, frame: object) -> None:
 
 
 def read_through(path: Path) -> tuple[int, int]:
-    """Frames read, and errors of our own; anything else is raised."""
-    whole = told = 0
+    """Numbers of frames and of the package's own errors; any other error is raised."""
+    whole = own_errors = 0
     try:
         for item in open_recording(path).read_all():
             if isinstance(item, TofuseError):
-                told += 1
+                own_errors += 1
                 assert len(str(item).splitlines()) == 1
             else:
                 assert np.isfinite(item.points).all()
                 whole += 1
     except TofuseError as error:
-        told += 1
+        own_errors += 1
         if len(str(error).splitlines()) != 1:
             raise ValueError("more than one line") from error
-    return whole, told
+    return whole, own_errors
 
 
 def fuzz(total: int, first: int, work: Path) -> int:
@@ -111,8 +110,8 @@ def fuzz(total: int, first: int, work: Path) -> int:
                     damage(files, rng)
             signal.alarm(LIMIT_S)
             try:
-                whole, told = read_through(copy / (file or "."))
-                frames, errors = frames + whole, errors + told
+                whole, own_errors = read_through(copy / (file or "."))
+                frames, errors = frames + whole, errors + own_errors
             except BaseException:
                 failures += 1
                 print(f"{name}, mutation {k}:", file=sys.stderr)
@@ -126,7 +125,7 @@ def fuzz(total: int, first: int, work: Path) -> int:
 
 
 def decode(frames: int, work: Path) -> None:
-    """Print how many 640 x 480 depth images a second are read, warm, with reading ahead."""
+    """Print the decoding rate of 640 x 480 depth images, warm, with read-ahead."""
     camera = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
     folder = work / "vga"
     writer = RecordingWriter(folder, camera)
@@ -145,7 +144,7 @@ def decode(frames: int, work: Path) -> None:
         start = time.perf_counter()
         count = sum(1 for _ in open_recording(folder))
         rates.append(count / (time.perf_counter() - start))
-    print(f"640 x 480 depth images: {np.median(rates):.0f} a second (median of 3 runs)")
+    print(f"640 x 480 depth images: {np.median(rates):.0f} per second (median of 3 runs)")
 
 
 def main() -> int:

@@ -1,11 +1,10 @@
-"""The picture and the figures of the README, from the result of ``tofuse demo``.
+"""The image and the numbers of the README, from the result of ``tofuse demo``.
 
     python benchmarks/readme_picture.py [DIR of the demo [DIR of another result]]
 
-The other result is that of another method on the demo's recording, and gives figures alone. Prints
-the verdict and the errors against the simulator's exact poses, and draws
-docs/images/room.png: one frame of the recording, and the cloud seen from above at an angle, with
-the path of the camera.
+The other result is that of another method on the demo's recording, for its numbers only. Prints the
+verdict and the errors against the simulator's exact poses, and draws docs/images/room.png: one
+frame of the recording, and an oblique view of the cloud from above, with the camera trajectory.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ PICTURE = ROOT / "docs" / "images" / "room.png"
 
 SIZE = (940, 420)  # pixels
 PIXEL_M = 0.0125
-CEILING_M = 0.75  # what is higher above the camera than this hides the room
+CEILING_M = 0.75  # points higher above the camera than this would hide the room
 TILT = np.radians(52.0)  # from the horizon
 TURN = np.radians(62.0)
 PATH_BGR = (40, 90, 255)
 BACKGROUND_BGR = (96, 78, 66)
-LEVELS = np.uint8(0xF8)  # noise in the lowest bits doubles the file, and nobody sees it
+LEVELS = np.uint8(0xF8)  # invisible noise in the lowest bits would double the file size
 
 
 def print_figures(folder: Path, recording: Path) -> None:
@@ -57,7 +56,7 @@ def print_figures(folder: Path, recording: Path) -> None:
 
 
 def from_above() -> Float64:
-    """Rotation (3, 3) from the world (x right, y down) into the picture (z away from the eye)."""
+    """Rotation (3, 3) from the world (x right, y down) to the view (z away from the viewer)."""
     turn = se3.so3_exp([0.0, TURN, 0.0])
     tilt = se3.so3_exp([TILT, 0.0, 0.0])
     return tilt @ turn
@@ -70,18 +69,20 @@ def canvas(size: tuple[int, int]) -> UInt8:
 
 
 def draw_cloud(points: Float64, color: UInt8, size: tuple[int, int]) -> tuple[UInt8, Float64]:
-    """Draw points seen from far away; returns the image (BGR) and the world point in its centre."""
+    """Draw points in orthographic projection; returns the BGR image and its central point."""
     R = from_above()
     low, high = np.percentile(points, [1, 99], axis=0)
     centre = (low + high) / 2
     seen = (points - centre) @ R.T
     u = np.round(seen[:, 0] / PIXEL_M + size[0] / 2).astype(int)
     v = np.round(seen[:, 1] / PIXEL_M + size[1] / 2).astype(int)
-    order = np.argsort(-seen[:, 2], kind="stable")  # far ones first: near ones cover them
+    order = np.argsort(
+        -seen[:, 2], kind="stable"
+    )  # far to near, so that near points cover far ones
     image = canvas(size)
     inside = (u[order] >= 0) & (u[order] < size[0] - 1) & (v[order] >= 0) & (v[order] < size[1] - 1)
     order = order[inside]
-    for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):  # a point is two pixels wide
+    for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):  # each point covers two by two pixels
         image[v[order] + dv, u[order] + du] = color[order, ::-1]
     return image, centre
 

@@ -1,4 +1,4 @@
-"""Every recording of real cameras at hand, with what is known of its poses."""
+"""The recordings of real cameras, with their reference poses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tofuse.geometry import se3
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 
-# One for each way to read the reference; none where there is nothing to compare with.
+# Reads the candidate references of a recording; empty if there is none.
 References = Callable[[Path, Recording], list[Float64]]
 
 
@@ -27,14 +27,14 @@ class Recorded:
     Attributes
     ----------
     name
-        Its folder in the data.
+        Folder in the data.
     reference_m, reference_rad
-        How far the reference itself may be off.
+        Uncertainty of the reference itself.
     references
-        (N, 4, 4) T_world_camera. Of several the one that fits best counts: a direction may not be
-        known.
+        (N, 4, 4) T_world_camera. Of several, the best-fitting one is used: the sign of a
+        direction may be unknown.
     object
-        Whether the object is the world.
+        Whether the world frame is that of a moving object.
     """
 
     name: str
@@ -47,8 +47,8 @@ class Recorded:
 
     @property
     def tolerance(self) -> Tolerance:
-        """What is wrong, the reference's own error allowed for."""
-        return Tolerance().beside(self.reference_m, np.radians(self.reference_deg))
+        """Tolerance of a right pose, including the uncertainty of the reference."""
+        return Tolerance().widened(self.reference_m, np.radians(self.reference_deg))
 
 
 def _folder(*parts: str) -> Callable[[Path], Recording]:
@@ -62,7 +62,7 @@ def _folder(*parts: str) -> Callable[[Path], Recording]:
 
 
 def _own(_data: Path, recording: Recording) -> list[Float64]:
-    """What was found beside the frames."""
+    """The reference stored with the frames."""
     return [] if recording.reference is None else [recording.reference]
 
 
@@ -71,12 +71,12 @@ def _none(_data: Path, _recording: Recording) -> list[Float64]:
 
 
 def _still(_data: Path, recording: Recording) -> list[Float64]:
-    """The camera does not move."""
+    """A static camera."""
     return [np.tile(np.eye(4), (len(recording), 1, 1))]
 
 
 def _corridor(_data: Path, recording: Recording) -> list[Float64]:
-    """Two places, the second 305 mm further along the optical axis."""
+    """Two positions, the second 305 mm further along the optical axis."""
     poses = np.tile(np.eye(4), (len(recording), 1, 1))
     poses[len(poses) // 2 :, 2, 3] = 0.305
     return [poses]

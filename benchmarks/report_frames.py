@@ -1,11 +1,10 @@
-"""Frames per second of a report's 3D view while it is turned, in software WebGL.
+"""Frame rate of a report's 3D view while it is rotated, in software WebGL.
 
-Opens report.html of a result in a headless Chromium that renders on the processor (SwiftShader),
-at the size of a desktop and of a phone, and turns the model with the pointer for some seconds. It
-prints how many frames are painted per second (from the median interval), the triangles that are
-drawn while the model moves and once it rests, and the size of the file. The view draws fewer
-triangles and pixels while it moves, if the machine can't keep up; the first second, in which it
-finds out, does not count. The browser paints at most 60 frames per second.
+Opens report.html of a result in a headless Chromium that renders on the CPU (SwiftShader), at the
+sizes of a desktop and of a phone, and rotates the model with the pointer for some seconds. Prints
+the frame rate (from the median interval), the numbers of triangles drawn in motion and at rest, and
+the size of the file. On slow machines the view draws fewer triangles and pixels in motion; the
+first second, in which it adapts, is not counted. The browser paints at most 60 frames per second.
 
     tofuse run RECORDING --out RESULT --voxel 0.008
     python benchmarks/report_frames.py RESULT [--seconds 4]
@@ -29,7 +28,7 @@ SIZES = {"desktop": (1280, 900, 1.0), "phone": (390, 844, 2.0)}
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
 FLAGS += ["--enable-unsafe-swiftshader"]
 SETTLING_S = 1.0
-# Notes when a frame was painted, and with how many triangles.
+# Records when a frame was painted, and its number of triangles.
 WATCH = """
   window.painted = [];
   const draw = WebGLRenderingContext.prototype.drawElements;
@@ -38,7 +37,7 @@ WATCH = """
     return draw.call(this, mode, count, ...rest);
   };
 """
-# Moves the pointer once per frame of the screen: events from outside the page come more slowly.
+# Moves the pointer once per screen frame: events from outside the page are slower.
 TURN = """
   (canvas, [x, y, reach]) => {
     const begun = performance.now();
@@ -57,7 +56,7 @@ TURN = """
 
 
 def measured(page: Any, seconds: float) -> tuple[np.ndarray, float, float]:
-    """Return intervals in ms while the model turns, and triangles in motion and at rest."""
+    """Return frame intervals in ms in motion, and triangles in motion and at rest."""
     canvas = page.locator("canvas").first
     canvas.scroll_into_view_if_needed()
     page.wait_for_function("window.painted.length > 0")

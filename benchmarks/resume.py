@@ -1,9 +1,9 @@
-"""Runs that are killed at random moments: do they go on, with the same bytes?
+"""Runs that are killed at random moments: do they resume, with identical results?
 
-Each time the same command is started, killed without warning at a random moment, and started once
-more. Before that, the output folder must hold a whole result or none; after it, the same files, to
-the byte, as those of a run that nobody killed. Also printed: how long the second start took, as a
-fraction of a whole run, beside the moment of the kill.
+A command is started, killed by SIGKILL at a random moment, and started again. After the kill, the
+output folder must contain a complete result or none; after the second start, files identical byte
+by byte to those of an uninterrupted run. Also printed: the moment of the kill and the time of the
+second run, as fractions of an uninterrupted one.
 
     python benchmarks/resume.py RECORDING --kills 20
 """
@@ -20,7 +20,7 @@ from time import perf_counter, sleep
 import numpy as np
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
-# A state is kept often, so that short recordings show what long ones need.
+# Checkpoint often, so that short recordings have several checkpoints as long ones do.
 _RUN = """
 import sys
 from tofuse.cli import main
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("recording", type=Path)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--every-s", type=float, default=0.5, help="how often a state is kept")
+    parser.add_argument("--every-s", type=float, default=0.5, help="interval of checkpoints")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "out" / "resume")
     arguments = parser.parse_args()
     out: Path = arguments.out
@@ -43,24 +43,24 @@ def main() -> None:
     out.mkdir(parents=True)
 
     def start(name: str) -> subprocess.Popen[str]:
-        words = ["run", str(arguments.recording), "--out", str(out / name)]
-        command = [sys.executable, "-c", _RUN, str(arguments.every_s), *words]
+        args = ["run", str(arguments.recording), "--out", str(out / name)]
+        command = [sys.executable, "-c", _RUN, str(arguments.every_s), *args]
         return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def finish(name: str) -> tuple[float, str]:
         begun = perf_counter()
         job = start(name)
-        _, said = job.communicate()
+        _, stderr = job.communicate()
         if job.returncode not in (0, 3):
-            raise SystemExit(f"{name}: status {job.returncode}: {said}")
-        return perf_counter() - begun, said
+            raise SystemExit(f"{name}: status {job.returncode}: {stderr}")
+        return perf_counter() - begun, stderr
 
     finish("whole")
     shutil.rmtree(out / "whole")
     seconds, _ = finish("whole")
     wanted = [(out / "whole" / name).read_bytes() for name in SAME]
     names = {p.name for p in (out / "whole").iterdir()}
-    print(f"a whole run takes {seconds:.1f} s")
+    print(f"an uninterrupted run takes {seconds:.1f} s")
     rng = np.random.default_rng(arguments.seed)
     good = 0
     for k, fraction in enumerate(np.sort(rng.random(arguments.kills))):
@@ -75,19 +75,20 @@ def main() -> None:
             print(f"{fraction:5.0%}  had finished")
             good += [(out / name / n).read_bytes() for n in SAME] == wanted
             continue
-        again, said = finish(name)
+        again, stderr = finish(name)
         same = [(out / name / n).read_bytes() for n in SAME] == wanted
         clean = {p.name for p in (out / name).iterdir()} == names
         good += same and clean
-        notes = [line for line in said.splitlines() if "stopped" in line]
+        notes = [line for line in stderr.splitlines() if "stopped" in line]
         print(
-            f"{fraction:5.0%}  {'the same' if same and clean else 'DIFFERS'}, "
-            f"in {again / seconds:.0%} of the time{' (moves cut off)' if halves else ''}; "
+            f"{fraction:5.0%}  {'identical' if same and clean else 'DIFFERS'}, "
+            f"in {again / seconds:.0%} of the time"
+            f"{' (killed while moving files)' if halves else ''}; "
             f"{'; '.join(notes)}",
             flush=True,
         )
         shutil.rmtree(out / name)
-    print(f"{good} of {arguments.kills} the same")
+    print(f"{good} of {arguments.kills} identical")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""How well are rigs of cameras calibrated, and is a knocked camera found?
+"""Accuracy of the extrinsic calibration of camera rigs, and detection of displaced cameras.
 
-`still` simulates four cameras round a person who turns, and calibrates them from one instant and
-from up to 60; `--all-effects` adds multipath and scattering in the lens. `systematic` simulates
-random static rigs of five camera models in three scenes with all effects, one instant each, and
-counts the errors in the 95 % ellipsoids: of all errors, and of random errors alone. `moving`
-simulates three cameras back to back that are carried round a furnished room: errors by the
-trajectories alone, and by all views together. Clocks run at 30.03 and 30.14 Hz. `coverage` counts
-the errors in the 95 % ellipsoids of hand-eye calibrations of trajectories with errors that last
-half a second. `check` displaces one camera of a rig by 5 mm or 0.3 degrees, or none.
+`still` simulates four cameras around a rotating person, and calibrates them from one instant and
+from up to 60; `--all-effects` adds multipath and lens scattering. `systematic` simulates random
+static rigs of five camera models in three scenes with all effects, one instant each, and prints the
+coverage of the 95 % ellipsoids, of all errors and of random errors alone. `moving` simulates three
+cameras back to back that are carried through a furnished room, and prints the calibration from the
+trajectories alone, and from all views. Clocks run at 30.03 and 30.14 Hz. `coverage` prints the
+coverage of the 95 % ellipsoids of hand-eye calibrations, from trajectories with errors correlated
+over half a second. `check` displaces one camera of a rig by 5 mm or 0.3 degrees, or none.
 
     python benchmarks/rigs.py still [--instants 1 60] [--seeds 1] [--all-effects]
     python benchmarks/rigs.py systematic [--seeds 3]
@@ -69,16 +69,16 @@ def cameras_of(recordings: list[Recording]) -> list[Camera]:
     return [Camera(f"cam{k}", recording) for k, recording in enumerate(recordings)]
 
 
-def told(label: str, rig: Rig, truth: list[Float64], clocks: tuple[float, ...]) -> None:
+def print_errors(label: str, rig: Rig, truth: list[Float64], clocks: tuple[float, ...]) -> None:
     for camera in rig.cameras[1:]:
         k = int(camera.name[3:])
-        off = se3.inverse(camera.T_rig_camera) @ truth[k]
-        e = se3.log(off)
+        error = se3.inverse(camera.T_rig_camera) @ truth[k]
+        e = se3.log(error)
         late = 1e3 * (camera.time_offset_s - (clocks[k] - clocks[0]))
         square = e @ np.linalg.solve(camera.covariance, e)
         print(
-            f"{label:<28}{camera.name:<8}{1e3 * np.linalg.norm(off[:3, 3]):7.2f}"
-            f"{np.degrees(se3.angle(off)):8.3f}{late:10.2f}{square:8.1f}"
+            f"{label:<28}{camera.name:<8}{1e3 * np.linalg.norm(error[:3, 3]):7.2f}"
+            f"{np.degrees(se3.angle(error)):8.3f}{late:10.2f}{square:8.1f}"
         )
     for name, why in rig.unplaced.items():
         print(f"{label:<28}{name:<8}not placed: {why}")
@@ -103,7 +103,7 @@ def still(instants: list[int], seeds: int, *, all_effects: bool) -> None:
                 scene, sequence, mounts, first_s=0.5, frames=count, effects=effects, seed=seed
             )
             found = calibrate_cameras(cameras_of(recordings), [f"cam{k}" for k in range(4)])
-            told(f"still, {found.how}, seed {seed}", found.rig, truth, clocks)
+            print_errors(f"still, {found.how}, seed {seed}", found.rig, truth, clocks)
 
 
 def stands_of(scene: str, rng: np.random.Generator) -> list[Float64]:
@@ -203,11 +203,11 @@ def moving(frames: int, seeds: int) -> None:
             scene, sequence, mounts, first_s=0.2, frames=frames, effects=MOVING, seed=seed
         )
         found = calibrate_cameras(cameras_of(recordings), [f"cam{k}" for k in range(3)], "moving")
-        told(f"moving, {frames} frames, seed {seed}", found.rig, truth, clocks)
+        print_errors(f"moving, {frames} frames, seed {seed}", found.rig, truth, clocks)
 
 
 def with_errors(path, T: Float64, rate: float, clock: float, rng: np.random.Generator) -> Track:
-    """A trajectory of 8 s with errors of 2 mm and 0.07 degrees that last half a second."""
+    """A trajectory of 8 s with errors of 2 mm and 0.07 degrees, correlated over 0.5 s."""
     times = np.arange(240) / rate + 0.4 - clock
     poses = np.stack([path(t + clock) @ T for t in times])
     errors, keep = rng.normal(size=(240, 6)), np.exp(-1 / 15)
@@ -236,7 +236,7 @@ def coverage(seeds: int) -> None:
 
 
 def check(seeds: int) -> None:
-    """Rigs of four as calibrations with 0.6 mm and 0.03 degrees give them, before and after."""
+    """Check rigs of four, calibrated to 0.6 mm and 0.03 degrees, for displaced cameras."""
     sigma = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
     truth = relative(around((0, 0, 0.8), 1.6, 0.5, 4))
 
@@ -260,7 +260,7 @@ def check(seeds: int) -> None:
             found = compare(measured(truth, rng), measured(after, rng))
             named = [m.name for m in found if m.moved]
             right += named == ([] if name == "none" else [str(which)])
-        print(f"knocked by {name:<8} right in {right} of {seeds}")
+        print(f"displaced by {name:<8} detected rightly in {right} of {seeds}")
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
-"""Is any recording lost, is any wrong pose unmarked, is any wrong join made?
+"""Failures on real and stressed recordings: lost frames, unmarked wrong poses, wrong joins.
 
-`real`: every recording of real cameras that is a sequence, beside small_gicp's map, KISS-ICP and
-Open3D's odometry on the same frames, filtered alike. Of each peer the tuning is taken whose first
-frames agree best with each other. `stress`: simulated recordings with exact truth, to which happens
-what happens to people (`stress.py`). What counts as a wrong pose, as marked and as a wrong join is
-said, and computed, in `scoring.py`. Peers mark nothing and know one component only.
+`real`: all real recordings that are sequences, compared with small_gicp's map, KISS-ICP and
+Open3D's odometry on the same filtered frames. For each peer the tuning with the best map
+consistency on the first frames is used. `stress`: simulated recordings with exact ground truth and
+realistic disturbances (`stress.py`). `scoring.py` defines and computes wrong poses, marked poses
+and wrong joins. Peers mark nothing and have a single component.
 
     python benchmarks/robustness.py real [--names kitchen] [--peers]
     python benchmarks/robustness.py stress [--scenes room] [--cases covered] [--seeds 3] [--quick]
@@ -44,18 +44,18 @@ QUICK_FRAMES = 100
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one recording.
+    """Outcome of one method on one recording.
 
     Attributes
     ----------
     map_rms_m, map_inliers
         Map consistency of the main component; NaN where no two views overlap.
     components
-        How many there are, the main one and all that is joined to it counted once.
+        Number of components; the main one and those joined to it count as one.
     problem
-        Why there is no result, or empty.
+        Reason if there is no result, else empty.
     compared
-        Whether there is a truth or reference.
+        Whether there is ground truth or a reference.
     """
 
     group: str
@@ -83,7 +83,7 @@ def lost(count: int, truth: Truth) -> Score:
 def ours(
     recording: Recording, threads: int, *, turning: bool = False
 ) -> tuple[list[Part], str, float, str]:
-    """Run the default method; parts, verdict, seconds, and what went wrong."""
+    """Run the default method; return parts, verdict, seconds, and the problem if any."""
     began = time.perf_counter()
     try:
         config = resolve(Options(out=Path("unused"), object=turning))
@@ -91,7 +91,7 @@ def ours(
     except InputError as error:
         return [], "", time.perf_counter() - began, str(error)
     except Exception as error:
-        # A benchmark of robustness counts what breaks instead of breaking itself.
+        # Crashes are counted as outcomes.
         return [], "", time.perf_counter() - began, f"crashed: {type(error).__name__}: {error}"
     seconds = time.perf_counter() - began
     parts = scoring.parts_of(result, recording.indices)
@@ -99,7 +99,7 @@ def ours(
 
 
 def peer_methods() -> dict[str, tuple[str, list[Method]]]:
-    """Label of each peer -> the module that it needs, and its tunings."""
+    """Map each peer's label to the module that it needs and its tunings."""
     maps = [sgicp.Map(v, m) for v, m in ((0.02, 0.05), (0.04, 0.1), (0.08, 0.2))]
     return {
         "small_gicp map": ("small_gicp", list(maps)),
@@ -109,7 +109,7 @@ def peer_methods() -> dict[str, tuple[str, list[Method]]]:
 
 
 def peer_poses(method: Method, frames: Sequence[RangeFrame], threads: int) -> Float64:
-    """(N, 4, 4) poses that a peer gives, NaN where none."""
+    """Poses (N, 4, 4) of a peer, NaN where lost."""
     session = method.start(frames[0], threads)
     out = np.full((len(frames), 4, 4), np.nan)
     for k, frame in enumerate(frames):
@@ -120,7 +120,7 @@ def peer_poses(method: Method, frames: Sequence[RangeFrame], threads: int) -> Fl
 
 
 def as_part(poses: Float64) -> Part:
-    """Poses of a method that states nothing about them."""
+    """Part with the poses of a method that states no uncertainty."""
     nothing = np.zeros((0, 6))
     records = tuple(
         SimpleNamespace(index=k, status="tracked", covariance=None, unobservable=nothing)
@@ -132,7 +132,7 @@ def as_part(poses: Float64) -> Part:
 def peer(
     label: str, recording: Recording, frames: Sequence[RangeFrame], threads: int
 ) -> tuple[list[Part], float, str]:
-    """Run a peer with its best tuning; parts, seconds, and what went wrong."""
+    """Run a peer with its best tuning; return parts, seconds, and the problem if any."""
     module, tunings = peer_methods()[label]
     if find_spec(module) is None:
         return [], 0.0, f"{module} is not installed"
@@ -151,7 +151,7 @@ def peer(
 
 
 def agreement(recording: Recording, poses: Float64) -> tuple[float, float]:
-    """Map consistency, rms in m and fraction of inliers; NaN and 0 where no two views overlap."""
+    """Map consistency: rms in m and inlier ratio; NaN and 0 if no two views overlap."""
     try:
         found = map_consistency(recording, poses)
     except InputError:
@@ -163,9 +163,9 @@ def agreement(recording: Recording, poses: Float64) -> tuple[float, float]:
 
 
 def real(
-    one: Recorded, data: Path, threads: int, frames: int | None, *, beside: bool
+    one: Recorded, data: Path, threads: int, frames: int | None, *, with_peers: bool
 ) -> Iterator[Row]:
-    """Give the rows of one recording."""
+    """Yield the rows of one recording."""
     recording = one.open(data).select(end=frames)
     n = len(recording)
     whole = np.zeros(n, np.intp)
@@ -193,7 +193,7 @@ def real(
 
     parts, verdict, seconds, problem = ours(recording, threads, turning=one.object)
     yield row(OURS, parts, seconds, problem, verdict)
-    if not beside or one.object:
+    if not with_peers or one.object:
         return
     _, cleaned, _ = sequences.prepared(recording)
     for label in peer_methods():
@@ -204,13 +204,13 @@ def real(
 # ---- Stress --------------------------------------------------------------------------------------
 
 
-def stressed(case: stress.Case, threads: int, *, beside: bool) -> Iterator[Row]:
-    """Give the rows of one case."""
+def stressed(case: stress.Case, threads: int, *, with_peers: bool) -> Iterator[Row]:
+    """Yield the rows of one case."""
     n = len(case.recording)
     parts, verdict, seconds, problem = ours(case.recording, threads)
     score = scoring.score(parts, case.truth) if parts else lost(n, case.truth)
     yield Row(case.scene, case.name, OURS, score, seconds, verdict, len(parts), problem=problem)
-    if not beside:
+    if not with_peers:
         return
     _, cleaned, _ = sequences.prepared(case.recording)
     for label in peer_methods():
@@ -219,7 +219,7 @@ def stressed(case: stress.Case, threads: int, *, beside: bool) -> Iterator[Row]:
         yield Row(case.scene, case.name, label, score, seconds, problem=problem)
 
 
-# ---- Words ---------------------------------------------------------------------------------------
+# ---- Output --------------------------------------------------------------------------------------
 
 STRESS_HEAD = (
     f"{'scene':10} {'case':31} {'method':15} frames  main  covered  parts  wrong unmarked strict"
@@ -232,7 +232,7 @@ REAL_HEAD = (
 
 
 def stress_line(row: Row) -> str:
-    """Return a row of the stress part."""
+    """Format a row of the stress benchmark."""
     s = row.score
     fraction = f"{s.covered / s.overlapping:.0%}" if s.overlapping else "-"
     return (
@@ -244,7 +244,7 @@ def stress_line(row: Row) -> str:
 
 
 def real_line(row: Row) -> str:
-    """Return a row of the real part."""
+    """Format a row of the real benchmark."""
     s = row.score
     counts = (s.wrong, s.unmarked, s.joins) if row.compared else ("-", "-", "-")
     ate = f"{1000 * s.ate_m:.0f}" if row.compared else "-"
@@ -256,7 +256,7 @@ def real_line(row: Row) -> str:
 
 
 def summary(rows: Sequence[Row]) -> Iterator[str]:
-    """Give a line for each method: what all runs come to."""
+    """Yield a summary of all runs for each method."""
     for method in dict.fromkeys(row.method for row in rows):
         own = [row for row in rows if row.method == method]
         scores = [row.score for row in own]
@@ -265,13 +265,14 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
         posed = sum(s.main for s in scores)
         yield (
             f"{method}: {len(own)} runs, {len(failed)} without a result; "
-            f"{sum(s.covered for s in scores) / max(overlapping, 1):.1%} of what overlaps covered "
+            f"{sum(s.covered for s in scores) / max(overlapping, 1):.1%} of overlapping "
+            f"frames covered "
             f"(in the worst run {min(s.covered / max(s.overlapping, 1) for s in scores):.0%}); "
             f"wrong poses {sum(s.wrong for s in scores)} of {posed} in "
-            f"{sum(s.wrong > 0 for s in scores)} runs, not marked "
+            f"{sum(s.wrong > 0 for s in scores)} runs, unmarked "
             f"{sum(s.unmarked for s in scores)} in {sum(s.unmarked > 0 for s in scores)} runs "
             f"({sum(s.unmarked_strict for s in scores)} in "
-            f"{sum(s.unmarked_strict > 0 for s in scores)} by the stricter count), "
+            f"{sum(s.unmarked_strict > 0 for s in scores)} by the strict count), "
             f"marked by a reason alone {sum(s.by_reason for s in scores)}; "
             f"wrong joins {sum(s.joins for s in scores)} "
             f"({sum(s.joins_by_motion for s in scores)} with motion) in "
@@ -280,8 +281,8 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def by_case(rows: Sequence[Row]) -> Iterator[str]:
-    """Give a Markdown table of our own runs, a row for each case."""
-    yield "| case | runs | covered at least 95 % | wrong poses | not marked | wrong joins |"
+    """Yield a Markdown table of our own runs, a row for each case."""
+    yield "| case | runs | covered at least 95 % | wrong poses | unmarked | wrong joins |"
     yield "|---|---|---|---|---|---|"
     own = [row for row in rows if row.method == OURS]
     for name in dict.fromkeys(row.name for row in own):
@@ -305,18 +306,20 @@ def keep(rows: Sequence[Row], path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a row for each run, and what they come to."""
+    """Print a row for each run, and summaries."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("parts", nargs="*", choices=["real", "stress", []], default=[])
-    parser.add_argument("--names", nargs="+", default=[""], help="of real ones, parts of names")
+    parser.add_argument(
+        "--names", nargs="+", default=[""], help="real recordings whose names contain these"
+    )
     parser.add_argument("--scenes", nargs="+", choices=stress.SCENES, default=list(stress.SCENES))
     parser.add_argument("--cases", default="", metavar="SUBSTRING")
     parser.add_argument("--seeds", type=int, default=1, metavar="N")
     parser.add_argument("--quick", action="store_true", help="fewer cases; at most 100 frames")
     parser.add_argument("--peers", action="store_true", help="run the peers as well")
-    parser.add_argument("--frames", type=int, help="of real ones only the first so many")
+    parser.add_argument("--frames", type=int, help="real recordings: use only the first N")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA)
     parser.add_argument("--out", type=Path, default=sequences.OUT)
@@ -330,11 +333,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if not any(part in name for part in options.names):
                 continue
             try:
-                for row in real(one, options.data, options.threads, frames, beside=options.peers):
+                for row in real(
+                    one, options.data, options.threads, frames, with_peers=options.peers
+                ):
                     rows.append(row)
                     print(real_line(row), flush=True)
             except FileNotFoundError as error:
-                print(f"{one.title}: left out, there is no {error}", flush=True)
+                print(f"{one.title}: skipped, no {error}", flush=True)
         _end(rows, options.out / "robustness_real.json")
     if "stress" in wanted:
         rows = []
@@ -345,7 +350,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     stress.SCENES[name], seed, quick=options.quick, containing=options.cases
                 )
                 for case in made:
-                    for row in stressed(case, options.threads, beside=options.peers):
+                    for row in stressed(case, options.threads, with_peers=options.peers):
                         rows.append(row)
                         print(stress_line(row), flush=True)
         _end(rows, options.out / "robustness_stress.json")

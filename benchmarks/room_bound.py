@@ -1,12 +1,12 @@
-"""Whole reconstructions of a simulated room beside the lowest error that the noise allows.
+"""Whole reconstructions of a simulated room, compared with the Cramer-Rao bound.
 
     python benchmarks/room_bound.py [--scene room] [--seeds 1] [--effects noise]
 
-`noise` has the noise of the electrons, mixed pixels and ranges that wrap; `direct` has every error
-but light by way of other surfaces. Printed are the rms error of the positions after rigid alignment
-of the tracker and of the final poses, and the Cramer-Rao bound of the same figure, from distances
-alone and with albedo, which knows nothing of the surface (`lab/experiments/recording_bound.py`),
-with its range from 5 to 95 % of single recordings; and the ratio of the final error to both.
+`noise` has shot noise, mixed pixels and phase wraps; `direct` has all errors except multipath.
+Printed are the ATE (rms, after rigid alignment) of the tracker and of the final poses, and its
+Cramer-Rao bound with an unknown surface, from distances alone and with albedo
+(`lab/experiments/recording_bound.py`), with the 5 to 95 % range for single recordings; and the
+ratio of the final error to both.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def _case(scene: str, name: str, seed: int, threads: int) -> None:
         evaluate_trajectory(times, poses, times, truth).ate_rms_m * 1e3
         for poses in (result.diagnostics.sequential, result.trajectory)
     )
-    said = [f"{1e3 * b.mean:.2f} ({1e3 * b.low:.2f} to {1e3 * b.high:.2f})" for b in bounds]
+    texts = [f"{1e3 * b.mean:.2f} ({1e3 * b.low:.2f} to {1e3 * b.high:.2f})" for b in bounds]
     ratios = [f"{final / (1e3 * b.mean):.2f}" for b in bounds]
     print(
         f"{scene} {name} seed {seed}: tracker {tracker:.2f} mm, final {final:.2f} mm; bound, "
-        f"distances {said[0]} mm, with albedo {said[1]} mm; ratio {ratios[0]}, {ratios[1]}",
+        f"distances {texts[0]} mm, with albedo {texts[1]} mm; ratio {ratios[0]}, {ratios[1]}",
         flush=True,
     )
 

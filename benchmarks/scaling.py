@@ -1,12 +1,12 @@
-"""How the tracker's time and memory grow, and how far its kernels are from the memory's speed.
+"""Scaling of the tracker's time and memory, and its kernels compared with memory bandwidth.
 
-Four tables: time a frame over resolution; time and memory over the number of frames, the sequence
-going forth and back; the first-ever compilation, in a process of its own with an empty cache; and
-each kernel's own CPU time on one thread, beside the time that the machine needs to move the bytes
-that the kernel must touch, which are those of its arrays, each once. The frames are those of a
-made room, or of a recording. All but the compilation is warm.
+Four tables: time per frame over resolution; time and memory over the number of frames, with the
+sequence played forwards and backwards; compilation in a new process with an empty cache; and the
+CPU time of each kernel on one thread, with the lower bound from memory bandwidth, if each of its
+arrays is moved once. The frames are those of a synthetic room, or of a recording. All but the
+compilation is measured warm.
 
-With `--whole` the memory of whole runs is printed instead: everything but reading and writing.
+With `--whole` the memory of whole runs is printed instead, without reading and writing.
 
     python benchmarks/scaling.py [RECORDING] [--columns 160 320 640] [--counts 500 1000 5000]
 """
@@ -40,17 +40,17 @@ from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
-LENGTH = 60  # frames of the sequence that goes forth and back
+LENGTH = 60  # frames of the sequence that is played forwards and backwards
 BANDWIDTH_BYTES = 1 << 28
 
 
 def made_pose(k: int) -> Float64:
-    """T_world_camera (4, 4) of the k-th frame of the made room."""
+    """T_world_camera (4, 4) of the k-th frame of the synthetic room."""
     return se3.exp([0.5 * np.sin(0.02 * k), 0, 0.004 * k, 0.1 * np.sin(0.05 * k), 0.012 * k, 0])
 
 
 def made_frames(columns: int, count: int) -> list[RangeFrame]:
-    """Look round a room of 5 x 4 x 3 m with two boxes in it, with 2 mm of noise at 1 m."""
+    """Frames of a room of 5 x 4 x 3 m with two boxes, with 2 mm of noise at 1 m."""
     rows = columns * 3 // 4
     camera = Pinhole(columns, rows, 0.9 * columns, 0.9 * columns, columns / 2 - 0.5, rows / 2 - 0.5)
     rays = camera.rays().astype(float)
@@ -64,17 +64,19 @@ def made_frames(columns: int, count: int) -> list[RangeFrame]:
         length = np.linalg.norm(outward, axis=1)
         cosine = np.abs(np.take_along_axis(outward, axis[:, None], 1)[:, 0]) / length
         albedo = 0.5 + 0.2 * np.sin(7 * points).sum(1) / 3
-        light = 4000 * albedo * cosine / (z * length) ** 2
+        signal = 4000 * albedo * cosine / (z * length) ** 2
         rng = np.random.default_rng([0, columns, k])
         z = z + 0.002 * z * z * rng.standard_normal(z.shape)
-        light = light * (1 + 0.01 * rng.standard_normal(z.shape))
-        depth, amplitude = (image.reshape(rows, columns).astype(np.float32) for image in (z, light))
+        signal = signal * (1 + 0.01 * rng.standard_normal(z.shape))
+        depth, amplitude = (
+            image.reshape(rows, columns).astype(np.float32) for image in (z, signal)
+        )
         frames.append(RangeFrame(k, k / 30, camera, depth, amplitude_image=amplitude))
     return frames
 
 
 def _room(origin: Float64, directions: Float64) -> tuple[Float64, Intp]:
-    """z of what rays of unit z hit, from inside a box and from outside two more, and its axis."""
+    """Depths at which rays of unit z hit the room or two boxes, and the axis of the surface."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions
     low, high = np.array([-2.5, -1.5, -1.0]), np.array([2.5, 1.5, 3.0])
@@ -99,13 +101,13 @@ def recorded_frames(path: str, count: int) -> list[RangeFrame]:
 
 
 def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
-    """Return the frames with every so manieth pixel, so that they have that many columns."""
+    """Return the frames subsampled to a number of columns."""
     step = max(1, frames[0].camera.width // columns)
     part = (slice(step // 2, None, step), slice(step // 2, None, step))
     found = []
     for frame in frames:
         depth = np.ascontiguousarray(frame.depth[part])
-        light = frame.amplitude_image
+        amplitude = frame.amplitude_image
         assert isinstance(frame.camera, Pinhole)
         found.append(
             RangeFrame(
@@ -114,7 +116,9 @@ def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
                 scaled(frame.camera, depth.shape[1], depth.shape[0]),
                 depth,
                 frame.depth_kind,
-                amplitude_image=None if light is None else np.ascontiguousarray(light[part]),
+                amplitude_image=None
+                if amplitude is None
+                else np.ascontiguousarray(amplitude[part]),
                 amplitude_kind=frame.amplitude_kind,
             )
         )
@@ -122,20 +126,20 @@ def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
 
 
 def tracker(columns: int) -> Any:
-    """Return the default tracker, working on so many columns."""
+    """Return the default tracker, working at a number of columns."""
     options = Keyframes()
     return replace(options, views=replace(options.views, columns=columns)).start(0)
 
 
 def forth_and_back(frames: Sequence[RangeFrame], count: int) -> Iterator[RangeFrame]:
-    """Give `count` frames: the sequence, then back, and so on."""
+    """Yield `count` frames: the sequence forwards, backwards, and so on."""
     period = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
     for k in range(count):
         yield replace(frames[period[k % len(period)]], index=k, timestamp=k / 30)
 
 
 def timed(tracker: Any, frames: Iterator[RangeFrame]) -> tuple[Float64, int]:
-    """Return the seconds of each push, and how many frames have a pose."""
+    """Return the seconds of each push, and the number of frames with a pose."""
     seconds, posed = [], 0
     for frame in frames:
         start = time.perf_counter()
@@ -179,7 +183,7 @@ def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[
 
 
 def whole_run(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
-    """Memory of a whole run, loops, refinement and model included, as the sequence goes on."""
+    """Memory during a whole run, including loops, refinement and model."""
     mapper = Mapper()
     source = forth_and_back(frames, max(counts))
     yield f"{'frames':>8}{'CPU, s':>9}{'memory, MB':>12}"
@@ -189,17 +193,17 @@ def whole_run(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[s
         for _ in range(count - done):
             mapper.push(next(source))
         done = count
-        spent = time.process_time() - start
-        yield f"{count:>8}{spent:>9.1f}{resident_bytes() / 1e6:>12.0f}"
+        cpu_s = time.process_time() - start
+        yield f"{count:>8}{cpu_s:>9.1f}{resident_bytes() / 1e6:>12.0f}"
     start = time.process_time()
     result = mapper.finish()
-    spent = time.process_time() - start
-    yield f"{'finished':>8}{spent:>9.1f}{resident_bytes() / 1e6:>12.0f}"
+    cpu_s = time.process_time() - start
+    yield f"{'finished':>8}{cpu_s:>9.1f}{resident_bytes() / 1e6:>12.0f}"
     yield f"{result.has_pose.mean():.0%} posed, {len(result.diagnostics.loops)} loops considered"
 
 
 def resident_bytes() -> int:
-    """Memory that the process holds now; at its peak where the system only tells that."""
+    """Resident memory now, or at its peak if the system reports only that."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -211,7 +215,7 @@ def resident_bytes() -> int:
 
 
 def compilation() -> Iterator[str]:
-    """Track two small frames in a new process: with an empty cache, and again with a full one."""
+    """Track two small frames in a new process, with an empty and with a full cache."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         for name in ("first ever", "from the cache"):
@@ -226,8 +230,8 @@ def compilation() -> Iterator[str]:
 
 
 @dataclass
-class Spent:
-    """What a kernel took: calls, seconds, and the bytes of its arrays, each touched once."""
+class KernelCost:
+    """Cost of a kernel: calls, seconds, and the bytes of its arrays, each counted once."""
 
     calls: int = 0
     seconds: float = 0.0
@@ -235,9 +239,9 @@ class Spent:
 
 
 @contextmanager
-def watched_kernels() -> Iterator[dict[str, Spent]]:
-    """Measure every call of a kernel from Python, in CPU time. They must be compiled already."""
-    spent: dict[str, Spent] = {}
+def watched_kernels() -> Iterator[dict[str, KernelCost]]:
+    """Measure the CPU time of every kernel call from Python; kernels must be compiled."""
+    costs: dict[str, KernelCost] = {}
     dispatcher = type(numba.njit(lambda: None))
     places = [
         (module, name, value)
@@ -247,24 +251,24 @@ def watched_kernels() -> Iterator[dict[str, Spent]]:
         if isinstance(value, dispatcher)
     ]
     for module, name, value in places:
-        setattr(module, name, _watched(value, spent))
+        setattr(module, name, _watched(value, costs))
     try:
-        yield spent
+        yield costs
     finally:
         for module, name, value in places:
             setattr(module, name, value)
 
 
-def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
+def _watched(function: Any, costs: dict[str, KernelCost]) -> Callable[..., Any]:
     def called(*arguments: Any) -> Any:
         start = time.thread_time()
         result = function(*arguments)
         seconds = time.thread_time() - start
-        found = spent.setdefault(function.__name__, Spent())
+        found = costs.setdefault(function.__name__, KernelCost())
         found.calls += 1
         found.seconds += seconds
         arrays = [a for a in _flat(arguments) if isinstance(a, np.ndarray)]
-        # All iterations of a level are one call, which says last how many they were.
+        # One call does all iterations of a level, and returns their number last.
         passes = result[-1] if function.__name__ == "iterate_level" else 1
         found.bytes += passes * _fraction(arguments, arrays) * sum(a.nbytes for a in arrays)
         return result
@@ -278,7 +282,7 @@ def _flat(arguments: Sequence[Any]) -> Iterator[Any]:
 
 
 def _fraction(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:
-    """The part of the rows that a call works on: kernels end with (start, stop)."""
+    """Fraction of the rows that a call processes: the last arguments are (start, stop)."""
     ends = arguments[-2:]
     if len(ends) < 2 or not all(isinstance(e, int) for e in ends) or not arrays:
         return 1.0
@@ -286,9 +290,9 @@ def _fraction(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float
 
 
 def bandwidth(count: int) -> float:
-    """Bytes a second, read and written, of the fastest of ten copies of 256 MB.
+    """Bytes per second, read and written, of the fastest of ten copies of 256 MB.
 
-    On one thread in CPU time, as the kernels are measured.
+    In CPU time on one thread, as the kernels are measured.
     """
 
     @numba.njit(nogil=True)
@@ -316,32 +320,34 @@ def over_kernels(frames: Sequence[RangeFrame]) -> Iterator[str]:
     with using_threads(1):
         timed(tracker(columns), iter(frames[:3]))
         at_work = tracker(columns)
-        with watched_kernels() as spent:
+        with watched_kernels() as costs:
             start = time.thread_time()
             for frame in forth_and_back(frames, len(frames)):
                 at_work.push(frame)
             whole = time.thread_time() - start
     n = len(frames)
-    yield f"{'a frame':<20}{'calls':>7}{'ms':>8}{'MB':>8}{'bound, ms':>11}{'of the bound':>14}"
-    for name, s in sorted(spent.items(), key=lambda item: -item[1].seconds):
+    yield f"{'per frame':<20}{'calls':>7}{'ms':>8}{'MB':>8}{'bound, ms':>11}{'of the bound':>14}"
+    for name, s in sorted(costs.items(), key=lambda item: -item[1].seconds):
         bound = s.bytes / speed
         yield (
             f"{name:<20}{s.calls / n:>7.1f}{1e3 * s.seconds / n:>8.2f}{s.bytes / n / 1e6:>8.2f}"
             f"{1e3 * bound / n:>11.2f}{s.seconds / bound:>13.1f}x"
         )
-    inside = sum(s.seconds for s in spent.values())
+    inside = sum(s.seconds for s in costs.values())
     yield f"{'outside of kernels':<20}{'':>7}{1e3 * (whole - inside) / n:>8.2f}"
     yield f"{'in all':<20}{'':>7}{1e3 * whole / n:>8.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("recording", nargs="?", help="instead of the made room")
+    parser.add_argument(
+        "recording", nargs="?", help="recording to use instead of the synthetic room"
+    )
     parser.add_argument("--columns", type=int, nargs="+", default=[160, 320, 640])
     parser.add_argument("--counts", type=int, nargs="+", default=[500, 1000, 5000])
     parser.add_argument("--length", type=int, default=LENGTH, help="frames of the sequence")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--whole", action="store_true", help="only the memory of a whole run")
+    parser.add_argument("--whole", action="store_true", help="print only the memory of a whole run")
     parser.add_argument("--compile-only", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.compile_only:
@@ -353,7 +359,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     print(
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
-        f"{options.threads} threads{load}; {options.recording or 'made room'}"
+        f"{options.threads} threads{load}; {options.recording or 'synthetic room'}"
     )
     widest = max(options.columns)
     frames = (

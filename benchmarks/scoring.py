@@ -1,22 +1,22 @@
-"""Which poses of a result are wrong, which of those are marked as doubtful, and what was joined.
+"""Wrong poses of a result, whether they are marked as uncertain, and wrong joins.
 
-Definitions, for poses that are given in one common frame (a *part*: the main component with all
-that is joined to it, or a component of its own), against true poses:
+Definitions, for poses in a common frame (a *part*: the main component with all components joined to
+it, or a separate component), compared with true poses:
 
-- The part is aligned to the truth by one rigid motion: of the motions that put one of its frames
-  exactly right, that with which most frames are right, then the mean over those. So a part that
-  broke in two is aligned to its larger piece, not to something between. As covariances are relative
-  to the first frame, the motion that fits the piece with the first frame is tried as well, and the
-  one with fewer unmarked wrong poses counts: what is said of the later piece covers the break.
-  The stricter count, with the larger piece alone, is given beside it.
-- A pose is *wrong* if it is then off by more than 5 cm or 3 degrees.
-- It is *marked* if its frame is not called tracked; or the error is within three sigma of the
-  covariance that the frame states; or what is left of the error without the directions that the
-  frame calls unobservable is no longer wrong; or a reason of the run names its frame.
-- Frames are tied where their relative pose is off by no more than 5 cm and 3 degrees, and what
-  hangs together by ties is a *side*, which drift does not break. A *join is wrong* where two sides
-  of three or more frames of one part are off against each other by more than 20 cm or 10 degrees
-  (median over pairs of frames).
+- A part is aligned to the ground truth by one rigid motion: among the motions that align one of its
+  frames exactly, the one with the most right frames, then the mean over those. A part that broke in
+  two is thus aligned to its larger piece, not to a compromise. As covariances are relative to the
+  first frame, the alignment to the piece with the first frame is tried as well, and the one with
+  fewer unmarked wrong poses is used: statements about the later piece then cover the break. The
+  strict count uses the larger piece only.
+- A pose is *wrong* if its error is then above 5 cm or 3 degrees.
+- It is *marked* if its frame is not `tracked`; or the error is within three sigma of the frame's
+  covariance; or the error without the frame's unobservable directions is not wrong; or a reason of
+  the run names the frame.
+- Two frames are tied if their relative pose is accurate to 5 cm and 3 degrees. Connected components
+  of ties are *sides*, which drift does not break. A *join is wrong* if two sides of three or more
+  frames of one part are displaced against each other by more than 20 cm or 10 degrees (median over
+  pairs of frames).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tofuse.arrays import Bool, Float64, Intp
 from tofuse.evaluation.trajectory import mean_rotation
 from tofuse.geometry import se3
 
-OFF_M, OFF_RAD = 0.05, np.radians(3.0)
+MAX_ERROR_M, MAX_ERROR_RAD = 0.05, np.radians(3.0)
 JOIN_M, JOIN_RAD = 0.20, np.radians(10.0)
 SIGMAS = 3.0
 SMALLEST_SIDE = 3
@@ -40,18 +40,18 @@ SMALLEST_SIDE = 3
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Poses that a result gives in one common frame.
+    """Poses of a result in a common frame.
 
     Attributes
     ----------
     poses
-        (N, 4, 4) T_world_camera by position in the recording, NaN where it has none.
+        (N, 4, 4) T_world_camera by position in the recording, NaN if missing.
     records
-        What the result says of the frames, by position; None where nothing.
+        Records of the frames in the result, by position; None if missing.
     reasons
-        Those of the run that the part is of.
+        Reasons of the run that the part belongs to.
     by_motion
-        Whether something was joined to it by motion alone.
+        Whether a component was joined to it by motion alone.
     """
 
     poses: Float64
@@ -74,17 +74,17 @@ class Score:
     frames
         Readable frames.
     main
-        Those with a pose in the main component.
+        Frames with a pose in the main component.
     overlapping, covered
-        Frames that overlap others, and those of them that are in one part with their group.
+        Frames that overlap others, and those of them in the same part as their group.
     wrong, unmarked
-        Wrong poses of all parts, and those that nothing marks.
+        Wrong poses of all parts, and those that are not marked.
     unmarked_strict
-        Those that nothing marks where parts are aligned to their larger piece alone.
+        Unmarked wrong poses if parts are aligned to their larger piece only.
     by_reason
-        Wrong poses that only a reason of the run marks.
+        Wrong poses that are marked by a reason only.
     joins, joins_by_motion
-        Wrong joins, and those of parts in which something was joined by motion alone.
+        Wrong joins, and those in parts with components joined by motion alone.
     ate_m
         Rms distance of the main component's positions after the alignment; NaN without poses.
     """
@@ -104,27 +104,27 @@ class Score:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What is wrong: beyond `off_m` or `off_rad`. References that are not exact add their own."""
+    """Largest errors of a right pose. Inexact references add their own."""
 
-    off_m: float = OFF_M
-    off_rad: float = OFF_RAD
+    max_m: float = MAX_ERROR_M
+    max_rad: float = MAX_ERROR_RAD
     join_m: float = JOIN_M
     join_rad: float = JOIN_RAD
 
-    def beside(self, reference_m: float, reference_rad: float) -> Tolerance:
-        """Return the tolerance for a reference that may be off itself."""
+    def widened(self, reference_m: float, reference_rad: float) -> Tolerance:
+        """Return the tolerance for an inexact reference."""
         return Tolerance(
-            self.off_m + reference_m,
-            self.off_rad + reference_rad,
+            self.max_m + reference_m,
+            self.max_rad + reference_rad,
             self.join_m + reference_m,
             self.join_rad + reference_rad,
         )
 
 
 def parts_of(result: Any, indices: Iterable[int]) -> list[Part]:
-    """Return the main component, with all that is joined to it, and the components of their own.
+    """Return the main component, with all components joined to it, and the separate components.
 
-    Works on results that know of no components: then there is one part.
+    Results without components have one part.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _part(
     indices = [int(record.index) for record in result.diagnostics.frames]
     if frames is not None:
         members = [k for a, b in frames for k in range(a, b + 1)]
-        # Frames of a result of its own may be counted from its first one.
+        # A separate result may count its frames from its first one.
         if not set(indices) <= set(members) and len(indices) == len(members):
             indices = members
     for k, index in enumerate(indices):
@@ -173,15 +173,15 @@ def ranges(frames: Any) -> list[tuple[int, int]]:
 
 
 def relative_errors(estimate: Float64, truth: Float64) -> tuple[Float64, Float64]:
-    """Errors (N, N) in m and rad of pose j where pose i is put exactly right."""
+    """Errors (N, N) in m and rad of pose j if pose i is aligned exactly."""
     n = len(estimate)
     T_truth_world = truth @ se3.inverse(estimate)
     T_camera_truth = se3.inverse(truth)
     metres, radians = np.empty((n, n)), np.empty((n, n))
     for i in range(n):
-        off = T_camera_truth @ (T_truth_world[i] @ estimate)
-        metres[i] = np.linalg.norm(off[:, :3, 3], axis=1)
-        radians[i] = se3.angle(off)
+        error = T_camera_truth @ (T_truth_world[i] @ estimate)
+        metres[i] = np.linalg.norm(error[:, :3, 3], axis=1)
+        radians[i] = se3.angle(error)
     return metres, radians
 
 
@@ -190,10 +190,10 @@ def aligned(
 ) -> Float64:
     """Motion (4, 4) that maps the estimate's world into that of the truth; see the top.
 
-    `to_first` asks for the motion that fits the piece with the first frame.
+    `to_first` selects the alignment to the piece with the first frame.
     """
     metres, radians = relative_errors(estimate, truth)
-    right = (metres <= tolerance.off_m) & (radians <= tolerance.off_rad)
+    right = (metres <= tolerance.max_m) & (radians <= tolerance.max_rad)
     count = right.sum(1)
     spread = np.where(right, metres, 0).sum(1) / np.maximum(count, 1)
     tried = np.flatnonzero(right[0]) if to_first else np.arange(len(estimate))
@@ -201,7 +201,7 @@ def aligned(
     T = truth[right[best]] @ se3.inverse(estimate[right[best]])
     out = np.eye(4)
     out[:3, :3] = mean_rotation(T[:, :3, :3])
-    # The mean of where the cameras are, not of where the world's origin comes to be.
+    # Average over camera positions, not over positions of the world origin.
     centre = estimate[right[best]][:, :3, 3].mean(0)
     out[:3, 3] = truth[right[best]][:, :3, 3].mean(0) - out[:3, :3] @ centre
     return out
@@ -219,12 +219,12 @@ def too_far(error: Float64, tolerance: Tolerance) -> Bool:
     """Whether errors (..., 6) are beyond the tolerance."""
     metres = np.linalg.norm(error[..., :3], axis=-1)
     radians = np.linalg.norm(error[..., 3:], axis=-1)
-    found: Bool = (metres > tolerance.off_m) | (radians > tolerance.off_rad)
+    found: Bool = (metres > tolerance.max_m) | (radians > tolerance.max_rad)
     return found
 
 
-def admits(covariance: Float64 | None, error: Float64) -> bool:
-    """Whether a covariance (6, 6) allows an error (6,), position and rotation apart."""
+def within_covariance(covariance: Float64 | None, error: Float64) -> bool:
+    """Whether an error (6,) is within three sigma of a covariance (6, 6), by block."""
     if covariance is None or not np.isfinite(covariance).all():
         return False
     for k in (slice(0, 3), slice(3, 6)):
@@ -235,30 +235,30 @@ def admits(covariance: Float64 | None, error: Float64) -> bool:
 
 
 def seen_part(error: Float64, unobservable: Float64, tolerance: Tolerance) -> Float64:
-    """Return an error (6,) without what lies in directions (K, 6).
+    """Return an error (6,) without its components in directions (K, 6).
 
-    Metres and radians are put on the scale of the tolerance first.
+    Metres and radians are first scaled by the tolerance.
     """
     if len(unobservable) == 0:
         return error
-    scale = np.repeat([tolerance.off_m, tolerance.off_rad], 3)
+    scale = np.repeat([tolerance.max_m, tolerance.max_rad], 3)
     directions, _ = np.linalg.qr((np.asarray(unobservable, float) / scale).T)
     scaled = error / scale
     return (scaled - directions @ (directions.T @ scaled)) * scale
 
 
 def named(reasons: Iterable[Any], index: int) -> bool:
-    """Whether a reason's frames contain a frame."""
+    """Whether any reason names a frame."""
     return any(a <= index <= b for reason in reasons for a, b in ranges(reason.frames))
 
 
 def marks(part: Part, k: int, error: Float64, tolerance: Tolerance) -> set[str]:
-    """What marks the pose of the frame at position k, which has an error (6,)."""
+    """Return what marks the pose of the frame at position k with error (6,)."""
     record = part.records[k]
     found = set()
     if record.status != "tracked":
         found.add("status")
-    if admits(record.covariance, error):
+    if within_covariance(record.covariance, error):
         found.add("covariance")
     if not too_far(seen_part(error, record.unobservable, tolerance), tolerance):
         found.add("unobservable")
@@ -268,15 +268,15 @@ def marks(part: Part, k: int, error: Float64, tolerance: Tolerance) -> set[str]:
 
 
 def sides(estimate: Float64, truth: Float64, tolerance: Tolerance) -> Intp:
-    """Label (N,) of the side that each pose is of."""
+    """Label (N,) of the side of each pose."""
     metres, radians = relative_errors(estimate, truth)
-    tied = (metres <= tolerance.off_m) & (radians <= tolerance.off_rad)
+    tied = (metres <= tolerance.max_m) & (radians <= tolerance.max_rad)
     _, label = connected_components(tied | tied.T, directed=False)
     return label.astype(np.intp)
 
 
 def wrong_joins(estimate: Float64, truth: Float64, tolerance: Tolerance) -> int:
-    """How many sides are joined wrongly to the largest one, or to another."""
+    """Count the sides that are wrongly joined to the largest one, or to another."""
     label = sides(estimate, truth, tolerance)
     large = [s for s in np.unique(label) if (label == s).sum() >= SMALLEST_SIDE]
     if len(large) < 2:
@@ -296,15 +296,14 @@ def wrong_joins(estimate: Float64, truth: Float64, tolerance: Tolerance) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a result is compared with.
+    """Ground truth or reference of a recording.
 
     Attributes
     ----------
     poses
-        (N, 4, 4) true T_world_camera, NaN where not known. Places that have nothing in common lie
-        far apart.
+        (N, 4, 4) true T_world_camera, NaN if unknown. Places without a connection lie far apart.
     groups
-        (N,) number of the group of frames that can be connected; -1: nothing to connect it by.
+        (N,) index of the group of connectable frames; -1: not connectable.
     """
 
     poses: Float64
@@ -324,16 +323,16 @@ def score(parts: list[Part], truth: Truth) -> Score:
         estimate, reference = part.poses[at], truth.poses[at]
         tried = []
         for to_first in (False, True):
-            off = errors(estimate, reference, truth.tolerance, to_first=to_first)
-            far = np.flatnonzero(too_far(off, truth.tolerance))
-            found = [marks(part, int(at[k]), off[k], truth.tolerance) for k in far]
+            error = errors(estimate, reference, truth.tolerance, to_first=to_first)
+            far = np.flatnonzero(too_far(error, truth.tolerance))
+            found = [marks(part, int(at[k]), error[k], truth.tolerance) for k in far]
             bare = sum(not marked for marked in found)
-            tried.append((bare, len(far), sum(marked == {"reason"} for marked in found), off))
+            tried.append((bare, len(far), sum(marked == {"reason"} for marked in found), error))
         strict += tried[0][0]
-        bare, far_count, alone, off = min(tried, key=lambda one: one[:2])
+        bare, far_count, alone, error = min(tried, key=lambda one: one[:2])
         unmarked, wrong, by_reason = unmarked + bare, wrong + far_count, by_reason + alone
         if number == 0:
-            ate = float(np.sqrt((off[:, :3] ** 2).sum(1).mean()))
+            ate = float(np.sqrt((error[:, :3] ** 2).sum(1).mean()))
         count = wrong_joins(estimate, reference, truth.tolerance)
         joins += count
         by_motion += count if part.by_motion else 0

@@ -1,7 +1,7 @@
-"""The sequences that the benchmarks run on: recorded ones if they are there, and simulated ones.
+"""The sequences of the benchmarks: real ones, if available, and simulated ones.
 
-Recorded sequences are looked for in a folder of data that is not part of the project. Simulated
-ones are made once, with every error of the camera and its factory correction, and kept.
+Real sequences are read from a data folder that is not part of the project. Simulated ones, with all
+camera errors and factory correction, are created once and kept.
 """
 
 from __future__ import annotations
@@ -35,24 +35,23 @@ DATA = HERE.parents[1] / "shared" / "data"
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """Frames as every method gets them, and what to compare with.
+    """Input frames of all methods, and the reference.
 
     Attributes
     ----------
     title
-        What it is, with the camera.
+        Description, including the camera.
     frames
-        Decoded, corrected and filtered as the default method does for its tracker.
+        Decoded, corrected and filtered as for the tracker of the default method.
     cleaned
-        The same after the filters that the default method keeps for its model: for trackers
-        that don't know each pixel's noise.
+        The same after the filters of the default method for its model: for trackers without
+        a per-pixel noise model.
     checked
-        The recording that map consistency looks at: unfiltered, but for an object, which is
-        cut out.
+        The recording for map consistency: unfiltered, except that an object is segmented.
     reference
-        (N, 4, 4) T_world_camera, NaN where it is not known.
+        (N, 4, 4) T_world_camera, NaN where unknown.
     exact
-        Whether the reference is the truth.
+        Whether the reference is ground truth.
     """
 
     title: str
@@ -68,12 +67,12 @@ class _Kind:
     title: str
     open: Callable[[Path], Recording]
     exact: bool
-    farthest_m: float | None = None  # the object is nearer, the background is not
+    farthest_m: float | None = None  # separates the object from the background
     referenced: bool = True
 
 
 def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = False) -> Sequence:
-    """Read a sequence into memory; FileNotFoundError where its data is not there."""
+    """Read a sequence into memory; FileNotFoundError if its data is missing."""
     kind = KINDS[name]
     if fresh:
         shutil.rmtree(OUT / "recordings" / name, ignore_errors=True)
@@ -97,7 +96,7 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
 def prepared(
     recording: Recording, cut: tuple[Filter, ...] = ()
 ) -> tuple[tuple[RangeFrame, ...], tuple[RangeFrame, ...], list[Frame]]:
-    """Return frames as the default's tracker gets them, as its model does, and as they are."""
+    """Return the frames for the default method's tracker, for its model, and unfiltered."""
     config = with_recording_defaults(default("range"), recording)
     correctors = [correction.start() for correction in config.corrections]
     past: deque[Frame] = deque(maxlen=config.window - 1)
@@ -113,7 +112,7 @@ def prepared(
 
 
 def _images(frames: Iterable[Frame]) -> tuple[RangeFrame, ...]:
-    """New frames, which keep nothing that was derived from the old ones."""
+    """Copies of the frames without cached derived data."""
     return tuple(replace(frame) for frame in frames if isinstance(frame, RangeFrame))
 
 
@@ -128,7 +127,7 @@ def _recorded(*parts: str) -> Callable[[Path], Recording]:
 
 
 def kinect_loop(data: Path) -> Recording:
-    """Stop-and-go views; beside them are the poses of the robot that carried the camera."""
+    """Stop-and-go views, with the poses of the robot that carried the camera."""
     recording = _recorded("kinectv2_loop", "recording")(data)
     times, poses = read_tum(Path(recording.path) / "reference_poses.txt")
     recording.source.reference = poses_of_frames(recording.timestamps, times, poses)

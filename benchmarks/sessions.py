@@ -1,12 +1,12 @@
-"""Sessions in one map: are those joined that share a place, how exactly, and no others?
+"""Merging of sessions: are those of one place joined, how accurately, and no others?
 
 Tours of a simulated flat with four rooms, each reconstructed alone and then merged with the first
-one, which goes from room 0 into room 1. The truth is exact. `join error` is how far the second
-session is off from the first in the merged map: each session's own frames are brought onto the
-truth, and what is left between the two is measured in the middle of the room that they share.
+one, which goes from room 0 into room 1. Ground truth is exact. `join error` is the relative error
+between the two sessions in the merged map: each session is aligned to the ground truth, and the
+difference of the two alignments is measured at the cameras in the shared room.
 
-`--row N` merges sessions one after the other into a growing map, each a walk of its own through a
-part of two rooms, and prints after each merge how far the map is off, and its worst session.
+`--row N` merges sessions one by one into a growing map, each a different walk through parts of two
+rooms, and prints after each merge the ATE of the map and of its worst session.
 
     python benchmarks/sessions.py [--cases shares-a-room,...] [--threads 2]
     python benchmarks/sessions.py --row 10 [--frames 61]
@@ -40,25 +40,25 @@ from tofuse.results.types import Reconstruction
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"
 EVERY = 4
-# The second tour goes beside the first one, and looks aside.
+# The second tour follows a parallel path, and looks to the side.
 BESIDE = paths.rotation([0, 0.2, 0])
 BESIDE[:3, 3] = 0.12, 0.03, 0.0
 
 
 @dataclass(frozen=True)
 class Tour:
-    """A walk through a part of the flat.
+    """A walk through part of the flat.
 
     Attributes
     ----------
     first, frames
-        Raw frame to begin with, and how many are taken.
-    beside
-        Whether it goes beside the usual path.
+        First raw frame, and number of frames.
+    parallel
+        Whether it follows a path parallel to the usual one.
     chair
-        By how much the chair in room 1 has moved, m; None where there is none.
+        Displacement of the chair in room 1, m; None without a chair.
     refurnished
-        Whether each room has the furniture of the next one: another flat of the same plan.
+        Whether each room has the furniture of the next one: another flat with the same plan.
     """
 
     name: str
@@ -66,12 +66,12 @@ class Tour:
     frames: int
     scene: str = "flat"
     camera: str = "ifm-o3r"
-    beside: bool = True
+    parallel: bool = True
     chair: float | None = 0.0
     refurnished: bool = False
 
     def plan(self) -> Plan:
-        """What is recorded."""
+        """The plan of the simulation."""
         with ExitStack() as stack:
             if self.scene == "flat":
                 rooms = list(flat._FURNISHED)
@@ -87,7 +87,7 @@ class Tour:
                 first=self.first,
                 frames=self.frames,
             )
-        if not self.beside:
+        if not self.parallel:
             return made
         path = made.sequence.camera_path
         return replace(
@@ -95,7 +95,7 @@ class Tour:
         )
 
     def recording(self) -> tuple[Path, Float64]:
-        """Its folder, and (N, 4, 4) true T_flat_camera."""
+        """Folder of the recording, and (N, 4, 4) true T_flat_camera."""
         made, folder = self.plan(), OUT / self.name
         if not folder.is_dir():
             unfinished = folder.with_name(f"{folder.name}.part")
@@ -106,7 +106,7 @@ class Tour:
         return folder, made.sequence.T_room_camera(start) @ made.poses
 
     def result(self, threads: int) -> Path:
-        """The folder of its result."""
+        """Folder of the result."""
         folder, _ = self.recording()
         out = RUNS / self.name
         if not (out / "run.json").is_file():
@@ -118,7 +118,7 @@ Furnish = Callable[[Assembly, Float64, np.random.Generator, int], None]
 
 
 def with_chair(furnish: Furnish, moved: float) -> Furnish:
-    """A room with one more chair."""
+    """Furnish a room with one more chair."""
 
     def furnished(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
         furnish(assembly, T, rng, room)
@@ -127,14 +127,14 @@ def with_chair(furnish: Furnish, moved: float) -> Furnish:
     return furnished
 
 
-FIRST = Tour("a", 120, 81, beside=False)
+FIRST = Tour("a", 120, 81, parallel=False)
 SECOND = Tour("b", 180, 81)
-ALIKE = Tour("alike", 0, 81, scene="flat-alike", beside=False, chair=None)
+ALIKE = Tour("alike", 0, 81, scene="flat-alike", parallel=False, chair=None)
 
 
 @dataclass(frozen=True)
 class Case:
-    """Two tours, and whether they are of one place."""
+    """Two tours, and whether they share a place."""
 
     name: str
     first: Tour
@@ -163,20 +163,20 @@ CASES = (
     Case(
         "study of another flat",
         FIRST,
-        replace(ALIKE, name="alike-2", first=570, beside=True),
+        replace(ALIKE, name="alike-2", first=570, parallel=True),
         False,
     ),
     Case(
         "room that looks alike",
         ALIKE,
-        replace(ALIKE, name="alike-2", first=570, beside=True),
+        replace(ALIKE, name="alike-2", first=570, parallel=True),
         False,
     ),
 )
 
 
 def join_error(result: Reconstruction, truth: Sequence[Float64]) -> tuple[float, float]:
-    """m and rad by which the second session is off from the first; NaN where it is apart."""
+    """Relative error of the second session in m and rad; NaN if it is not joined."""
     if result.sessions[1].T_main_session is None:
         return np.nan, np.nan
     index = np.array([f.index for f in result.diagnostics.frames])
@@ -186,15 +186,15 @@ def join_error(result: Reconstruction, truth: Sequence[Float64]) -> tuple[float,
         known = true[index[mine] - session.first]
         T_flat_map.append(align(result.trajectory[mine], known))
         common = known if common is None else common
-    # Where the second tour is, as the first one's map has it and as its own has it.
+    # Alignments of both sessions to the flat, and cameras of the second one.
     _, theirs = truth
     nearest = np.linalg.norm(theirs[:, None, :3, 3] - truth[0][None, :, :3, 3], axis=2).min(1)
     here = theirs[nearest < 0.5]
-    off = se3.inverse(T_flat_map[0]) @ T_flat_map[1]
-    # Of points in the map: in the frame of the flat they lie where the shared cameras are.
+    error = se3.inverse(T_flat_map[0]) @ T_flat_map[1]
+    # Displacement of points at these cameras.
     at = se3.inverse(T_flat_map[1]) @ here
-    moved = (off @ at)[:, :3, 3] - at[:, :3, 3]
-    return float(np.sqrt((moved**2).sum(1).mean())), float(se3.angle(off))
+    moved = (error @ at)[:, :3, 3] - at[:, :3, 3]
+    return float(np.sqrt((moved**2).sum(1).mean())), float(se3.angle(error))
 
 
 def main() -> None:
@@ -202,14 +202,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", default="", help="names, separated by commas")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--row", type=int, help="so many sessions in a row, and nothing else")
-    parser.add_argument("--frames", type=int, default=61, help="of each session in a row")
+    parser.add_argument(
+        "--row", type=int, help="merge this many sessions one by one, and nothing else"
+    )
+    parser.add_argument("--frames", type=int, default=61, help="of each session, with --row")
     arguments = parser.parse_args()
     if arguments.row:
         in_a_row(arguments.row, arguments.frames, arguments.threads)
         return
     wanted = {name.strip().replace("-", " ") for name in arguments.cases.split(",") if name}
-    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure")
+    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "confidence")
     head = (*head, "changed")
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     for case in CASES:
@@ -225,13 +227,13 @@ def main() -> None:
 
 
 def in_a_row(count: int, frames: int, threads: int) -> None:
-    """Merge sessions one after the other, and print the error of the map after each."""
+    """Merge sessions one by one, and print the error of the map after each."""
     head = ("sessions", "in the map", "ATE map", "ATE worst session", "stated", "changed")
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
-    # Each begins elsewhere in the first two rooms, and every other one goes beside the path.
+    # Each starts elsewhere in the first two rooms; every other one follows the parallel path.
     starts = [120 + 25 * (k % 5) + 8 * (k // 5) for k in range(count)]
     tours = [
-        Tour(f"row-{start}-{frames}", start, frames, beside=k % 2 == 1)
+        Tour(f"row-{start}-{frames}", start, frames, parallel=k % 2 == 1)
         for k, start in enumerate(starts)
     ]
     truth = [tour.recording()[1] for tour in tours]
@@ -241,7 +243,7 @@ def in_a_row(count: int, frames: int, threads: int) -> None:
         options = MergeOptions(out, overwrite=True, threads=threads)
         result = merge_files([whole, tours[k].result(threads)], options)
         whole = out
-        true, ates = against(result, truth)
+        true, ates = compared(result, truth)
         posed = result.has_pose
         joined = sum(session.T_main_session is not None for session in result.sessions)
         cells = (
@@ -255,8 +257,8 @@ def in_a_row(count: int, frames: int, threads: int) -> None:
         print("| " + " | ".join(cells) + " |", flush=True)
 
 
-def against(result: Reconstruction, truth: Sequence[Float64]) -> tuple[Float64, list[float]]:
-    """(N, 4, 4) true poses of the frames, and the ATE of each session in m, NaN where apart."""
+def compared(result: Reconstruction, truth: Sequence[Float64]) -> tuple[Float64, list[float]]:
+    """True poses (N, 4, 4), and the ATE of each session in m, NaN if not joined."""
     index = np.array([f.index for f in result.diagnostics.frames])
     true = np.full((len(index), 4, 4), np.nan)
     ates = []
@@ -270,7 +272,7 @@ def against(result: Reconstruction, truth: Sequence[Float64]) -> tuple[Float64, 
 
 def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
     """One line of the table."""
-    true, ates = against(result, truth)
+    true, ates = compared(result, truth)
     posed = result.has_pose
     ate = displacement(result.trajectory[posed], true[posed])[0]
     metres, angle = join_error(result, truth)

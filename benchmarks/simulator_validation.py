@@ -1,10 +1,10 @@
-"""The simulated camera beside real ones: noise by confidence and amplitude, profiles of edges.
+"""Simulated cameras compared with real ones: noise by confidence and amplitude, edge profiles.
 
     python benchmarks/simulator_validation.py [folder of the real recordings]
 
-Prints the tables of docs/simulator.md and writes figures to benchmarks/out/. The real cameras
-stood still, so the simulated ones do too; the scenes are not the same, so what is compared are
-laws (noise at a given confidence or amplitude, the profile across an edge), not images.
+Prints the tables of docs/simulator.md and writes figures to benchmarks/out/. The real cameras were
+static, so the simulated ones are too. The scenes differ, so that relations are compared (noise at a
+given confidence or amplitude, the profile across an edge), not images.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Positions = Sequence[Sequence[RangeFrame]]
 def still(
     scene: str, raw: Sequence[int], frames: int, camera: str, effects: Effects | None = None
 ) -> list[list[RangeFrame]]:
-    """Frames of a camera that stands still where raw frames of a scene were taken."""
+    """Frames of a static camera at the poses of raw frames of a scene."""
     effects = effects or Effects()
     built, moving = scenes.build(scene)
     model = camera_model(camera)
@@ -77,9 +77,9 @@ def temporal(frames: Sequence[RangeFrame]) -> tuple[np.ndarray, ...]:
     z = np.stack([f.z for f in frames]).astype(float)
     r = np.stack([f.radial_range for f in frames]).astype(float)
     rays = frames[0].camera.rays().astype(float)
-    light = (1 + (rays**2).sum(-1)) ** (-SR4000.falloff / 2)
+    falloff = (1 + (rays**2).sum(-1)) ** (-SR4000.falloff / 2)
     compensated = np.stack([f.amplitude_image for f in frames]).astype(float)
-    raw = compensated / np.maximum(r, 0.05) ** 2 * light
+    raw = compensated / np.maximum(r, 0.05) ** 2 * falloff
     raw[compensated >= 65535] = np.nan
     confidence = np.stack([f.confidence_image for f in frames])
     return z.std(0, ddof=1), r.mean(0), raw.mean(0), np.median(confidence, 0)
@@ -103,7 +103,7 @@ def noise_by(
 
 
 def print_noise(real: Positions, simulated: Positions) -> dict[str, tuple]:
-    print("SR4000: temporal standard deviation of z, 4 still frames at a time, median (mm)")
+    print("SR4000: temporal standard deviation of z, 4 static frames at a time, median (mm)")
     kept = {}
     for name, pick, edges in (
         ("confidence", lambda _r, _a, c: c, [*np.arange(8) - 0.01, 7.5]),
@@ -119,16 +119,20 @@ def print_noise(real: Positions, simulated: Positions) -> dict[str, tuple]:
 
 
 def agreement_of_confidence(real: Positions) -> None:
-    """How often the simulated rule gives the confidence that the real camera gave."""
+    """Print how often the simulator's rule reproduces the confidence of the real camera."""
     same = near = total = 0
     for frames in real:
-        light = SR4000.transmission
+        transmission = SR4000.transmission
         for f in frames:
             r = np.maximum(f.radial_range.astype(float), 0.05)
-            raw = f.amplitude_image / r**2 * light
+            raw = f.amplitude_image / r**2 * transmission
             level = np.searchsorted(SR4000.confidence_thresholds, raw, side="right")
-            off = np.abs(level - f.confidence_image.astype(int))[f.valid]
-            same, near, total = same + (off == 0).sum(), near + (off <= 1).sum(), total + off.size
+            error = np.abs(level - f.confidence_image.astype(int))[f.valid]
+            same, near, total = (
+                same + (error == 0).sum(),
+                near + (error <= 1).sum(),
+                total + error.size,
+            )
     print(
         f"confidence by the simulator's rule on the real amplitudes: same {same / total:.3f}, "
         f"within one step {near / total:.3f} of {total} pixels"
@@ -138,11 +142,11 @@ def agreement_of_confidence(real: Positions) -> None:
 def edge_profiles(
     positions: Positions, *, step: float = 0.3, limit: float = 2.0
 ) -> tuple[np.ndarray, int]:
-    """Where pixels beside depth steps lie between the two sides: 0 near, 1 far.
+    """Relative positions of pixels at depth steps between the two sides: 0 near, 1 far.
 
-    A step is where three pixels left and three right of a pixel are each even (within 4 cm and
-    2 %), and differ by `step` to `limit` m; neighbouring candidates count once, at their middle.
-    Returns the places (steps, 3) of the pixel and its two neighbours, near side first.
+    At a step, the three pixels on either side of a pixel are smooth (within 4 cm and 2 %), and the
+    sides differ by `step` to `limit` m; adjacent candidates count once, at their centre. Returns
+    the positions (steps, 3) of the pixel and its two neighbours, near side first.
     """
     found = []
     for frames in positions:
@@ -152,16 +156,16 @@ def edge_profiles(
         for rows, ok in ((z, good), (z.T, good.T)):
             left = np.stack([rows[:, 0 + k : rows.shape[1] - 8 + k] for k in range(3)])
             right = np.stack([rows[:, 6 + k : rows.shape[1] - 2 + k] for k in range(3)])
-            middle = np.stack([rows[:, 3 + k : rows.shape[1] - 5 + k] for k in range(3)])
+            centre = np.stack([rows[:, 3 + k : rows.shape[1] - 5 + k] for k in range(3)])
             fine = np.stack([ok[:, k : ok.shape[1] - 8 + k] for k in range(9)]).all(0)
             a, b = np.median(left, 0), np.median(right, 0)
             even = np.minimum(a, b) * 0.02 + 0.04
             jump = np.abs(b - a)
             take = fine & (np.ptp(left, axis=0) < even) & (np.ptp(right, axis=0) < even)
             take &= (jump > step) & (jump < limit)
-            place = (middle - a) / np.where(jump > 0, b - a, 1)
+            place = (centre - a) / np.where(jump > 0, b - a, 1)
             place = np.where(b > a, place, (1 - place)[::-1])
-            # Of a run of candidates, the one whose pixel lies nearest to halfway.
+            # Of adjacent candidates, the one whose pixel lies closest to halfway.
             for row, mask in zip(np.moveaxis(place, 0, -1), take, strict=True):
                 starts = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0]) == 1)
                 ends = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0]) == -1)
@@ -177,7 +181,7 @@ def print_edges(cases: dict[str, Positions]) -> dict[str, np.ndarray]:
     print("depth steps of 0.3 to 2 m: pixels between the two sides (0.1 to 0.9 of the step)")
     print(
         f"  {'':26s} {'steps':>6s} {'per step':>9s} {'outside':>8s}"
-        "   fraction of those between, by place"
+        "   fraction of those between, by position"
     )
     print(f"  {'':52s}   0.1-0.3 0.3-0.5 0.5-0.7 0.7-0.9")
     out = {}
@@ -193,7 +197,7 @@ def print_edges(cases: dict[str, Positions]) -> dict[str, np.ndarray]:
 
 
 def print_zense(folder: Path) -> None:
-    """The real Pico Zense beside the simulated pico-flexx: noise relative to range."""
+    """Print the noise over range of the real Pico Zense and of the simulated pico-flexx."""
     depth = [read_image(p) * 1e-3 for p in sorted(folder.glob("depth_*.png"))]
     z = np.stack(depth).astype(float)
     still_frames = still("rail", [0, 150], 10, "pico-flexx")
@@ -220,7 +224,7 @@ def print_zense(folder: Path) -> None:
 
 def print_correction() -> None:
     print(
-        "residual of the factory correction on a wall, without noise, scattering and bounces (mm)"
+        "residual of the factory correction on a wall, without noise, scattering and multipath (mm)"
     )
     effects = Effects().without(
         "shot_noise",
@@ -247,7 +251,7 @@ def print_correction() -> None:
 
 
 def print_timing() -> None:
-    print("time of a frame of `room`, all effects, warm (s; this machine, all its threads)")
+    print("time per frame of `room`, all effects, warm (s; this machine, all its threads)")
     built, sequence = scenes.build("room")
     for name in CAMERAS:
         model = camera_model(name)
@@ -279,7 +283,7 @@ def draw(noise: dict[str, tuple], profiles: dict[str, np.ndarray]) -> None:
     figure, axis = plt.subplots(figsize=(7, 4))
     for name, fraction in profiles.items():
         axis.plot([0.2, 0.4, 0.6, 0.8], fraction[2:6], "o-", label=name)
-    axis.set(xlabel="place between near (0) and far (1) side", ylabel="pixels per step")
+    axis.set(xlabel="position between near (0) and far (1) side", ylabel="pixels per step")
     axis.legend()
     figure.tight_layout()
     figure.savefig(OUT / "simulator_edges.png", dpi=100)
@@ -290,7 +294,7 @@ def main(data: Path) -> int:
     print_timing()
     corridor = data / "sr4000_corridor"
     if not corridor.is_dir():
-        print(f"{data}: no real recordings here; nothing to compare with", file=sys.stderr)
+        print(f"{data}: no real recordings found", file=sys.stderr)
         return 2
     real = [list(open_recording(corridor / y)) for y in ("Y1", "Y2")]
     simulated = still("corridor", [0, 30], 4, "sr4000")

@@ -1,11 +1,11 @@
-"""Recordings that ask much: what can happen while one records, made of simulated recordings.
+"""Difficult recordings: realistic disturbances, applied to simulated recordings.
 
-The simulated recordings have exact truth. They are taken without multipath and, but for the quick
-turns, without smear (which take most of the time and nothing of the difficulty), and kept in
-`out/recordings/robustness`. Raw amplitude is freed of its falloff towards the corners, as a
-calibrated camera would give it; what comes of it if it is not is a case of its own. Which frames
-can be connected at all is found from the truth: two frames are tied where each sees at least 35 %
-of the other.
+The simulated recordings have exact ground truth. They are simulated without multipath and, except
+for the quick rotations, without motion smear (slow to simulate, and not the difficulty here), and
+kept in `out/recordings/robustness`. The falloff of raw amplitude towards the corners is
+compensated, as by a calibrated camera; uncompensated falloff is a separate case. Which frames are
+connectable is determined from the ground truth: two frames are tied if each sees at least 35 % of
+the other.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from tofuse.sensor.models import camera_model
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 
 OVERLAP, NEAR_M = 0.35, 0.10
-APART_M = 100.0  # between places that have nothing in common
+APART_M = 100.0  # between places without a connection
 DURATIONS_S = (0.3, 1.0, 3.0)
 FRACTIONS = (0.10, 0.25, 0.40)
 
@@ -62,20 +62,20 @@ class Take:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is recorded for one scene.
+    """Recordings of one scene.
 
     Attributes
     ----------
     camera
-        One of `sensor.models.CAMERAS`.
+        Name in `sensor.models.CAMERAS`.
     first, frames
-        Raw frame to begin with, and how many are taken.
+        First raw frame, and number of frames.
     elsewhere
         Another place: scene, first raw frame.
     again
-        Raw frame from which on the recording is back at its start.
+        Raw frame from which the recording is back at its start.
     bare
-        Place of a camera close to a bare wall, and what it looks at.
+        Position of a camera close to a bare wall, and its target point.
     """
 
     name: str
@@ -93,7 +93,7 @@ SCENES = {
         Scene("room", "sr4000", 0, 128, ("rail", 0), 264, ((-0.15, 1.22, 1.3), (-0.15, 1.6, 1.3))),
         Scene("rail", "sr4000", 0, 63, ("room", 0), 190, ((0.2, 2.6, 1.8), (0.2, 3.0, 1.8))),
         Scene("flat", "ifm-o3r", 0, 110, ("room", 0), 900, ((-2.6, -4.0, 1.3), (-2.6, -4.4, 1.3))),
-        # The other place is another one of the rooms.
+        # The other place is another room.
         Scene(
             "flat-alike",
             "ifm-o3r",
@@ -106,7 +106,7 @@ SCENES = {
     )
 }
 
-STRETCH_S = 1.5  # to the bare wall, before it, and back
+STRETCH_S = 1.5  # each: to the bare wall, at it, and back
 
 
 def take(
@@ -119,16 +119,16 @@ def take(
     frames: int | None = None,
     falloff: bool = False,
 ) -> Take:
-    """Simulate a recording, or read it if it was made before.
+    """Simulate a recording, or read it if it exists.
 
     Parameters
     ----------
     passing
-        What passes through the view.
+        Object that passes through the view.
     motion
-        "quick turns", "close-up", or nothing: as the scene has it.
+        "quick turns", "close-up", or empty for the motion of the scene.
     other
-        Another scene and first raw frame, with the same camera.
+        Another scene and its first raw frame, with the same camera.
     falloff
         Whether raw amplitude falls off towards the corners.
     """
@@ -170,17 +170,19 @@ def take(
 
 
 def evenly_lit(frame: RangeFrame, transmission: Float64) -> RangeFrame:
-    """Divide raw amplitude by what lens and lamp leave of it in each pixel (H, W)."""
-    light = frame.amplitude_image
-    if light is None or frame.amplitude_kind != "raw":
+    """Compensate raw amplitude for the transmission (H, W) of lens and illumination."""
+    amplitude = frame.amplitude_image
+    if amplitude is None or frame.amplitude_kind != "raw":
         return frame
-    even = light / np.where(transmission > 0, transmission, 1.0)
-    even = np.where(light >= SATURATED_AMPLITUDE, light, np.minimum(even, SATURATED_AMPLITUDE - 1))
+    even = amplitude / np.where(transmission > 0, transmission, 1.0)
+    even = np.where(
+        amplitude >= SATURATED_AMPLITUDE, amplitude, np.minimum(even, SATURATED_AMPLITUDE - 1)
+    )
     return replace(frame, amplitude_image=even.astype(np.float32))
 
 
 def quick_turns(path: paths.Path, start: float) -> paths.Path:
-    """Turn by 60 degrees to a side within 0.4 s and back, every 3 s."""
+    """Rotate by 60 degrees to a side within 0.4 s and back, every 3 s."""
 
     def turned(t: float) -> Float64:
         u = (t - start) % 3.0
@@ -192,7 +194,7 @@ def quick_turns(path: paths.Path, start: float) -> paths.Path:
 
 
 def close_up(path: paths.Path, leave: float, T_room_wall: Float64) -> paths.Path:
-    """Leave the path at a time, go to a place close to a wall, slide there, come back, go on."""
+    """Leave the path at a time, approach a wall, slide along it, return and continue."""
     T = path(leave)
     way = se3.log(se3.inverse(T) @ T_room_wall)
 
@@ -211,7 +213,7 @@ def close_up(path: paths.Path, leave: float, T_room_wall: Float64) -> paths.Path
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One recording to reconstruct, and what is true of it."""
+    """One recording to reconstruct, with its ground truth."""
 
     scene: str
     name: str
@@ -220,16 +222,16 @@ class Case:
 
 
 def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = ()) -> Intp:
-    """(N,) number of the group of frames that overlap; -1 for those that are blind or alone.
+    """Index (N,) of the group of overlapping frames; -1 if blind or isolated.
 
     Parameters
     ----------
     frames
-        As the camera saw them; pixels are thinned to about 40 x 30.
+        Frames of the camera; they are subsampled to about 40 x 30 pixels.
     poses
         (N, 4, 4) true poses.
     blind
-        Positions of frames that show nothing of the scene.
+        Positions of frames in which the scene is not visible.
     """
     n = len(frames)
     step = max(1, frames[0].depth.shape[1] // 40)
@@ -248,7 +250,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
         T = se3.inverse(poses[i]) @ poses
         centre = T[:, :3, 3]
         for j in seeing:
-            # Another place needs no look.
+            # Frames of different places never overlap.
             if i == j or np.linalg.norm(centre[j]) > APART_M / 2:
                 continue
             points = se3.transform(T[j], clouds[j])
@@ -279,9 +281,9 @@ def as_case(
     Parameters
     ----------
     blind
-        Positions of frames that show nothing of the scene, or nothing to place them by.
+        Positions of frames in which the scene is not visible, or gives no constraints.
     seen
-        The same frames as they would be without the trouble, where that hides what overlaps.
+        The undisturbed frames, if the disturbance hides the overlap.
     """
     frames = [replace(frame, index=k) for k, frame in enumerate(took.frames)]
     clear = took if seen is None else seen
@@ -291,36 +293,36 @@ def as_case(
     return Case(scene, name, recording, Truth(took.poses, label))
 
 
-# ---- What happens to frames ----------------------------------------------------------------------
+# ---- Disturbances of frames ----------------------------------------------------------------------
 
 
 def covered(frame: RangeFrame) -> RangeFrame:
-    """Put the lid on: no valid pixel."""
-    light = frame.amplitude_image
+    """Cover the lens by a lid: no valid pixels."""
+    amplitude = frame.amplitude_image
     return replace(
         frame,
         depth=np.zeros_like(frame.depth),
-        amplitude_image=None if light is None else np.zeros_like(light),
+        amplitude_image=None if amplitude is None else np.zeros_like(amplitude),
     )
 
 
 def hand(frame: RangeFrame, rng: np.random.Generator) -> RangeFrame:
-    """Hold a hand right before the lens: 6 to 14 cm away, bright, its border blurred."""
+    """Cover the lens by a hand: 6 to 14 cm away, bright, with a blurred border."""
     height, width = frame.depth.shape
     v, u = np.mgrid[:height, :width] / width
     tilt = rng.uniform(-0.04, 0.04, 2)
     depth = 0.10 + tilt[0] * u + tilt[1] * v + 0.012 * np.sin(23 * u + rng.uniform(0, 6))
     depth += rng.normal(0, 0.003, depth.shape)
-    # A gap at one side, through which the scene shows.
+    # A gap at one side, through which the scene is visible.
     gap = u > rng.uniform(0.90, 1.0)
-    light = frame.amplitude_image
-    if light is not None:
-        bright = np.percentile(light[light > 0], 99) if (light > 0).any() else 1000.0
-        light = np.where(gap, light, 1.5 * bright + 0 * depth).astype(np.float32)
+    amplitude = frame.amplitude_image
+    if amplitude is not None:
+        bright = np.percentile(amplitude[amplitude > 0], 99) if (amplitude > 0).any() else 1000.0
+        amplitude = np.where(gap, amplitude, 1.5 * bright + 0 * depth).astype(np.float32)
     return replace(
         frame,
         depth=np.where(gap, frame.depth, depth).astype(np.float32),
-        amplitude_image=light,
+        amplitude_image=amplitude,
         sigma_image=None
         if frame.sigma_image is None
         else np.where(gap, frame.sigma_image, 0.003).astype(np.float32),
@@ -328,17 +330,17 @@ def hand(frame: RangeFrame, rng: np.random.Generator) -> RangeFrame:
 
 
 def brighter(frame: RangeFrame, factor: float) -> RangeFrame:
-    """Let the amplitude jump, as with another integration time; depth stays as it was."""
-    light = frame.amplitude_image
-    if light is None:
+    """Scale the amplitude, as with another integration time; depth is unchanged."""
+    amplitude = frame.amplitude_image
+    if amplitude is None:
         return frame
-    scaled = np.minimum(factor * light, SATURATED_AMPLITUDE - 1)
-    scaled = np.where(light >= SATURATED_AMPLITUDE, light, scaled)
+    scaled = np.minimum(factor * amplitude, SATURATED_AMPLITUDE - 1)
+    scaled = np.where(amplitude >= SATURATED_AMPLITUDE, amplitude, scaled)
     return replace(frame, amplitude_image=scaled.astype(np.float32))
 
 
 def farther(frame: RangeFrame, metres: float) -> RangeFrame:
-    """Add to the range of every valid pixel."""
+    """Add an offset to the range of every valid pixel."""
     depth = frame.depth.astype(float)
     length = 1.0
     if frame.depth_kind == "z":
@@ -359,7 +361,7 @@ def timed(frames: Sequence[RangeFrame], times: Sequence[float] | Float64) -> tup
 def hidden(
     base: Take, seconds: float, how: str, rng: np.random.Generator
 ) -> tuple[Take, list[int]]:
-    """Cover the lens for a time, somewhere in the middle, while the camera moves on."""
+    """Cover the lens for a time in the middle of the recording, while the camera moves."""
     count = max(1, round(seconds / base.step_s))
     first = int(rng.integers(len(base) // 4, max(len(base) // 4 + 1, 3 * len(base) // 4 - count)))
     bad = list(range(first, min(first + count, len(base) - 1)))
@@ -371,7 +373,7 @@ def hidden(
 
 
 def two_places(base: Take, other: Take) -> Take:
-    """Go on in another place, without a break in time."""
+    """Continue in another place, without a gap in time."""
     half = base.at(range(len(base) // 2))
     step = base.step_s
     frames = (*half.frames, *other.frames[: len(half)])
@@ -384,7 +386,7 @@ def two_places(base: Take, other: Take) -> Take:
 
 
 def twice(base: Take, again: Take, gap_s: float = 60.0) -> Take:
-    """Stop, and begin again later: the end is where the begin was."""
+    """Stop, and start again later at the initial place."""
     half = base.at(range(len(base) // 2))
     end = half.frames[-1].timestamp + gap_s
     later = end + again.step_s * np.arange(len(again))
@@ -396,7 +398,7 @@ def twice(base: Take, again: Take, gap_s: float = 60.0) -> Take:
 
 
 def shuffled(base: Take, rng: np.random.Generator) -> Take:
-    """Put the frames into a random order, the times staying in order."""
+    """Shuffle the frames, with ascending timestamps."""
     order = rng.permutation(len(base))
     times = [frame.timestamp for frame in base.frames]
     took = base.at(order)
@@ -404,16 +406,16 @@ def shuffled(base: Take, rng: np.random.Generator) -> Take:
 
 
 def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "") -> Iterator[Case]:
-    """Make the cases of a scene, one after the other.
+    """Yield the cases of a scene.
 
     Parameters
     ----------
     seed
-        Of the scene, the camera's noise, and what happens when.
+        Random seed of the scene, the camera's noise, and the disturbances.
     quick
-        Leave out what differs by degree only.
+        Skip cases that differ only in degree.
     containing
-        Make only those whose name contains this.
+        Yield only cases whose name contains this.
     """
     durations = DURATIONS_S[1:2] if quick else DURATIONS_S
     fractions = FRACTIONS[1:2] if quick else FRACTIONS
@@ -489,7 +491,7 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
         return as_case(scene.name, name, took, blind=np.flatnonzero(near).tolist())
 
     def places(rng: np.random.Generator, name: str) -> Case:
-        # Another room of the same flat has its place in it; other scenes have none.
+        # Another room of the same flat has known poses; other scenes have not.
         other = take(scene, seed, other=scene.elsewhere, frames=scene.frames // 2)
         if scene.elsewhere[0] != scene.name:
             away = other.poses.copy()

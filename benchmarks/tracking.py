@@ -1,13 +1,12 @@
-"""tofuse's tracker beside its peers on the same frames: speed, accuracy, map consistency.
+"""tofuse's tracker compared with its peers on the same frames: speed, accuracy, map consistency.
 
-Every method gets the same frames, decoded, corrected and filtered beforehand. What a method does
-from there to a pose is timed, and only that: bringing the frame into the type that the method takes
-is not. Each row is warm: a pass over the first frames went before, and the first frame is not
-counted. Peers run the first frames with each of their tunings, and with and without the filters
-that tofuse keeps for its model, and go on with what had the least ATE; tofuse has one tuning for
-all sequences. Rows of one run can be compared with each other, not
-with those of another machine. A peer that is not installed is named as such: `pip install
-tofuse[bench]`.
+Every method gets the same frames, decoded, corrected and filtered beforehand. Only the tracking of
+a frame is timed, not its conversion to the method's data type. Each row is measured after a warm-up
+pass over the first frames, and without the first frame. Peers run the first frames with each of
+their tunings, with and without the filters that tofuse uses for its model, and continue with the
+combination that has the lowest ATE; tofuse has one tuning for all sequences. Rows of one run are
+comparable with each other, not with those of another machine. Peers come with `pip install
+tofuse[bench]`; missing ones are reported.
 
     python benchmarks/tracking.py [--sequences kitchen room] [--methods tofuse KISS] [--frames 50]
 """
@@ -84,12 +83,12 @@ class TofuseSession:
         self.statuses: list[str] = []
         self.unconstrained: list[int] = []
         self.reasons: list[str] = []
-        # Of components that are connected with the first one; and of frames, where they are.
+        # Components connected with the first one, and positions of the frames.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_world_camera: dict[int, Float64] = {}
 
     def prepare(self, frame: RangeFrame) -> RangeFrame:
-        # A new frame: nothing that another method derived from it is kept.
+        # A copy, without derived data cached by another method.
         return replace(frame)
 
     def push(self, prepared: RangeFrame) -> Float64 | None:
@@ -111,9 +110,9 @@ class TofuseSession:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a method made of a sequence: poses (N, 4, 4), NaN where lost, and seconds (N,).
+    """Result of a method on a sequence: poses (N, 4, 4), NaN where lost, and seconds (N,).
 
-    `cpu` are seconds of all threads together, which other programs at work hardly change.
+    `cpu` is the CPU time of all threads, which hardly depends on other load.
     """
 
     poses: Float64
@@ -148,10 +147,10 @@ def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
 def best(
     candidates: Items[peers.Method], sequence: sequences.Sequence, threads: int, frames: int
 ) -> tuple[peers.Method, bool, str]:
-    """Choose a peer's tuning, and its frames, by the least ATE over the first frames.
+    """Choose a peer's tuning and filtering by the lowest ATE on the first frames.
 
-    Returns the method, whether it gets the cleaned frames, and how it was chosen. The tunings run
-    on the cleaned frames; the best of them then on the others.
+    Returns the method, whether it gets the cleaned frames, and how it was chosen. All tunings run
+    on the cleaned frames, then the best of them on the others.
     """
     first = sequence.cleaned[:frames]
     reference = sequence.reference[: len(first)]
@@ -160,7 +159,7 @@ def best(
     bare = ate(run(chosen, sequence.frames[:frames], threads).poses, reference)
     cleaned = not bare < min(errors)
     how = f"best of {len(candidates)} on {len(first)} frames, " if len(candidates) > 1 else ""
-    return chosen, cleaned, f"{how}{'cleaned' if cleaned else 'as tofuse has them'}"
+    return chosen, cleaned, f"{how}{'cleaned' if cleaned else 'filtered as for tofuse'}"
 
 
 def ate(poses: Float64, reference: Float64) -> float:
@@ -173,7 +172,7 @@ def ate(poses: Float64, reference: Float64) -> float:
 def row(
     method: peers.Method, chosen_how: str, sequence: sequences.Sequence, result: Run, threads: int
 ) -> dict[str, Any]:
-    """Return every figure of one method on one sequence: m, degrees, ms."""
+    """Return all metrics of one method on one sequence: m, degrees, ms."""
     ms = 1e3 * result.seconds[1:]
     return {
         "method": method.label,
@@ -189,15 +188,15 @@ def row(
 
 
 def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
-    """Return how far poses are from the reference, and how well the images agree under them."""
+    """Return errors of the poses against the reference, and map consistency."""
     times = np.arange(len(poses), dtype=float)
     error = evaluate_trajectory(times, poses, times, sequence.reference, times)
     agreement = map_consistency(sequence.checked, poses, CONSISTENCY_FRAMES)
-    # From the first frame on, with no alignment: where one comes out after a turn.
+    # Error at the end, aligned at the first frame only: drift over the sequence.
     true = se3.inverse(sequence.reference[0]) @ sequence.reference
     has = np.flatnonzero(np.isfinite(poses).all((1, 2)))
-    off = se3.inverse(true[has]) @ se3.inverse(poses[has[0]]) @ poses[has]
-    metres, degrees = np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle(off))
+    error = se3.inverse(true[has]) @ se3.inverse(poses[has[0]]) @ poses[has]
+    metres, degrees = np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(se3.angle(error))
     per_frame = np.full((len(poses), 2), np.nan)
     per_frame[has] = np.stack([metres, degrees], 1)
     short, long = error.relative
@@ -222,7 +221,7 @@ def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
 def compare(
     sequence: sequences.Sequence, wanted: Items[str], threads: int, tuning_frames: int
 ) -> Iterator[dict[str, Any]]:
-    """Run the methods on a sequence, one after the other, and give their rows."""
+    """Run the methods on a sequence, one after the other, and yield their rows."""
     frames = sequence.frames
     ours: list[list[peers.Method]] = [[Tofuse()]]
     if frames[0].amplitude_image is not None:
@@ -250,7 +249,7 @@ def compare(
 _COLUMNS = {
     "method": "method",
     "resolution": "resolution",
-    "ms": "ms a frame: median (95 %)",
+    "ms": "ms/frame: median (95 %)",
     "ratio": "of tofuse",
     "cpu": "CPU ms",
     "ate": "ATE m",
@@ -294,7 +293,7 @@ def table(rows: Items[dict[str, Any]]) -> str:
     """Return rows as a Markdown table with aligned columns."""
     ours = next((r.get("ms_median") for r in rows if r["method"] == "tofuse"), None)
     lines = [list(_COLUMNS.values()), *[cells(r, ours) for r in rows]]
-    # A long last column need not be padded.
+    # The last column is not padded.
     widths = [*[max(len(line[k]) for line in lines) for k in range(len(_COLUMNS) - 1)], 6]
     text = [
         "| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |"
@@ -305,7 +304,7 @@ def table(rows: Items[dict[str, Any]]) -> str:
 
 
 def figure(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    """Draw the time a frame against the ATE, a panel for each sequence."""
+    """Plot the time per frame against the ATE, a panel for each sequence."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -326,7 +325,7 @@ def figure(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
             axis.plot(
                 r["ms_median"], r["ate_m"], marker, color=f"C{k % 10}", label=r["method"], ms=9
             )
-        axis.set(xscale="log", yscale="log", title=title, xlabel="ms a frame", ylabel="ATE, m")
+        axis.set(xscale="log", yscale="log", title=title, xlabel="ms/frame", ylabel="ATE, m")
         axis.title.set_fontsize(8)
         axis.grid(which="both", alpha=0.3)
         axis.legend(fontsize=6)
@@ -336,7 +335,7 @@ def figure(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
 
 
 def machine(threads: int) -> str:
-    """Say what it ran on."""
+    """Describe the machine."""
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
@@ -345,7 +344,7 @@ def machine(threads: int) -> str:
 
 
 def limit_threads(count: int) -> None:
-    """Hold every method to so many threads, and to so many cores where that can be asked for."""
+    """Limit every method to a number of threads and, where possible, of cores."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(count)
     if hasattr(os, "sched_setaffinity"):
@@ -355,10 +354,10 @@ def limit_threads(count: int) -> None:
 def main(arguments: Items[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sequences", nargs="+", default=sequences.names(), metavar="NAME")
-    parser.add_argument("--methods", nargs="+", default=[], help="beginnings of their names")
-    parser.add_argument("--frames", type=int, help="use only the first so many")
+    parser.add_argument("--methods", nargs="+", default=[], help="prefixes of their names")
+    parser.add_argument("--frames", type=int, help="use only the first N")
     parser.add_argument(
-        "--tuning-frames", type=int, default=100, help="peers are tuned on the first so many"
+        "--tuning-frames", type=int, default=100, help="peers are tuned on the first N"
     )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA, help="recorded sequences")
@@ -379,7 +378,7 @@ def main(arguments: Items[str] | None = None) -> None:
         try:
             sequence = sequences.load(name, options.data, options.frames, fresh=options.fresh)
         except FileNotFoundError as error:
-            print(f"\n{name}: left out, there is no {error}", flush=True)
+            print(f"\n{name}: skipped, no {error}", flush=True)
             continue
         print(f"\n{sequence.title}", flush=True)
         rows = []
@@ -387,7 +386,7 @@ def main(arguments: Items[str] | None = None) -> None:
             rows.append(r)
             print(f"  {brief(r)}", flush=True)
         found[sequence.title] = rows
-        against = "the truth" if sequence.exact else "reference poses that are not exact"
+        against = "ground truth" if sequence.exact else "inexact reference poses"
         text.append(f"### {sequence.title}\n\nAgainst {against}.\n\n{table(rows)}")
         print(f"\n{text[-1]}", flush=True)
         keep(options.out, about, text, found)
@@ -397,15 +396,15 @@ def main(arguments: Items[str] | None = None) -> None:
 
 
 def brief(r: dict[str, Any]) -> str:
-    """Return a row in a few words, for those who wait."""
+    """Return a short form of a row, to show progress."""
     if "problem" in r:
         return f"{r['method']}: {r['problem']}"
-    speed = f"{r['ms_median']:.1f} ms a frame, " if "ms_median" in r else ""
+    speed = f"{r['ms_median']:.1f} ms/frame, " if "ms_median" in r else ""
     return f"{r['method']}: {speed}ATE {r['ate_m']:.4f} m"
 
 
 def keep(out: Path, about: str, text: Items[str], found: dict[str, Any]) -> None:
-    """Write what there is so far: a long run that is stopped leaves the sequences before."""
+    """Write the results so far, so that an interrupted run keeps them."""
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "tracking.md", "\n\n".join(text) + "\n")
     write_text(out / "tracking.json", json.dumps({"machine": about, "sequences": found}))

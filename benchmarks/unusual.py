@@ -1,7 +1,7 @@
 """Simulated recordings with cameras, scenes and motions that no other benchmark has; part of
 `variants.py`.
 
-Taken without multipath and smear, with all other errors of the camera. Poses are exact.
+Simulated without multipath and smear, with all other errors of the camera. Poses are exact.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ THINGS = tuple(Material(f"thing {k}", 0.25 + 0.1 * k, 0.1, "print", (0.1,) * 3) 
 
 @dataclass(frozen=True)
 class Unusual:
-    """One recording: what is seen, how the camera moves, which camera, how often.
+    """One recording: scene, camera motion, camera, and frame rate.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Unusual:
 
 
 def pinhole(model: str, width: int, height: int, degrees: float) -> CameraModel:
-    """Return a camera with another size and horizontal field of view."""
+    """Return a camera with another image size and horizontal field of view."""
     base = camera_model(model)
     f = width / 2 / np.tan(np.radians(degrees) / 2)
     camera = Pinhole(width, height, f, f, (width - 1) / 2, (height - 1) / 2)
@@ -79,7 +79,7 @@ def handheld(
 
 
 def jerks(rng: np.random.Generator, degrees: float, seconds: float = 0.15) -> Path:
-    """Turn by an angle about a random axis within a moment, about once a second, and back."""
+    """Rotate abruptly about random axes and back, about once a second."""
     axes = rng.standard_normal((100, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
 
@@ -92,7 +92,7 @@ def jerks(rng: np.random.Generator, degrees: float, seconds: float = 0.15) -> Pa
 
 
 def together(*parts: Path) -> Path:
-    """Compose paths: the later ones in the frame of the earlier ones."""
+    """Compose paths: later ones in the frame of earlier ones."""
 
     def path(t: float) -> Float64:
         T = np.eye(4)
@@ -104,7 +104,7 @@ def together(*parts: Path) -> Path:
 
 
 def straight(start: Float64, velocity: tuple[float, float, float]) -> Path:
-    """Move steadily in the room (m/s), without turning."""
+    """Move at constant velocity in the room (m/s), without rotation."""
 
     def path(t: float) -> Float64:
         T = start.copy()
@@ -139,7 +139,7 @@ Fill = Callable[[Assembly, np.random.Generator], None]
 
 
 def built(name: str, fill: Fill) -> Callable[[int], scenes.Scene]:
-    """Return a scene of its own."""
+    """Return a scene built by a function."""
 
     def make(seed: int) -> scenes.Scene:
         assembly = Assembly([])
@@ -199,7 +199,7 @@ EYE = paths.look_at((0, 0, 1.1), (1, 0.2, 0.9))
 
 
 def _in_room(*more: Callable[[np.random.Generator], Path]) -> Callable[[int], Path]:
-    """Stand in the room, turn slowly, and move as told."""
+    """Stand in the room, rotate slowly, and add motions."""
 
     def made(seed: int) -> Path:
         rng = np.random.default_rng([seed, 12])
@@ -257,7 +257,7 @@ def record(one: Unusual, seed: int, *without: str) -> Recording:
     Parameters
     ----------
     without
-        Effects that are switched off; multipath and smear unless given.
+        Effects to switch off; by default multipath and smear.
     """
     sequence = scenes.Sequence(one.frames, 1, one.rate_hz, one.path(seed))
     model = replace(one.camera, frame_rate_hz=one.rate_hz)

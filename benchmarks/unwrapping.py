@@ -1,15 +1,14 @@
-"""Phase unwrapping: pixels restored and harmed in a room larger than the camera's period.
+"""Phase unwrapping: pixels restored and harmed in a room beyond the ambiguity range.
 
     python benchmarks/unwrapping.py [--seeds 5] [--every 15]
 
-A simulated SR4000 (period 5 m) turns around in the scene `hall`, 8 x 8 m, with all its errors, and
-in the scene `room`, most of which lies within the period; both also without indirect light. Then
-the room again, as if the period were shorter, so that up to a third of it is beyond. The correction
-`unwrap` learns the camera's light from the frames and moves pixels by whole periods.
-Printed for each seed: which fraction of the wrapped pixels is moved back to where it belongs
-(target 99 %), and which fraction of the others is moved by mistake (at most 0.1 %). Pixels count
-whose measurement is that of one surface: within half a metre of the truth but for whole periods,
-and with a confidence of 1 or more.
+A simulated SR4000 (ambiguity range 5 m) rotates in the scene `hall`, 8 x 8 m, with all camera
+errors, and in the scene `room`, most of which lies within the ambiguity range; both also without
+multipath. Then the room again with a shorter ambiguity range that up to a third of it exceeds. The
+correction `unwrap` estimates the amplitude model from the frames and shifts pixels by whole
+periods. Printed for each seed: the percentage of wrapped pixels that are restored (target 99 %),
+and of the others that are shifted by mistake (at most 0.1 %). Only pixels that see a single surface
+count: within half a metre of the truth up to whole periods, and with a confidence of at least 1.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from tofuse.recordings.frames import RangeFrame
 
 PERIOD_M = 5.0
 SHORTER_M = (2.8, 3.2, 3.6, 4.0)
-OFF_M = 0.5
+MAX_ERROR_M = 0.5
 
 
 @dataclass
@@ -45,13 +44,13 @@ class Counts:
 
 
 def as_if(frame: RangeFrame, period: float) -> RangeFrame:
-    """What a camera of a shorter period would measure, which compensates its light by range."""
+    """Frame of a camera with a shorter period and range-compensated amplitude."""
     radial = np.maximum(frame.radial_range, np.float32(1e-6))
     near = np.mod(radial, period) / radial
-    light = frame.amplitude_image
-    if light is not None and frame.amplitude_kind == "range_compensated":
-        light = light * near**2
-    return replace(frame, depth=frame.depth * near, amplitude_image=light, ambiguity_m=period)
+    amplitude = frame.amplitude_image
+    if amplitude is not None and frame.amplitude_kind == "range_compensated":
+        amplitude = amplitude * near**2
+    return replace(frame, depth=frame.depth * near, amplitude_image=amplitude, ambiguity_m=period)
 
 
 def count(scene: str, effects: Effects, seed: int, every: int, period: float = PERIOD_M) -> Counts:
@@ -67,8 +66,8 @@ def count(scene: str, effects: Effects, seed: int, every: int, period: float = P
     out = Counts()
     for frame, radial in zip(frames, truth, strict=True):
         lacks = np.rint((radial - frame.radial_range) / period)
-        off = np.abs(radial - frame.radial_range - lacks * period)
-        sure = frame.valid & (radial > 0) & (off < OFF_M)
+        error = np.abs(radial - frame.radial_range - lacks * period)
+        sure = frame.valid & (radial > 0) & (error < MAX_ERROR_M)
         if frame.confidence_image is not None:
             sure &= frame.confidence_image >= 1
         found = corrector.apply(frame)

@@ -1,18 +1,18 @@
-"""Variants of recordings whose trajectory is known from that of the original.
+"""Variants of recordings whose trajectories follow from that of the original.
 
-`real`: a recording is reconstructed as it is and then changed in a way of which the effect on the
-trajectory is known: reversed, thinned, rotated about the optical axis, cropped, with less
-resolution, noisier... The trajectory of each variant is compared with that of the original, which
-is not the truth: it has errors of its own, as it states. `simulated`: cameras, scenes and motions
-that no other benchmark has (`unusual.py`), compared with the truth.
+`real`: a recording is reconstructed unchanged and then with changes of known effect on the
+trajectory: reversed, subsampled, rotated about the optical axis, cropped, at lower resolution,
+noisier... The trajectory of each variant is compared with that of the original, which is not exact
+but states its own error. `simulated`: cameras, scenes and motions that no other benchmark has
+(`unusual.py`), compared with ground truth.
 
-A row has the frames with a pose, ATE and largest error (aligned as in `scoring.py`), wrong poses
-and those that nothing marks (as there), the stated 95 % bound, the verdict with its reasons, and
-one of these marks:
+A row has the frames with a pose, ATE and largest error (aligned as in `scoring.py`), wrong and
+unmarked poses (as defined there), the stated 95 % bound, the verdict with its reasons, and one of
+these marks:
 
-- `LOST`: less than 90 % of the frames that the original places have a pose;
-- `WRONG`: the ATE exceeds what both runs state together, and the verdict is "good";
-- `off`: it exceeds that, but the verdict is not "good".
+- `LOST`: fewer than 90 % of the frames posed in the original have a pose;
+- `WRONG`: the ATE exceeds the combined stated bounds of both runs, and the verdict is "good";
+- `off`: it exceeds them, but the verdict is not "good".
 
     python benchmarks/variants.py [real] [--names tags] [--variants "every 3rd"] [--frames 60]
     python benchmarks/variants.py simulated [--names stairs] [--seeds 1 2]
@@ -44,19 +44,19 @@ from tofuse.recordings.frames import IMAGES, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
 SEED = 7
-MOST_FRAMES = 100
+MAX_FRAMES = 100
 PLACED_FRACTION = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Take(stress.Take):
-    """Frames of a recording in memory, with poses NaN where unknown; its path and format."""
+    """Frames of a recording in memory, with poses (NaN where unknown), path and format."""
 
     path: str
     format: str
 
     def at(self, order: Sequence[int] | Intp) -> Take:
-        """Return frames in another order, with their times where these ascend."""
+        """Return frames in another order, keeping their times if these ascend."""
         taken = super().at(np.asarray(order, int))
         times = np.array([frame.timestamp for frame in taken.frames])
         if (np.diff(times) <= 0).any():
@@ -69,11 +69,11 @@ class Take(stress.Take):
         )
 
     def each(self, change: Callable[[RangeFrame], RangeFrame]) -> Take:
-        """Return the take with changed frames."""
+        """Return the take with each frame changed."""
         return replace(self, frames=tuple(change(frame) for frame in self.frames))
 
     def as_recording(self) -> Recording:
-        """Return the take as a recording of the original's camera."""
+        """Return the take as a recording with the original's metadata."""
         frames = [replace(frame, index=k) for k, frame in enumerate(self.frames)]
         return Recording.of(ArraySource(frames, metadata=self.metadata), self.path, self.format)
 
@@ -94,7 +94,7 @@ def take_of(recording: Recording, poses: Float64 | None = None) -> Take:
 def arranged(
     frame: RangeFrame, camera: Camera, pick: Callable[[np.ndarray], np.ndarray]
 ) -> RangeFrame:
-    """Return the frame with pixels picked from all its images, and the camera that fits them."""
+    """Return the frame with resampled images and the matching camera."""
     images = {name: getattr(frame, name) for name in IMAGES}
     picked = {
         name: None if image is None else np.ascontiguousarray(pick(image))
@@ -106,7 +106,7 @@ def arranged(
 def picked_camera(
     camera: Camera, pick: Callable[[np.ndarray], np.ndarray], R: Float64 | None = None
 ) -> Camera:
-    """Return the camera of picked pixels; rays (2,) are rotated by R (2, 2)."""
+    """Return the camera of resampled pixels; rays (2,) are rotated by R (2, 2)."""
     rays = pick(camera.rays())
     if R is not None:
         rays = rays @ R.T.astype(np.float32)
@@ -122,7 +122,7 @@ def picked_camera(
 
 
 def picked(take: Take, pick: Callable[[np.ndarray], np.ndarray], degrees: float = 0.0) -> Take:
-    """Pick pixels of all images; the camera is turned about its axis by an angle."""
+    """Resample all images; the camera is rotated about its optical axis by an angle."""
     T = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(degrees)]))
     cameras: dict[int, Camera] = {}
 
@@ -148,7 +148,7 @@ def cropped(take: Take) -> Take:
 
 
 def thinned(take: Take, step: int) -> Take:
-    """Keep every so many pixels."""
+    """Keep every `step`-th pixel."""
     return picked(take, lambda image: image[::step, ::step])
 
 
@@ -181,13 +181,13 @@ def scaled(take: Take, factor: float) -> Take:
 
 
 def untimed(take: Take) -> Take:
-    """Number the frames at 30 Hz instead of their times."""
+    """Replace the timestamps by 30 Hz."""
     frames = [replace(f, timestamp=k / 30) for k, f in enumerate(take.frames)]
     return replace(take, frames=tuple(frames))
 
 
 def depth_only(frame: RangeFrame) -> RangeFrame:
-    """Leave depth alone."""
+    """Keep depth only."""
     return replace(frame, **{name: None for name in IMAGES if name != "depth"})
 
 
@@ -201,7 +201,7 @@ def dropped(take: Take, fraction: float) -> Take:
 
 
 def paused(take: Take, count: int = 60) -> Take:
-    """Stop in the middle: one image many times, each with the noise of its own (1 mm)."""
+    """Pause in the middle: one image repeated, each time with independent noise (1 mm)."""
     half = len(take.frames) // 2
     longer = take.at([*range(half), *[half] * count, *range(half, len(take.frames))])
 
@@ -215,7 +215,7 @@ def paused(take: Take, count: int = 60) -> Take:
 
 
 def every(step: int, first: int = 0) -> Callable[[Take], Take]:
-    """Take every so many frames."""
+    """Take every `step`-th frame."""
     return lambda take: take.at(range(first, len(take.frames), step))
 
 
@@ -267,7 +267,7 @@ VARIANTS: dict[str, Callable[[Take], Take]] = {
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a run states, and its poses."""
+    """Poses of a run, and what it states about them."""
 
     parts: tuple[scoring.Part, ...]
     bound_m: float
@@ -287,9 +287,9 @@ def run(recording: Recording, threads: int) -> Outcome:
     except InputError as error:
         return Outcome((), np.nan, "refused", (str(error),), 0, time.perf_counter() - began)
     except Exception as error:
-        # A benchmark of robustness counts what breaks instead of breaking itself.
-        said = f"{type(error).__name__}: {error}"
-        return Outcome((), np.nan, "CRASHED", (said,), 0, time.perf_counter() - began)
+        # Crashes are counted as outcomes.
+        message = f"{type(error).__name__}: {error}"
+        return Outcome((), np.nan, "CRASHED", (message,), 0, time.perf_counter() - began)
     found = result.diagnostics
     return Outcome(
         tuple(scoring.parts_of(result, recording.indices)),
@@ -301,10 +301,10 @@ def run(recording: Recording, threads: int) -> Outcome:
     )
 
 
-def load(name: str, data: Path, most: int) -> Take:
-    """Read up to so many frames of a recording into memory."""
+def load(name: str, data: Path, max_frames: int) -> Take:
+    """Read up to `max_frames` frames of a recording into memory."""
     recording = RECORDED[name].open(data)
-    recording = replace(recording, indices=recording.indices[:most])
+    recording = replace(recording, indices=recording.indices[:max_frames])
     return take_of(recording)
 
 
@@ -316,10 +316,10 @@ def line(name: str, take: Take, outcome: Outcome, bound_m: float) -> str:
     both = known & placed
     ate, largest, degrees, wrong, unmarked = np.nan, np.nan, np.nan, 0, 0
     if both.sum() > 1:
-        off = scoring.errors(poses[both], take.poses[both], scoring.Tolerance())
-        distance = np.linalg.norm(off[:, :3], axis=1)
+        errors = scoring.errors(poses[both], take.poses[both], scoring.Tolerance())
+        distance = np.linalg.norm(errors[:, :3], axis=1)
         ate, largest = float(np.sqrt((distance**2).mean())), float(distance.max())
-        degrees = float(np.degrees(np.linalg.norm(off[:, 3:], axis=1).max()))
+        degrees = float(np.degrees(np.linalg.norm(errors[:, 3:], axis=1).max()))
         truth = scoring.Truth(take.poses, np.zeros(count, np.intp))
         found = scoring.score(list(outcome.parts), truth)
         wrong, unmarked = found.wrong, found.unmarked
@@ -345,7 +345,7 @@ HEAD = (
 
 
 def rows(name: str, options: argparse.Namespace) -> Iterator[str]:
-    """Give the rows of a recording and its variants."""
+    """Yield the rows of a recording and its variants."""
     take = load(name, options.data, options.frames)
     original = run(take.as_recording(), options.threads)
     take = replace(take, poses=original.parts[0].poses)
@@ -376,13 +376,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--names",
         nargs="+",
         default=[""],
-        help="parts of names",
+        help="recordings whose names contain these",
     )
-    parser.add_argument("--variants", nargs="+", default=[""], help="parts of names of variants")
-    parser.add_argument("--frames", type=int, default=MOST_FRAMES, help="at most, of a recording")
+    parser.add_argument(
+        "--variants", nargs="+", default=[""], help="variants whose names contain these"
+    )
+    parser.add_argument("--frames", type=int, default=MAX_FRAMES, help="maximum per recording")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of simulated ones")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of simulated recordings")
     options = parser.parse_args(arguments)
     wanted = options.parts or ["real", "simulated"]
     print(HEAD)
@@ -393,7 +395,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for row in rows(name, options):
                 print(row, flush=True)
         except FileNotFoundError as error:
-            print(f"{one.title}: left out, there is no {error}", flush=True)
+            print(f"{one.title}: skipped, no {error}", flush=True)
     for name in unusual.UNUSUAL if "simulated" in wanted else ():
         if any(part in name for part in options.names):
             for seed in options.seeds:

@@ -1,18 +1,18 @@
-"""Is the stated accuracy true and sharp, and is the verdict right?
+"""Coverage and sharpness of the stated accuracy, and correctness of the verdict.
 
-Many runs, each judged without the truth and then against it. Of each are printed the true rms
-error of the poses after alignment and the 95 % bound that was stated; at the end, by family, how
-many true errors are within the bound, the median ratio of bound and error, and how often right and
-wrong runs were called good; and by what is wrong with the recording, how often a reason names it.
-A run is right if its error is within the tolerance (0.5 % of the model's diagonal, at least 1 cm)
-and at least 95 % of its frames have a pose; for real recordings, what their reference itself may be
-off is added.
+Many runs are assessed without ground truth and then compared with it. For each, the true rms error
+of the poses after alignment and the stated 95 % bound are printed; at the end, by family, the
+coverage of the bound, the median ratio of bound to error, and how often right and wrong runs were
+called good; and for each fault of the recordings, how often a reason or finding names it. A run is
+right if its error is within the tolerance (0.5 % of the model's diagonal, at least 1 cm) and at
+least 95 % of its frames have a pose; for real recordings, the uncertainty of the reference is
+added.
 
-Simulated scenes are recorded by cameras of several kinds, with and without multipath; from each
-recording others are made: with every second or fourth frame, a wrong focal length, a depth offset,
-or a gap. The family `incidents` are cases of `stress.py`: somebody passes through the view, the
-lens is covered, the camera comes close to a bare wall, or goes on in another place. Real recordings
-are whole, and every fourth frame.
+Simulated scenes are recorded by several cameras, with and without multipath. Variants of each
+recording have every second or fourth frame, a wrong focal length, a depth offset, or a gap. The
+family `incidents` has cases of `stress.py`: a person passes through the view, the lens is covered,
+the camera approaches a bare wall, or continues in another place. Real recordings are used complete
+and with every fourth frame.
 
     python benchmarks/verdict.py [--seeds 10 11] [--families room] [--real] [--json FILE]
 """
@@ -44,7 +44,7 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 
 OUT = sequences.OUT / "recordings" / "verdict"
-# Stride among the raw frames of each scene.
+# Stride over the raw frames of each scene.
 SCENES = {"room": 12, "rail": 10, "empty-room": 12, "corridor": 12, "flat": 3}
 FRAMES = 60
 CAMERAS = ("sr4000", "ifm-o3r", "pico-flexx")
@@ -52,7 +52,7 @@ POSED = 0.95
 FOCAL, OFFSET_M = 1.05, 0.03
 INCIDENTS = "incidents"
 UNCHANGED = "as it is"
-# What is wrong with a recording, by the end of a run's name, and the reasons that name it.
+# Fault of a recording, by the end of a run's name, and the reasons that name it.
 CALIBRATION = frozenset({"calibration_alarm", "self_calibrated", "unchecked_calibration"})
 INCIDENT_CAUSES = {
     "passes over 25%": frozenset({"moving_objects"}),
@@ -72,20 +72,20 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Run:
-    """One run and what was true.
+    """One run, with its true error.
 
     Attributes
     ----------
     error_m, error_rad
         Rms after alignment; inf if fewer than half of the frames have a pose.
     bound_m, bound_rad
-        As stated; inf if not bounded.
+        Stated bounds; inf if not bounded.
     allowed_m
-        What a right run may be off by.
+        Largest error of a right run.
     posed
-        Share of the frames that have a pose.
+        Fraction of the frames with a pose.
     reference_m
-        What the reference itself may be off by.
+        Uncertainty of the reference itself.
     """
 
     family: str
@@ -102,17 +102,17 @@ class Run:
 
     @property
     def right(self) -> bool:
-        """Whether the result is."""
+        """Whether the result is right."""
         return self.error_m <= self.allowed_m and self.posed >= POSED
 
     @property
     def within(self) -> bool:
-        """Whether the error is within the stated bound, that of the reference allowed for."""
+        """Whether the error is within the stated bound plus that of the reference."""
         return self.error_m <= self.bound_m + self.reference_m
 
 
 def recorded(scene: str, camera: str, seed: int, *, multipath: bool) -> Recording:
-    """A simulated recording, made once and kept."""
+    """A simulated recording, created once and kept."""
     path = OUT / f"{scene}_{camera}_{seed}_{int(multipath)}"
     if not path.is_dir():
         unfinished = path.with_suffix(".part")
@@ -131,13 +131,13 @@ def recorded(scene: str, camera: str, seed: int, *, multipath: bool) -> Recordin
 
 
 def wrong_focal(frame: RangeFrame) -> RangeFrame:
-    """The frame as if its camera had another focal length."""
+    """The frame with a wrong focal length."""
     camera = frame.camera
     return replace(frame, camera=replace(camera, fx=FOCAL * camera.fx, fy=FOCAL * camera.fy))
 
 
 def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
-    """Give recordings that are made of one."""
+    """Yield variants of a recording."""
     yield UNCHANGED, recording
     yield "every 2nd", recording.select(every=2)
     n = len(recording)
@@ -162,7 +162,7 @@ def judged(
     *,
     turning: bool = False,
 ) -> Run:
-    """Inspect and reconstruct as `tofuse run` does; compare with the reference that fits best."""
+    """Inspect and reconstruct as `tofuse run` does; compare with the best-fitting reference."""
     config = resolve(Options(out=Path("unused"), object=turning))
     try:
         findings = inspect_recording(recording, turning=turning, quick=True).findings
@@ -193,21 +193,21 @@ def judged(
 
 
 def simulated(seeds: Sequence[int], families: Sequence[str]) -> Iterator[Run]:
-    """Give the runs of simulated recordings."""
+    """Yield the runs of simulated recordings."""
     for seed in seeds:
         for scene in families:
             for camera in CAMERAS:
                 for multipath in (True, False):
                     recording = recorded(scene, camera, seed, multipath=multipath)
-                    light = "" if multipath else ", no multipath"
+                    label = "" if multipath else ", no multipath"
                     for what, made in variants(recording):
                         assert made.reference is not None
-                        name = f"{scene}, {camera}{light}, seed {seed}, {what}"
+                        name = f"{scene}, {camera}{label}, seed {seed}, {what}"
                         yield judged(scene, name, made, [made.reference])
 
 
 def real(data: Path) -> Iterator[Run]:
-    """Give the runs of real recordings that have a reference."""
+    """Yield the runs of real recordings with a reference."""
     for one in RECORDED.values():
         try:
             recording = one.open(data)
@@ -222,7 +222,7 @@ def real(data: Path) -> Iterator[Run]:
 
 
 def incidents(seeds: Sequence[int]) -> Iterator[Run]:
-    """Give the runs of recordings to which something happens."""
+    """Yield the runs of recordings with incidents."""
     for seed in seeds:
         for scene in stress.SCENES.values():
             for name in INCIDENT_CAUSES:
@@ -233,7 +233,7 @@ def incidents(seeds: Sequence[int]) -> Iterator[Run]:
 
 
 def line(run: Run) -> str:
-    """One run in a line."""
+    """Format one run as a line."""
     bound = f"{1e3 * run.bound_m:8.1f}" if np.isfinite(run.bound_m) else "    none"
     return (
         f"{run.name:58} {'right' if run.right else 'wrong'} {1e3 * run.error_m:8.1f}"
@@ -243,7 +243,7 @@ def line(run: Run) -> str:
 
 
 def table(runs: Sequence[Run]) -> Iterator[str]:
-    """What they come to, by family."""
+    """Yield the table by family."""
     yield (
         "| family | runs | error within bound | bounded | median bound / error | right, good"
         " | wrong, good |"
@@ -266,9 +266,9 @@ def table(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def named(runs: Sequence[Run]) -> Iterator[str]:
-    """What is wrong with recordings, and whether it is named where it has an effect.
+    """Yield the table of faults, and whether they are named where they have an effect.
 
-    Runs count whose recording is right and good without it, as far as that was run.
+    Only runs count whose recording is right and good without the fault, if that was run.
     """
     yield "| what is wrong | runs | right and good | of the others, named |"
     yield "|---|---|---|---|"
@@ -289,16 +289,16 @@ def named(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run them, print a line for each, and the table."""
+    """Run all, print a line for each, and the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--seeds", nargs="*", type=int, default=[10, 11], help="of the simulation")
     families = [*SCENES, INCIDENTS]
     parser.add_argument("--families", nargs="*", default=families, choices=families)
-    parser.add_argument("--real", action="store_true", help="the real recordings too")
+    parser.add_argument("--real", action="store_true", help="also the real recordings")
     parser.add_argument("--data", type=Path, default=sequences.DATA, help="real recordings")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all runs there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all runs to this file")
     options = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     print(f"{'run':58} is     error mm    deg    bound    deg allowed  verdict", flush=True)

@@ -1,10 +1,10 @@
-"""Wheels of every dependency, for each system and version of Python.
+"""Availability of wheels of all dependencies, for each system and version of Python.
 
     python benchmarks/wheels.py [--only dask scan ...]
 
-Resolves what `pyproject.toml` asks for, alone and with each extra, from wheels only, as `pip` would
-on that system, and prints which of them can be had and what is missing. Nothing is installed. Needs
-uv (`pip install uv`) and a package index.
+Resolves the dependencies in `pyproject.toml`, without and with each extra, from wheels only, as
+`pip` would on that system, and prints which are available and what is missing. Nothing is
+installed. Needs uv (`pip install uv`) and a package index.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-# Names of uv, and what people call them.
+# Names of platforms in uv, and common names.
 SYSTEMS = {
     "x86_64-pc-windows-msvc": "Windows",
     "aarch64-apple-darwin": "macOS arm64",
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def missing(uv: str, system: str, python: str, extra: str | None) -> str:
-    """Return what has no wheel there; nothing if all do."""
+    """Return the packages without a wheel on a platform; empty if none."""
     command = [uv, "pip", "compile", "--quiet", "--no-header", "--only-binary", ":all:"]
     command += ["--python-platform", system, "--python-version", python, "pyproject.toml"]
     command += [] if extra is None else ["--extra", extra]
@@ -63,15 +63,15 @@ def missing(uv: str, system: str, python: str, extra: str | None) -> str:
     return "" if done.returncode == 0 else reason(done.stderr)
 
 
-def reason(said: str) -> str:
-    """Return the packages that uv names as having no wheel, or else what it says first."""
-    text = " ".join(said.split())
+def reason(message: str) -> str:
+    """Return the packages without a wheel from uv's message, or else its beginning."""
+    text = " ".join(message.split())
     found = sorted(set(_LACKING.findall(text)))
     return ", ".join(found) if found else text[:200] or "not resolved"
 
 
 def cell(lacking: dict[str, str]) -> str:
-    """Return one cell of the table: which versions have all, and what the others lack."""
+    """Format a cell: versions with all wheels, and what the others lack."""
     if not any(lacking.values()):
         return f"{PYTHONS[0]} to {PYTHONS[-1]}"
     if all(lacking.values()) and len(set(lacking.values())) == 1:

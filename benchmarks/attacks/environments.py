@@ -1,6 +1,6 @@
 """Runs of the program in hostile environments.
 
-Each must end with a result and the status of a result, or without one and with a line on standard
+Each run must end with a result and its exit status, or without a result and with a line on standard
 error that states the reason; without a traceback, and with all other files unchanged.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 LIMIT_S = 120.0
 _MB = 1 << 20
 
-# Runs in the child before anything of the program is loaded.
+# Runs in the child before any module of the program is loaded.
 _BEGIN = """
 import os, sys
 sys.argv[0] = "tofuse"
@@ -28,7 +28,7 @@ sys.exit(console())
 
 @dataclass(frozen=True)
 class Environment:
-    """An environment, and what a run must do in it.
+    """An environment, and the required outcome of a run.
 
     Attributes
     ----------
@@ -38,11 +38,11 @@ class Environment:
         Redirection of its streams, in shell syntax.
     variables
         Changed environment variables.
-    words
+    arguments
         Arguments appended to the command.
     must
         "work", "refuse", or "either".
-    says
+    message
         Text required on standard error if it must refuse.
     leaves
         Whether hidden files may remain, for the next run to remove.
@@ -52,9 +52,9 @@ class Environment:
     setup: str = ""
     shell: str = ""
     variables: tuple[tuple[str, str], ...] = ()
-    words: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()
     must: str = "work"
-    says: str = ""
+    message: str = ""
     leaves: bool = False
     folder: str = "out"
 
@@ -112,12 +112,12 @@ ENVIRONMENTS: tuple[Environment, ...] = (
     Environment("ordinary"),
     *(
         Environment(f"{mb} MB of addresses", _limit("RLIMIT_AS", mb * _MB), must="refuse",
-                    says="not enough memory")
+                    message="not enough memory")
         for mb in (512, 700, 1024, 1536)
     ),
     *(
         Environment(f"{mb} MB of addresses, one thread", _limit("RLIMIT_AS", mb * _MB),
-                    words=("--threads", "1"), must="either")
+                    arguments=("--threads", "1"), must="either")
         for mb in (1800, 2048, 4096)
     ),
     *(
@@ -125,11 +125,11 @@ ENVIRONMENTS: tuple[Environment, ...] = (
                     leaves=True)
         for count in (7, 9, 12, 16, 24, 32, 64)
     ),
-    Environment("no threads", _NO_THREADS, must="either", says=""),
-    Environment("no threads, --threads 1", _NO_THREADS, words=("--threads", "1"),
+    Environment("no threads", _NO_THREADS, must="either", message=""),
+    Environment("no threads, --threads 1", _NO_THREADS, arguments=("--threads", "1"),
                 must="either"),
     Environment("files of 20 kB at most", _limit("RLIMIT_FSIZE", 20_000), must="refuse",
-                says="can't be written"),
+                message="can't be written"),
     Environment("stdout closed", shell=">&-"),
     Environment("stderr closed", shell="2>&-"),
     Environment("both closed", shell=">&- 2>&-"),
@@ -137,9 +137,9 @@ ENVIRONMENTS: tuple[Environment, ...] = (
     Environment("all closed", shell="<&- >&- 2>&-"),
     Environment("stdout full", shell="> /dev/full"),
     Environment("stderr full", shell="2> /dev/full"),
-    Environment("JSON lines to a full disk", shell="> /dev/full", words=("--json",)),
-    Environment("a reader that leaves", shell="| head -c 1 > /dev/null", words=("--json",)),
-    Environment("a reader that never reads", shell="| true", words=("--json",)),
+    Environment("JSON lines to a full disk", shell="> /dev/full", arguments=("--json",)),
+    Environment("a reader that leaves", shell="| head -c 1 > /dev/null", arguments=("--json",)),
+    Environment("a reader that never reads", shell="| true", arguments=("--json",)),
     Environment("a reader of errors that leaves", shell="2>&1 | head -c 1 > /dev/null"),
     Environment("ASCII", variables=(("PYTHONIOENCODING", "ascii"), ("PYTHONUTF8", "0"))),
     Environment("Windows-1252", variables=(("PYTHONIOENCODING", "cp1252"), ("PYTHONUTF8", "0"))),
@@ -156,7 +156,7 @@ ENVIRONMENTS: tuple[Environment, ...] = (
     Environment("a clock that goes backwards", _CLOCK),
     Environment("one core", "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"),
     Environment("the output folder is read-only", must="refuse", folder="/proc/out",
-                says="can't be written"),
+                message="can't be written"),
     *(
         Environment(f"{name} at {stage}",
                     _at(function, f"os.kill(os.getpid(), signal.{name})"), must="either")
@@ -171,12 +171,12 @@ class Outcome:
     """Exit status and standard error of a run, whether there is a result, and the faults."""
 
     status: int | None
-    said: str
+    stderr: str
     result: bool
     faults: tuple[str, ...]
 
 
-def attempt(environment: Environment, recording: Path, where: Path, *words: str) -> Outcome:
+def attempt(environment: Environment, recording: Path, where: Path, *arguments: str) -> Outcome:
     """Run the program on a recording in an environment, over an earlier result."""
     out = Path(environment.folder) if environment.folder[0] == "/" else where / environment.folder
     mine = None
@@ -195,11 +195,11 @@ def attempt(environment: Environment, recording: Path, where: Path, *words: str)
         "--out",
         str(out),
         "--overwrite",
-        *words,
-        *environment.words,
+        *arguments,
+        *environment.arguments,
     ]
     with tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as code:
-        # The status of the program itself, not that of what it is piped to.
+        # The status of the program itself, not of the end of the pipe.
         script = f'{{ "$@"; echo $? >&{code.fileno()}; }} {environment.shell}'
         try:
             subprocess.run(
@@ -212,23 +212,23 @@ def attempt(environment: Environment, recording: Path, where: Path, *words: str)
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return Outcome(None, "", False, (f"it took more than {LIMIT_S:.0f} s",))
+            return Outcome(None, "", False, (f"took more than {LIMIT_S:.0f} s",))
         err.seek(0)
         code.seek(0)
-        said = err.read().decode(errors="replace")
+        stderr = err.read().decode(errors="replace")
         status = int(code.read() or b"-1")
-    return _judged(environment, status, said, out, mine)
+    return _judged(environment, status, stderr, out, mine)
 
 
 def _judged(
-    environment: Environment, status: int, said: str, out: Path, mine: dict[str, bytes] | None
+    environment: Environment, status: int, stderr: str, out: Path, mine: dict[str, bytes] | None
 ) -> Outcome:
     whole = {"run.json", "trajectory.txt", "cloud.ply", "pose_graph.g2o", "report.html"}
     there = {p.name for p in out.iterdir()} if out.is_dir() else set()
     result = whole <= there
     old = mine is not None and (out / "run.json").read_bytes() == mine["run.json"]
     faults = []
-    if "Traceback" in said or "Exception ignored" in said:
+    if "Traceback" in stderr or "Exception ignored" in stderr:
         faults.append("a traceback")
     if status in (0, 3) and not result:
         faults.append(f"status {status} without a result")
@@ -244,14 +244,14 @@ def _judged(
     if hidden and not environment.leaves and status >= 0 and status not in (134, 137, 139):
         faults.append(f"left {hidden}")
     if status in (134, 139):
-        faults.append("it crashed")
-    lines = [line for line in said.splitlines() if line.startswith("tofuse: ")]
+        faults.append("crashed")
+    lines = [line for line in stderr.splitlines() if line.startswith("tofuse: ")]
     if status not in (0, 3) and not lines and "2>" not in environment.shell:
-        faults.append("it does not say why")
+        faults.append("no reason given")
     if environment.must == "work" and status not in (0, 3):
         faults.append(f"status {status}")
     if environment.must == "refuse" and status != 2:
         faults.append(f"status {status}, not 2")
-    if environment.must == "refuse" and environment.says not in said:
-        faults.append(f"does not say {environment.says!r}")
-    return Outcome(status, said, result, tuple(faults))
+    if environment.must == "refuse" and environment.message not in stderr:
+        faults.append(f"message lacks {environment.message!r}")
+    return Outcome(status, stderr, result, tuple(faults))

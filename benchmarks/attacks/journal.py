@@ -46,7 +46,7 @@ class Journal:
             path.write_text(json.dumps(settings) + "\n")
 
     def do(self, name: str, number: int, work: Callable[[], tuple[int, list[str]]]) -> None:
-        """Do a piece unless it is done; `work` returns how many were tried, and faults."""
+        """Run a piece unless it is completed; `work` returns the number of attacks, and faults."""
         if (name, number) in self.pieces:
             return
         tried, faults = work()

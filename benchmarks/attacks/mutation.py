@@ -324,7 +324,7 @@ def _small() -> dict[str, Subject]:
 
 
 def _file(name: str, make: Callable[[Path], object], read: Callable[[Path], object]) -> Subject:
-    """A file that is no recording."""
+    """A file that is not a recording."""
 
     def made(folder: Path) -> None:
         make(folder / name)
@@ -433,8 +433,8 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
     data = bytearray(path.read_bytes())
     size = max(1, len(data))
 
-    def at(most: int = size) -> int:
-        return int(rng.integers(max(1, min(size, most))))
+    def at(limit: int = size) -> int:
+        return int(rng.integers(max(1, min(size, limit))))
 
     match int(rng.integers(14)):
         case 0:
@@ -538,8 +538,8 @@ def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
         import traceback
 
         last = traceback.extract_tb(error.__traceback__)[-1]
-        said = " ".join(str(error).split())[:150]
-        return f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {said}"
+        text = " ".join(str(error).split())[:150]
+        return f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {text}"
     finally:
         signal.alarm(0)
         signal.setitimer(signal.ITIMER_PROF, 0)

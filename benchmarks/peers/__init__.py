@@ -1,4 +1,4 @@
-"""Trackers to compare with, all behind one interface. Each file names one; none is needed."""
+"""Trackers of other programs behind one interface, one file each; all are optional."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ MAX_DEPTH_M = 12.0
 
 
 class Session(Protocol):
-    """A tracker at work on one sequence."""
+    """A tracker running on one sequence."""
 
     def prepare(self, frame: RangeFrame) -> Any:
-        """Bring a frame into the type that the tracker takes. Not timed."""
+        """Convert a frame to the data type of the tracker. Not timed."""
         ...
 
     def push(self, prepared: Any) -> Float64 | None:
-        """Track, and return T_world_camera (4, 4) or None where lost. Timed."""
+        """Track a frame; return T_world_camera (4, 4) or None if lost. Timed."""
         ...
 
 
@@ -37,15 +37,15 @@ class Method(Protocol):
 
     @property
     def tuning(self) -> str:
-        """Every setting that is not its default, for people."""
+        """All non-default settings, as text."""
         ...
 
     def resolution(self, frame: RangeFrame) -> str:
-        """Say on what grid or voxels it works."""
+        """Describe the grid or voxels that it uses."""
         ...
 
     def start(self, frame: RangeFrame, threads: int) -> Session:
-        """Begin a sequence whose first frame is given."""
+        """Start a sequence, given its first frame."""
         ...
 
 
@@ -56,9 +56,9 @@ def grid(frame: RangeFrame) -> str:
 
 @dataclass
 class PinholeImages:
-    """Images as a pinhole camera would have taken them: nearest pixels, where a lens distorts.
+    """Images of an ideal pinhole camera, resampled by nearest pixels if the lens distorts.
 
-    Peers that know no distortion get these.
+    For peers without a distortion model.
     """
 
     camera: Camera
@@ -78,7 +78,7 @@ class PinholeImages:
         self._rows, self._columns = rows.clip(0, c.height - 1), columns.clip(0, c.width - 1)
 
     def take(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Resample an image; 0 where the camera did not look."""
+        """Resample an image; 0 outside the field of view."""
         if type(self.camera) is Pinhole:
             return np.ascontiguousarray(image)
         taken = image[self._rows, self._columns]
@@ -87,7 +87,7 @@ class PinholeImages:
 
 
 def all_methods(frame: RangeFrame) -> list[list[Method]]:
-    """Return the peers that can work on such frames; of each, the tunings to choose from."""
+    """Return the peers that support such frames; for each, its candidate tunings."""
     from peers import kiss, o3d, sgicp
 
     return [*o3d.methods(frame), *sgicp.methods(frame), *kiss.methods(frame)]

@@ -1,4 +1,4 @@
-"""KISS-ICP with voxels as small as a room asks for."""
+"""KISS-ICP with voxel sizes for indoor scenes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _THRESHOLDS_M = (0.1, 0.5)
 
 @dataclass(frozen=True)
 class KissIcp:
-    """Point to point against a voxel map, with an adaptive threshold."""
+    """Point-to-point ICP against a voxel map, with an adaptive threshold."""
 
     voxel_m: float
     threshold_m: float
@@ -30,7 +30,7 @@ class KissIcp:
     @property
     def tuning(self) -> str:
         return (
-            f"initial threshold {100 * self.threshold_m:g} cm, least motion 1 cm, no deskewing, "
+            f"initial threshold {100 * self.threshold_m:g} cm, minimum motion 1 cm, no deskewing, "
             "start: last motion"
         )
 

@@ -1,4 +1,4 @@
-"""KISS-Matcher (Lim et al. 2025), with its own parameters for the voxel size."""
+"""KISS-Matcher (Lim et al. 2025), with its default parameters for the voxel size."""
 
 from __future__ import annotations
 

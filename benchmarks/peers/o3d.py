@@ -1,4 +1,4 @@
-"""Open3D: tensor odometry from frame to frame, and dense SLAM from frame to model."""
+"""Open3D: frame-to-frame tensor odometry, and frame-to-model dense SLAM."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from peers import MAX_DEPTH_M, Method, PinholeImages, Session, grid
 from tofuse.arrays import Float64, Int64, UInt8
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 
-# Counts of a metre: 0.2 mm, so that rounding is far below the noise of any camera.
+# Counts per metre: 0.2 mm, so that rounding is far below the noise of any camera.
 _SCALE = 5000.0
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Multi-scale RGB-D odometry against the frame before."""
+    """Multi-scale RGB-D odometry against the previous frame."""
 
     hybrid: str = ""  # "color", "amplitude", or nothing: depth only
     iterations: tuple[int, ...] = (10, 5, 3)
@@ -43,7 +43,7 @@ class Odometry:
 
 @dataclass(frozen=True)
 class DenseSlam:
-    """Frame to model: TSDF volume, ray casting, point to plane."""
+    """Frame-to-model tracking: TSDF volume, ray casting, point-to-plane ICP."""
 
     voxel_m: float = 0.01
     iterations: tuple[int, ...] = (6, 3, 1)
@@ -120,7 +120,7 @@ class _OdometrySession:
                     self._criteria,
                     self._method,
                 )
-            except RuntimeError:  # too little in common
+            except RuntimeError:  # too little overlap
                 return None
             self._T = self._T @ found.transformation.numpy()
         return self._T
@@ -157,7 +157,7 @@ class _DenseSession:
                 found = self._model.track_frame_to_model(
                     self._input, self._cast, _SCALE, MAX_DEPTH_M, 0.07, self._method, self._criteria
                 )
-            except RuntimeError:  # too little in common
+            except RuntimeError:  # too little overlap
                 return None
             self._T = self._T @ found.transformation.numpy()
         self._model.update_frame_pose(self._index, self._images.o3d.core.Tensor(self._T))
@@ -167,23 +167,23 @@ class _DenseSession:
         return self._T
 
     def write_mesh(self, path: Path) -> None:
-        """Write the surface of what was pushed so far as PLY."""
+        """Write the surface fused so far as PLY."""
         mesh = self._model.voxel_grid.extract_triangle_mesh()
         self._images.o3d.io.write_triangle_mesh(str(path), mesh.to_legacy())
 
 
 def fused(
-    frames: Sequence[RangeFrame], poses: Float64, voxel_m: float, least: float
+    frames: Sequence[RangeFrame], poses: Float64, voxel_m: float, min_weight: float
 ) -> tuple[Float64, Int64]:
-    """Vertices and faces of its TSDF of the frames at given poses (N, 4, 4).
+    """Vertices and faces of Open3D's TSDF fusion at given poses (N, 4, 4).
 
-    Truncation is 8 voxels, its default; `least` is the weight, one a view, from which it shows a
-    surface.
+    Truncation is 8 voxels, its default; `min_weight` is the weight, one per view, from which
+    surfaces are extracted.
     """
     images = _Images(frames[0])
     o3d = images.o3d
     kinds = (o3d.core.float32, o3d.core.float32)
-    # Smaller blocks, or fewer of them to begin with, end in an error of its allocator.
+    # With smaller blocks, or fewer initial ones, its allocator fails.
     volume = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), kinds, ((1), (1)), voxel_m, 16, 50000, o3d.core.Device("CPU:0")
     )
@@ -192,20 +192,22 @@ def fused(
         seen_from = (images.K, o3d.core.Tensor(np.linalg.inv(T_world_camera)), _SCALE, MAX_DEPTH_M)
         blocks = volume.compute_unique_block_coordinates(depth, *seen_from, 8.0)
         volume.integrate(blocks, depth, *seen_from, 8.0)
-    mesh = volume.extract_triangle_mesh(least).to_legacy()
+    mesh = volume.extract_triangle_mesh(min_weight).to_legacy()
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
 
 
 def _grey(frame: RangeFrame) -> UInt8:
-    """Amplitude without its falloff with range, 0 to 255: the median at 100."""
-    light = frame.amplitude_image
-    assert light is not None
-    light = np.where((light < SATURATED_AMPLITUDE) & frame.valid, light, 0).astype(np.float32)
+    """Range-compensated amplitude, 0 to 255, with the median at 100."""
+    amplitude = frame.amplitude_image
+    assert amplitude is not None
+    amplitude = np.where((amplitude < SATURATED_AMPLITUDE) & frame.valid, amplitude, 0).astype(
+        np.float32
+    )
     if frame.amplitude_kind == "raw":
-        light = light * frame.radial_range**2
-    lit = light[light > 0]
-    scale = 100 / np.median(lit) if len(lit) else 1.0
-    return np.clip(light * scale, 0, 255).astype(np.uint8)
+        amplitude = amplitude * frame.radial_range**2
+    positive = amplitude[amplitude > 0]
+    scale = 100 / np.median(positive) if len(positive) else 1.0
+    return np.clip(amplitude * scale, 0, 255).astype(np.uint8)
 
 
 def methods(frame: RangeFrame) -> list[list[Method]]:

@@ -1,4 +1,4 @@
-"""Open3D: RANSAC over matches of FPFH, then point-to-plane ICP, as its tutorial does."""
+"""Open3D: RANSAC over FPFH matches, then point-to-plane ICP, as in its tutorial."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.recordings.frames import Frame
 
-# Of the tutorial: 5 cm for a room. Radii and distances are multiples of it.
+# As in the tutorial: 5 cm for a room. Radii and distances are multiples of it.
 VOXEL_M = 0.05
 _ITERATIONS, _CONFIDENCE = 100_000, 0.999
 

@@ -1,12 +1,12 @@
-"""Open3D's offline reconstruction system, put together from its library by its documentation.
+"""Open3D's offline reconstruction system, assembled from its library as documented.
 
-Fragments of a hundred frames by RGB-D odometry and loops within them; fragments registered by
-features and ICP, and once more at finer scales; a pose graph with a line process after each of
-these; one volume of all frames. Options are the defaults that the system is published with
-(Choi et al. 2015; open3d.org, "Reconstruction system").
+Fragments of a hundred frames from RGB-D odometry with loop closures; registration of fragments by
+features and ICP, and again at finer scales; a pose graph with a line process after each step; one
+volume of all frames. Options are the published defaults of the system (Choi et al. 2015;
+open3d.org, "Reconstruction system").
 
-Without registered colour there are no features of images to start loops within a fragment from, and
-no colours to align clouds by: loops then start from the odometry, and ICP is point to plane.
+Without registered colour there are no image features to initialise loop closures within a fragment,
+and no coloured ICP: loop closures then start from the odometry, and ICP is point-to-plane.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
-_SCALE = 5000.0  # counts of a metre
-_LEAST_WEIGHT = 1.0  # what one frame saw is shown
-# To begin with: where there are few, its allocator fails as they become more.
+_SCALE = 5000.0  # counts per metre
+_LEAST_WEIGHT = 1.0  # extract surfaces seen by a single frame
+# Initial number of blocks: with few, its allocator fails as the volume grows.
 _BLOCKS, _BLOCKS_OF_SCENE = 20_000, 50_000
 _GREY = 128  # of images without colour: their mean must not be 0
 
 
 @dataclass(frozen=True)
 class System:
-    """Its options, in m."""
+    """Options of the system, in m."""
 
     frames_per_fragment: int = 100
     keyframe_step: int = 5
@@ -56,13 +56,13 @@ class System:
 
     @property
     def near(self) -> float:
-        """Farthest that points are apart which are taken for the same."""
+        """Maximum correspondence distance."""
         return 1.4 * self.voxel
 
 
 @dataclass(frozen=True)
 class Selected:
-    """Frames of a recording; opened anew in every process."""
+    """Frames of a recording, which every process opens itself."""
 
     source: str
     start: int
@@ -80,7 +80,7 @@ class Selected:
 
 @dataclass
 class Made:
-    """What it made of a recording."""
+    """Reconstruction of a recording."""
 
     poses: Float64
     seconds: dict[str, float] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Made:
 
 @dataclass(frozen=True)
 class _Fragment:
-    poses: Float64  # (N, 4, 4) of its frames in that of its first
+    poses: Float64  # (N, 4, 4) of its frames, relative to the first
     points: Float64
     normals: Float64
     colors: Float64 | None
@@ -121,7 +121,7 @@ def _open3d() -> Any:
 
 
 class _Images:
-    """Images of one camera in its types."""
+    """Images of one camera in Open3D's types."""
 
     def __init__(self, options: System, frame: RangeFrame) -> None:
         self.o3d = _open3d()
@@ -145,7 +145,7 @@ class _Images:
         )
 
     def volume(self, blocks: int) -> Any:
-        """Begin a volume; the one of the system's own scripts stays empty in version 0.20."""
+        """Create a volume; that of the system's own scripts stays empty in version 0.20."""
         o3d = self.o3d
         color = self.colored
         kinds = (o3d.core.float32, o3d.core.float32, o3d.core.float32)
@@ -186,7 +186,7 @@ class _Images:
 
 
 def _optimised(poses: Float64, edges: Sequence[_Edge], near: float, loops: float) -> Float64:
-    """Poses (N, 4, 4) of the pose graph, the first one held."""
+    """Optimised poses (N, 4, 4) of the pose graph, with the first one fixed."""
     r = _open3d().pipelines.registration
     graph = r.PoseGraph()
     for T in poses:
@@ -208,7 +208,7 @@ def _optimised(poses: Float64, edges: Sequence[_Edge], near: float, loops: float
 
 
 def make_fragment(options: System, selected: Selected, first: int) -> _Fragment | None:
-    """Step 1: poses and points of some frames; None where there are none."""
+    """Step 1: poses and points of a fragment; None if it has no frames."""
     frames = selected.frames(first, first + options.frames_per_fragment)
     if not frames:
         return None
@@ -274,21 +274,21 @@ def _icp(
     iterations: Sequence[int],
     T: Float64,
 ) -> tuple[Float64, Float64]:
-    """Transform and information after one scale after the other."""
+    """Multi-scale ICP: transform and information matrix."""
     o3d = _open3d()
     r = o3d.pipelines.registration
-    for scale, most in zip(scales, iterations, strict=True):
+    for scale, max_iterations in zip(scales, iterations, strict=True):
         a, b = source.voxel_down_sample(scale), target.voxel_down_sample(scale)
         for cloud in (a, b):
             cloud.estimate_normals(
                 o3d.geometry.KDTreeSearchParamHybrid(radius=2 * scale, max_nn=30)
             )
         if a.has_colors():
-            criteria = r.ICPConvergenceCriteria(1e-6, 1e-6, most)
+            criteria = r.ICPConvergenceCriteria(1e-6, 1e-6, max_iterations)
             kind = r.TransformationEstimationForColoredICP()
             found = r.registration_colored_icp(a, b, options.near, T, kind, criteria)
         else:
-            criteria = r.ICPConvergenceCriteria(max_iteration=most)
+            criteria = r.ICPConvergenceCriteria(max_iteration=max_iterations)
             kind = r.TransformationEstimationPointToPlane()
             found = r.registration_icp(a, b, options.near, T, kind, criteria)
         T = found.transformation
@@ -299,7 +299,7 @@ def _icp(
 def register_pair(
     options: System, s: int, t: int, source: _Fragment, target: _Fragment
 ) -> _Edge | None:
-    """Step 2: two fragments; None where they have too little in common."""
+    """Step 2: register two fragments; None if they overlap too little."""
     r = _open3d().pipelines.registration
     (a, features_a), (b, features_b) = (_thinned(options, f.cloud()) for f in (source, target))
     if t == s + 1:
@@ -322,7 +322,7 @@ def register_pair(
         r.RANSACConvergenceCriteria(1000000, 0.999),
     )
     T = r_found.transformation
-    if np.trace(T) == 4:  # nothing found
+    if np.trace(T) == 4:  # no match found
         return None
     information = r.get_information_matrix_from_point_clouds(a, b, options.near, T)
     if information[5, 5] < options.least_overlap * min(len(a.points), len(b.points)):
@@ -331,14 +331,14 @@ def register_pair(
 
 
 def refine_pair(options: System, edge: _Edge, source: _Fragment, target: _Fragment) -> _Edge:
-    """Step 3: one of the pairs, to a quarter of the voxel."""
+    """Step 3: refine a pair, down to a quarter of the voxel size."""
     scales = [options.voxel / k for k in (1, 2, 4)]
     T, information = _icp(options, source.cloud(), target.cloud(), scales, [50, 30, 14], edge.T)
     return _Edge(edge.source, edge.target, T, information, edge.uncertain)
 
 
 def _chained(count: int, edges: Sequence[_Edge]) -> Float64:
-    """Poses of fragments along those that follow each other."""
+    """Poses of fragments, chained along consecutive ones."""
     steps = {e.source: e.T for e in edges if e.target == e.source + 1}
     poses = [np.eye(4)]
     for k in range(count - 1):
@@ -347,7 +347,7 @@ def _chained(count: int, edges: Sequence[_Edge]) -> Float64:
 
 
 def reconstruct(options: System, selected: Selected, out: Path, workers: int) -> Made:
-    """Run all steps, in so many processes where the system does; the mesh goes to `out`."""
+    """Run all steps, parallel where the system is, and write the mesh to `out`."""
     seconds: dict[str, float] = {}
 
     @contextmanager
@@ -356,7 +356,7 @@ def reconstruct(options: System, selected: Selected, out: Path, workers: int) ->
         yield
         seconds[name] = time.perf_counter() - start
 
-    # Each of them is busy with one thread.
+    # One thread each.
     os.environ["OMP_NUM_THREADS"] = "1"
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
 

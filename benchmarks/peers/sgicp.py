@@ -1,4 +1,4 @@
-"""small_gicp: each frame against the one before, and against an incremental voxel map."""
+"""small_gicp: each frame against the previous one, and against an incremental voxel map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from peers import MAX_DEPTH_M, Method, Session
 from tofuse.arrays import Float64
 from tofuse.recordings.frames import RangeFrame
 
-# Each peer is tried with every pair of these, and the best on the first frames is taken.
+# Each peer is tried with every pair of these; the best on the first frames is used.
 _VOXELS_M = (0.02, 0.04, 0.08)
 _DISTANCES_M = (0.05, 0.1, 0.3)
 _MAP_VOXELS_M = (0.05, 0.1, 0.2)
@@ -20,7 +20,7 @@ _MAP_VOXELS_M = (0.05, 0.1, 0.2)
 
 @dataclass(frozen=True)
 class Pairwise:
-    """GICP against the frame before."""
+    """GICP against the previous frame."""
 
     voxel_m: float
     distance_m: float

@@ -57,7 +57,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_hostile_environments(name: str, clouds: Path, tmp_path: Path) -> None:
     (environment,) = [e for e in ENVIRONMENTS if e.name == name]
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
-    assert outcome.faults == (), outcome.said
+    assert outcome.faults == (), outcome.stderr
 
 
 def shell(script: str) -> tuple[int, str]:

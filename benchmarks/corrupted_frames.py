@@ -1,13 +1,12 @@
-"""Spoilt recordings: does a wrong pose ever look fine?
+"""Corrupted frames: is every wrong pose detected?
 
-Of simulated and recorded sequences one frame, or all from one on, or all, are spoilt; the default
-tracker and the checks of the whole run have to notice. A pose is wrong if it is off by more than
-5 cm or 3 degrees beyond what the clean sequence drifts. It looks fine if the frame is called
-tracked and held in every direction, nothing but what is said of the clean sequence too is said of
-the result, and the error is beyond three times the sigma that the pose states. Where there is no
-reference the clean run is it.
+In simulated and recorded sequences one frame, all from one on, or all are corrupted; the default
+tracker and the checks of the whole run have to detect it. A pose is wrong if its error exceeds the
+drift on the clean sequence by more than 5 cm or 3 degrees. It is undetected if the frame is tracked
+without unobservable directions, the run has no reasons beyond those of the clean sequence, and the
+error exceeds three times the stated sigma. If there is no reference, the clean run serves as one.
 
-    python benchmarks/spoilt.py --scenes room rail torso corridor [--cases "depth"]
+    python benchmarks/corrupted_frames.py --scenes room rail torso corridor [--cases "depth"]
 """
 
 from __future__ import annotations
@@ -27,39 +26,39 @@ from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.results.types import Reconstruction
 
-Spoil = Callable[[RangeFrame], RangeFrame]
+Corruption = Callable[[RangeFrame], RangeFrame]
 
 FRAMES, FIRST = 16, 7
-OFF_M, OFF_RAD = 0.05, np.radians(3.0)
+MAX_ERROR_M, MAX_ERROR_RAD = 0.05, np.radians(3.0)
 SIGMAS = 3.0
 
 
-def arranged(order: tuple[slice, ...]) -> Spoil:
-    """Spoil by putting the pixels into another order."""
+def arranged(order: tuple[slice, ...]) -> Corruption:
+    """Corruption that reorders the pixels."""
 
-    def spoil(frame: RangeFrame) -> RangeFrame:
-        light = frame.amplitude_image
+    def corrupt(frame: RangeFrame) -> RangeFrame:
+        amplitude = frame.amplitude_image
         return replace(
             frame,
             depth=np.ascontiguousarray(frame.depth[order]),
-            amplitude_image=None if light is None else np.ascontiguousarray(light[order]),
+            amplitude_image=None if amplitude is None else np.ascontiguousarray(amplitude[order]),
         )
 
-    return spoil
+    return corrupt
 
 
-def scaled(factor: float) -> Spoil:
-    """Spoil by another unit of depth."""
+def scaled(factor: float) -> Corruption:
+    """Corruption that scales depth."""
     return lambda frame: replace(frame, depth=frame.depth * np.float32(factor))
 
 
 def sparse(frame: RangeFrame) -> RangeFrame:
-    """Leave one pixel in a hundred."""
+    """Keep one pixel in a hundred."""
     return frame.keep(np.random.default_rng([1, frame.index]).random(frame.depth.shape) < 0.01)
 
 
 def salted(frame: RangeFrame) -> RangeFrame:
-    """Put 30 % of the pixels very near or very far."""
+    """Replace 30 % of the pixels by very near or very far ones."""
     rng = np.random.default_rng([2, frame.index])
     hit = rng.random(frame.depth.shape) < 0.3
     wrong = rng.choice([0.3, 8.0], frame.depth.shape)
@@ -67,32 +66,32 @@ def salted(frame: RangeFrame) -> RangeFrame:
 
 
 def constant(frame: RangeFrame) -> RangeFrame:
-    """Put all pixels at one depth."""
+    """Set all pixels to one depth."""
     return replace(frame, depth=np.full_like(frame.depth, np.median(frame.depth[frame.valid])))
 
 
 def covered(frame: RangeFrame) -> RangeFrame:
-    """Hold a hand before the left half."""
+    """Cover the left half with a hand."""
     depth = frame.depth.copy()
     half = depth.shape[1] // 2
     v, u = np.mgrid[: depth.shape[0], :half]
     depth[:, :half] = 0.35 + 0.02 * np.sin(u / 9) + 0.03 * np.cos(v / 13)
-    light = frame.amplitude_image
-    if light is not None:
-        light = light.copy()
-        light[:, :half] = np.percentile(light, 99)
-    return replace(frame, depth=depth, amplitude_image=light)
+    amplitude = frame.amplitude_image
+    if amplitude is not None:
+        amplitude = amplitude.copy()
+        amplitude[:, :half] = np.percentile(amplitude, 99)
+    return replace(frame, depth=depth, amplitude_image=amplitude)
 
 
 def saturated(frame: RangeFrame) -> RangeFrame:
     """Saturate the amplitude."""
-    light = frame.amplitude_image
-    if light is None:
+    amplitude = frame.amplitude_image
+    if amplitude is None:
         return frame
-    return replace(frame, amplitude_image=np.full_like(light, SATURATED_AMPLITUDE))
+    return replace(frame, amplitude_image=np.full_like(amplitude, SATURATED_AMPLITUDE))
 
 
-SPOILT: dict[str, Spoil] = {
+CORRUPTIONS: dict[str, Corruption] = {
     "blank": scaled(0),
     "1 % valid": sparse,
     "salt and pepper": salted,
@@ -110,16 +109,16 @@ SPOILT: dict[str, Spoil] = {
 
 
 def cases(frames: list[RangeFrame], other: list[RangeFrame]) -> dict[str, tuple[list, list]]:
-    """Name of a case -> frames, and for each which of the clean frames it is, or None."""
+    """Map each case to its frames, and the indices of the clean frames they show, or None."""
     n = min(FRAMES, len(frames))
     first = min(FIRST, n // 2)
     plain = list(range(n))
     found: dict[str, tuple[list, list]] = {}
-    for name, spoil in SPOILT.items():
+    for name, corrupt in CORRUPTIONS.items():
         for how, last in (("one frame", first + 1), ("from a frame on", n)):
             bad = range(first, last)
             found[f"{name}, {how}"] = (
-                [spoil(frames[k]) if k in bad else frames[k] for k in plain],
+                [corrupt(frames[k]) if k in bad else frames[k] for k in plain],
                 plain,
             )
     for how, last in (("one frame", first + 1), ("from a frame on", n)):
@@ -129,17 +128,17 @@ def cases(frames: list[RangeFrame], other: list[RangeFrame]) -> dict[str, tuple[
             [other[k] if k in bad else frames[k] for k in plain],
             truth,
         )
-        hung = [first - 1 if k in bad else k for k in plain]
-        found[f"frozen, {how}"] = ([frames[k] for k in hung], plain)
+        frozen = [first - 1 if k in bad else k for k in plain]
+        found[f"frozen, {how}"] = ([frames[k] for k in frozen], plain)
     found["frozen from the start"] = ([frames[0]] * n, [0] * n)
     for name in ("depth x 10", "depth / 10"):
-        found[f"{name}, all"] = [SPOILT[name](frames[k]) for k in plain], plain
+        found[f"{name}, all"] = [CORRUPTIONS[name](frames[k]) for k in plain], plain
     if frames[0].amplitude_image is not None:
-        amiss = [
-            replace(SPOILT["mirrored left to right"](f), amplitude_image=f.amplitude_image)
+        mismatched = [
+            replace(CORRUPTIONS["mirrored left to right"](f), amplitude_image=f.amplitude_image)
             for f in frames[:n]
         ]
-        found["depth mirrored, amplitude not, all"] = amiss, plain
+        found["depth mirrored, amplitude not, all"] = mismatched, plain
     for far in (4, 8, 14, 32):
         path = [*range(8), *range(8 + far, 12 + far), 7, 6, 5, 4]
         if max(path) < len(frames):
@@ -148,7 +147,7 @@ def cases(frames: list[RangeFrame], other: list[RangeFrame]) -> dict[str, tuple[
 
 
 def run(frames: Sequence[RangeFrame]) -> Reconstruction | None:
-    """Run the default method on frames that are corrected and filtered already."""
+    """Run the default method on frames that are already corrected and filtered."""
     config = replace(from_method("default"), corrections=(), filters=())
     mapper = Mapper(config, threads=1)
     poses = [mapper.push(replace(frame, index=k)) for k, frame in enumerate(frames)]
@@ -156,25 +155,25 @@ def run(frames: Sequence[RangeFrame]) -> Reconstruction | None:
 
 
 def errors(result: Reconstruction, poses: Sequence[Float64 | None]) -> Float64:
-    """(N, 2) m and rad; NaN without an estimate, infinite where there is no true pose."""
+    """Errors (N, 2) in m and rad; NaN without an estimate, infinite without a true pose."""
     out = np.full((len(poses), 2), np.nan)
     for k, true in enumerate(poses):
         if result.has_pose[k]:
             out[k] = np.inf
             if true is not None:
-                off = se3.inverse(true) @ result.trajectory[k]
-                out[k] = np.linalg.norm(off[:3, 3]), float(se3.angle(off))
+                error = se3.inverse(true) @ result.trajectory[k]
+                out[k] = np.linalg.norm(error[:3, 3]), float(se3.angle(error))
     return out
 
 
-def admitted(result: Reconstruction, off: Float64) -> Bool:
-    """(N,) whether errors (N, 2), m and rad, are such as the frames themselves allow for."""
+def within_stated(result: Reconstruction, error: Float64) -> Bool:
+    """Whether errors (N, 2), m and rad, are within three sigma or in unobservable directions."""
     out = np.array([len(frame.unobservable) > 0 for frame in result.diagnostics.frames])
     for k, frame in enumerate(result.diagnostics.frames):
         if not out[k] and frame.covariance is not None:
             parts = frame.covariance[:3, :3], frame.covariance[3:, 3:]
             sigma = np.sqrt([np.linalg.eigvalsh(part)[-1] for part in parts])
-            out[k] = bool((off[k] <= SIGMAS * sigma).all())
+            out[k] = bool((error[k] <= SIGMAS * sigma).all())
     return out
 
 
@@ -189,7 +188,7 @@ def main() -> None:
     parser.add_argument("--cases", default="", help="only those whose name contains this")
     parser.add_argument("--data", type=Path, default=sequences.DATA)
     options = parser.parse_args()
-    # Not the same room with chairs in it.
+    # Other scenes; the same room with other furniture would be too similar.
     others = {"room": "rail", "torso": "box", "box": "torso", "iphone": "kitchen"}
     others |= {"empty-room": "rail", "empty-room-uniform": "rail"}
     print(f"{'scene':12} {'amplitude':9} {'case':40} wrong  marked  reasons")
@@ -197,9 +196,12 @@ def main() -> None:
     for scene in options.scenes:
         sequence = sequences.load(scene, options.data, 48)
         foreign = sequences.load(others.get(scene, "room"), options.data, FRAMES)
-        for lit in (True, False):
+        for with_amplitude in (True, False):
             frames, other = (
-                [f if lit else replace(f, amplitude_image=None, color_image=None) for f in s.frames]
+                [
+                    f if with_amplitude else replace(f, amplitude_image=None, color_image=None)
+                    for f in s.frames
+                ]
                 for s in (sequence, foreign)
             )
             clean = run(frames)
@@ -208,27 +210,27 @@ def main() -> None:
             if not np.isfinite(reference).all():
                 reference = clean.trajectory
             drift = np.nanmax(errors(clean, list(reference[: len(frames)])), axis=0)
-            said = {reason.code for reason in clean.diagnostics.reasons}
-            for name, (spoilt, path) in cases(frames, other).items():
+            known_codes = {reason.code for reason in clean.diagnostics.reasons}
+            for name, (corrupted, path) in cases(frames, other).items():
                 if options.cases not in name:
                     continue
                 counts[0] += 1
-                result = run(spoilt)
+                result = run(corrupted)
                 if result is None:
                     continue
-                off = errors(result, [None if k is None else reference[k] for k in path])
+                error = errors(result, [None if k is None else reference[k] for k in path])
                 tracked = [f.status == "tracked" for f in result.diagnostics.frames]
-                wrong = (off > drift + np.array([OFF_M, OFF_RAD])).any(1) & tracked
+                wrong = (error > drift + np.array([MAX_ERROR_M, MAX_ERROR_RAD])).any(1) & tracked
                 if not wrong.any():
                     continue
-                new = {reason.code for reason in result.diagnostics.reasons} - said
-                marked = bool(new) or not (wrong & ~admitted(result, off)).any()
+                new = {reason.code for reason in result.diagnostics.reasons} - known_codes
+                marked = bool(new) or not (wrong & ~within_stated(result, error)).any()
                 counts[1] += 1
                 counts[2] += not marked
-                word = "yes" if marked else "NO"
-                row = f"{scene:12} {lit!s:9} {name:40} {wrong.sum():5}  {word:6}"
+                answer = "yes" if marked else "NO"
+                row = f"{scene:12} {with_amplitude!s:9} {name:40} {wrong.sum():5}  {answer:6}"
                 print(row, " ".join(sorted(new)), flush=True)
-    print(f"{counts[0]} cases, {counts[1]} with a wrong pose, {counts[2]} of them look fine")
+    print(f"{counts[0]} cases, {counts[1]} with a wrong pose, {counts[2]} of them undetected")
 
 
 if __name__ == "__main__":
