@@ -299,7 +299,7 @@ FAULTS: dict[str, tuple[str, Callable[[Frames, int], Frames], str]] = {
     "phase wrap": ("clean", wrapped, "phase_wrap"),
     "saturation": ("saturation", as_it_is, "saturated"),
     "depth smoothed across edges": ("furnished", smoothed, "flying_pixels"),
-    "somebody walks": ("moving", as_it_is, "moving_objects"),
+    "a person walks": ("moving", as_it_is, "moving_objects"),
     "moves by 0.3 of the view a frame": ("fast", as_it_is, "fast_motion"),
     "moves by 0.75 of the view a frame": ("overlap", as_it_is, "little_overlap"),
     "camera stands still": ("static", as_it_is, "static"),

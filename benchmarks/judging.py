@@ -200,9 +200,9 @@ def cases(
             if title == "good":
                 fit = d.fit
             at = np.searchsorted(recording.indices, d.ids)
-            error = displaced(poses[at], made[at], d.fit.depth_m)
+            error_m = displaced(poses[at], made[at], d.fit.depth_m)
             estimates = d.estimate_m, d.at_least_m, d.at_most_m, d.distance_m
-            yield Case(name, title, size, error, *estimates)
+            yield Case(name, title, size, error_m, *estimates)
 
 
 def corrupted(

@@ -195,8 +195,8 @@ def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
     # Error at the end, aligned at the first frame only: drift over the sequence.
     true = se3.inverse(sequence.reference[0]) @ sequence.reference
     has = np.flatnonzero(np.isfinite(poses).all((1, 2)))
-    error = se3.inverse(true[has]) @ se3.inverse(poses[has[0]]) @ poses[has]
-    metres, degrees = np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(se3.angle(error))
+    gaps = se3.inverse(true[has]) @ se3.inverse(poses[has[0]]) @ poses[has]
+    metres, degrees = np.linalg.norm(gaps[:, :3, 3], axis=1), np.degrees(se3.angle(gaps))
     per_frame = np.full((len(poses), 2), np.nan)
     per_frame[has] = np.stack([metres, degrees], 1)
     short, long = error.relative

@@ -270,7 +270,7 @@ def named(runs: Sequence[Run]) -> Iterator[str]:
 
     Only runs count whose recording is right and good without the fault, if that was run.
     """
-    yield "| what is wrong | runs | right and good | of the others, named |"
+    yield "| fault | runs | right and good | of the others, named |"
     yield "|---|---|---|---|"
     fine = {run.name: run.right and run.verdict == "good" for run in runs}
     for cause, codes in CAUSES.items():

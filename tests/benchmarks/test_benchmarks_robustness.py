@@ -371,7 +371,7 @@ def test_a_run_gives_a_row_and_what_fails_is_counted(stress, monkeypatch, capsys
     arguments = ["stress", "--scenes", "rail", "--cases", "as it is", "--threads", "1"]
     robustness.main([*arguments, "--out", str(tmp_path)])
     text = capsys.readouterr().out
-    assert "tofuse: 1 runs, 0 without a result; 100.0% of what overlaps covered" in text
+    assert "tofuse: 1 runs, 0 without a result; 100.0% of overlapping frames covered" in text
 
     def broken(*_arguments, **_options):
         raise ZeroDivisionError("oops")
