@@ -207,7 +207,7 @@ _FRAMES = (
     ("room", "Furnished room, SR4000", (1, 2, 3), "room", True),
     ("empty-room", "Empty room, SR4000", (1, 3), "room", True),
     ("flat", "Flat of four rooms, SR4000", (1, 2, 3), "flat", True),
-    ("flat-alike", "The same, rooms alike", (1, 2), "flat", True),
+    ("flat-alike", "Flat with similar rooms, SR4000", (1, 2), "flat", True),
     ("torso", "Torso alone, SR4000", (1, 2, 4), "torso", True),
     ("rail", "Rail, pico flexx", (1, 2), "rail", False),
     ("hall", "Hall, ifm O3R", (1, 2), "hall", False),

@@ -336,7 +336,7 @@ def row(name: str, some: list[Outcome]) -> str:
 
 def report(found: list[Outcome], *, kinds: bool = False) -> None:
     print(
-        "| Pairs | accepted and right | and wrong | % in the 95 % ellipsoid | radius / error"
+        "| Pairs | accepted, correct | accepted, wrong | % in the 95 % ellipsoid | radius / error"
         " | % within the bound | bound / error | error, mm | leaks |\n"
         "|---|---|---|---|---|---|---|---|---|"
     )

@@ -127,9 +127,9 @@ SCENES = {
     for scene in (
         _sim("room", "Furnished room, SR4000", "room", 8, 24),
         _sim("empty-room", "Empty room, SR4000", "empty-room", 8, 24),
-        _sim("plain-room", "Empty room, one albedo", "empty-room", 8, 24, texture=False),
+        _sim("plain-room", "Empty room, uniform albedo", "empty-room", 8, 24, texture=False),
         _sim("flat", "Flat of four rooms, SR4000", "flat", 12, 48),
-        _sim("flat-alike", "The same, rooms alike", "flat-alike", 12, 48, seed=2),
+        _sim("flat-alike", "Flat with similar rooms, SR4000", "flat-alike", 12, 48, seed=2),
         _sim("rail", "Rail, pico flexx", "rail", 40, 7, camera="pico-flexx"),
         _sim("hall", "Hall, ifm O3R", "hall", 12, 12, camera="ifm-o3r"),
         Scene("kitchen", "7-Scenes kitchen, Kinect v1", _kitchen, 2, (10, 30, 60), "kitchen"),

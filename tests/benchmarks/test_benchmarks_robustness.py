@@ -380,7 +380,7 @@ def test_a_run_gives_a_row_and_what_fails_is_counted(stress, monkeypatch, capsys
     robustness.main([*arguments, "--out", str(tmp_path)])
     text = capsys.readouterr().out
     assert "crashed: ZeroDivisionError: oops" in text
-    assert "1 without a result; 0.0% of what overlaps covered" in text
+    assert "1 without a result; 0.0% of overlapping frames covered" in text
     assert (tmp_path / "robustness_stress.json").is_file()
 
 
