@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--boards", nargs="+", choices=[*BOARDS], default=[*BOARDS])
     parser.add_argument("--methods", nargs="+", default=[], help="run only these methods")
-    parser.add_argument("--seeds", type=int, default=4, help="of each case")
+    parser.add_argument("--seeds", type=int, default=4, help="seeds per case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--scheduler")
     parser.add_argument("--fresh", action="store_true")

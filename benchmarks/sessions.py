@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument(
         "--row", type=int, help="merge this many sessions one by one, and nothing else"
     )
-    parser.add_argument("--frames", type=int, default=61, help="of each session, with --row")
+    parser.add_argument("--frames", type=int, default=61, help="frames per session, with --row")
     arguments = parser.parse_args()
     if arguments.row:
         in_a_row(arguments.row, arguments.frames, arguments.threads)

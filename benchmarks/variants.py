@@ -384,7 +384,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=MAX_FRAMES, help="maximum per recording")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of simulated recordings")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[1], help="seeds of simulated recordings"
+    )
     options = parser.parse_args(arguments)
     wanted = options.parts or ["real", "simulated"]
     print(HEAD)

@@ -293,7 +293,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--seeds", nargs="*", type=int, default=[10, 11], help="of the simulation")
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, default=[10, 11], help="seeds of the simulation"
+    )
     families = [*SCENES, INCIDENTS]
     parser.add_argument("--families", nargs="*", default=families, choices=families)
     parser.add_argument("--real", action="store_true", help="also the real recordings")

@@ -142,7 +142,7 @@ def _from_sequence(origin: Any, args: tuple[Any, ...], data: Any, where: str) ->
     if origin is tuple and not (len(args) == 2 and args[1] is Ellipsis):
         if len(data) != len(args):
             raise InputError(
-                f"has {len(data)} values", where=where, remedy=f"give {len(args)} values"
+                f"has {len(data)} values", where=where, remedy=f"use {len(args)} values"
             )
         hints = list(args)
     else:
@@ -202,4 +202,4 @@ def _plain(hint: Any, data: Any, where: str) -> Any:
     ):
         return data
     wanted = hint.__name__ if isinstance(hint, type) else str(hint)
-    raise InputError(f"is {data!r}", where=where, remedy=f"give a value of type {wanted}")
+    raise InputError(f"is {data!r}", where=where, remedy=f"use a value of type {wanted}")

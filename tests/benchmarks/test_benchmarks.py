@@ -1,4 +1,4 @@
-"""The benchmark scripts run, with no peer installed, and measure what they say."""
+"""The benchmark scripts run without peers, and their measurements are right."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Some hundreds of the fuzzed files of `benchmarks/attack.py`, and some of its power cuts."""
+"""A few hundred of the fuzzed files of `benchmarks/attack.py`, and some of its power cuts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The leaderboard: new parts are rows, and what was done is not done again."""
+"""The leaderboard: new parts become rows, and stored results are reused."""
 
 from __future__ import annotations
 

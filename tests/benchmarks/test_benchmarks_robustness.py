@@ -1,4 +1,4 @@
-"""The robustness benchmark: what counts as wrong, as marked, as a wrong join; and its cases."""
+"""The robustness benchmark: definitions of wrong poses, marked poses and wrong joins; its cases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def stress(monkeypatch, tmp_path):
 
 
 def walk(count=30):
-    """Poses (N, 4, 4) of a walk that turns."""
+    """Poses (N, 4, 4) of a walk with rotations."""
     steps = np.tile([0.0, 0.0, 0.08, 0.0, 0.05, 0.0], (count, 1))
     steps[:, 0] = 0.03 * np.sin(np.arange(count))
     poses = [np.eye(4)]
@@ -108,7 +108,7 @@ def test_frames_without_a_pose_are_not_wrong_but_not_covered(scoring) -> None:
     ],
 )
 def test_what_marks_a_wrong_pose(scoring, change, mark) -> None:
-    """One pose is off by 10 cm along x."""
+    """One pose has an error of 10 cm along x."""
     truth = walk()
     estimate = truth.copy()
     estimate[12] = moved(estimate[12], 0.10, 0, 0, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""The errors of depth from planes: made up, simulated and real."""
+"""Depth errors from planes: synthetic, simulated and real."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def test_command_writes_a_correction_that_is_applied(
 
 
 def test_real_sr4000_from_two_places_is_refused(shared_data: Path) -> None:
-    """Planes are found, but from two places in a corridor they tell no curve."""
+    """Planes are found, but from two places in a corridor they do not determine the curve."""
     recording = open_recording(shared_data / "sr4000_corridor")
     found, camera = scene_planes(recording, 4, 0)
     assert len(found) >= 16

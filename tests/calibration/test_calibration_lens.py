@@ -1,4 +1,4 @@
-"""A lens from views of a checkerboard: simulated cameras, whose lens is known."""
+"""Intrinsics from views of a checkerboard, for simulated cameras with known intrinsics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lenses from files of other programs, as these write them."""
+"""Intrinsics from files as other programs write them."""
 
 from __future__ import annotations
 
@@ -208,10 +208,10 @@ def test_ros_camera_info(tmp_path: Path, model: str, values: list[float], expect
     ("name", "text", "message"),
     [
         ("a.yaml", "nothing: here\n", "contains no known lens"),
-        ("a.m", BOUGUET.format(skew="0").replace("nx = 640;", ""), "gives no nx"),
+        ("a.m", BOUGUET.format(skew="0").replace("nx = 640;", ""), "has no nx"),
         ("a.m", BOUGUET.format(skew="0").replace("657.44", "-657.44"), "fx"),
         ("a.cal", CALLAB.format(origin="center", more="").replace("=2", "=1"), "version 1"),
-        ("a.cal", CALLAB.format(origin="middle", more=""), "give center or corner"),
+        ("a.cal", CALLAB.format(origin="middle", more=""), "use center or corner"),
         ("a.cal", CALLAB.format(origin="center", more="camera.0.s1=0.5"), "s1"),
         ("a.yaml", ROS.format(model="kannala9", count=0, values=[]), "distortion_model"),
         ("a.yaml", ROS.format(model="plumb_bob", count=1, values=[1e300]), "k1"),

@@ -1,4 +1,4 @@
-"""A camera's noise from still recordings: simulated ones, whose noise is known, and real ones."""
+"""A camera's noise from static recordings: simulated ones with known noise, and real ones."""
 
 from __future__ import annotations
 
@@ -174,8 +174,8 @@ def test_several_stretches_are_one_estimate() -> None:
     [
         (lambda: still_frames("corner", "sr4000", 8)[:2], "has 2 frames"),
         (lambda: still_frames("corner", "sr4000", 8)[:1] * 6, "repeats the same image"),
-        (lambda: [CloudFrame.of(np.eye(3))] * 5, "holds clouds"),
-        (lambda: list(simulate_recording("room", every=3, frames=3)), "nowhere static"),
+        (lambda: [CloudFrame.of(np.eye(3))] * 5, "contains clouds"),
+        (lambda: list(simulate_recording("room", every=3, frames=3)), "consecutive static frames"),
         (
             lambda: [replace(f, depth=f.depth * 1000) for f in plain_frames(np.full(80, 0.01))],
             "check depth_unit_m",

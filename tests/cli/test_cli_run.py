@@ -1,4 +1,4 @@
-"""Whole runs at the command line: exit status, output folder, what is printed, interruptions."""
+"""Whole runs at the command line: exit status, output folder, messages, interruptions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FILES = {*SAME, "report.html", "view.npz", "run.json"}
 
 @pytest.fixture(autouse=True)
 def light_report(request, monkeypatch):
-    """Leave out the report, half of the time of a run, where the test doesn't look at it."""
+    """Skip the report, half of the time of a run, if the test does not use it."""
     if "full_report" not in request.fixturenames:
         monkeypatch.setattr(run_module, "write_report_files", _stubs)
 
@@ -476,7 +476,7 @@ def torn_apart(recording, config, **_options) -> Reconstruction:
         Component(((indices[n // 2], indices[-1]),), None, None, other),
     )
     d = main_part.diagnostics
-    reason = Reason("disconnected", components[1].frames, "The recording falls into 2 parts.")
+    reason = Reason("disconnected", components[1].frames, "The recording consists of 2 parts.")
     frames = (
         *(replace(f, component=0) for f in d.frames),
         *(replace(f, component=1) for f in other.diagnostics.frames),
@@ -505,8 +505,8 @@ def test_a_part_that_nothing_connects_has_its_own_result(
     out = tmp_path / "out"
     run(room_recording, "--out", out, status=3)
     said = capfd.readouterr().out.splitlines()
-    assert "  degraded: The recording falls into 2 parts." in said
-    at = said.index("  degraded: The recording falls into 2 parts.")
+    assert "  degraded: The recording consists of 2 parts." in said
+    at = said.index("  degraded: The recording consists of 2 parts.")
     assert said[at + 1].strip() == ADVICE["disconnected"]
     assert said[-1] == f"and {out / 'component-1/report.html'}, for frames 4-7"
     assert {p.name for p in out.iterdir()} == FILES | {"component-1"}

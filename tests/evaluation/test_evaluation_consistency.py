@@ -1,4 +1,4 @@
-"""Map consistency against its definition, and what it says of good and bad poses."""
+"""Map consistency against its definition, for good and bad poses."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_images_are_compared_with_the_camera_that_a_result_was_made_with(tmp_pat
         assert alone.consistency.rms_m == pytest.approx(found[-1])
     assert found[0] == found[1] > 3 * found[2] == 3 * found[3]
     (tmp_path / "run.json").write_text(json.dumps(run | {"config": {"corrections": [7]}}))
-    with pytest.raises(InputError, match="holds no config"):
+    with pytest.raises(InputError, match="contains no config"):
         evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 
 

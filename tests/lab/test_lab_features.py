@@ -1,4 +1,4 @@
-"""Registration without a guess by points that look alike: what agrees on a motion, and images."""
+"""Feature-based registration without a guess: consensus on a motion, and images."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def test_what_both_images_contradict_is_refused(images):
 
 def test_clouds_have_no_image(images):
     cloud = CloudFrame(0, 0.0, images[0].points)
-    with pytest.raises(RegistrationError, match="is no image"):
+    with pytest.raises(RegistrationError, match="is not an image"):
         tofuse.register(cloud, cloud, method=Features())
 
 

@@ -1,4 +1,4 @@
-"""Registration by the planes of two images, and what they leave open."""
+"""Registration by the planes of two images, and their unobservable directions."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_views_without_planes_are_refused():
     with pytest.raises(RegistrationError, match=r"no plane|contradicts"):
         tofuse.register(rough, rough, method=PlaneSets(min_fraction=0.3))
     cloud = CloudFrame(0, 0.0, rough.points)
-    with pytest.raises(RegistrationError, match="is no image"):
+    with pytest.raises(RegistrationError, match="is not an image"):
         tofuse.register(cloud, cloud, method=PlaneSets())
 
 

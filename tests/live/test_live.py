@@ -1,4 +1,4 @@
-"""Cameras by their makers' packages (stand-ins), recording from them, and playing recordings."""
+"""Cameras by the manufacturers' packages (mocks), recording from them, and playing recordings."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_azure_kinect(install: Install) -> None:
     assert package.stopped == 1
     with pytest.raises(DeviceError, match="does not start"):
         device("azure-kinect", {"device": "1"}).open()
-    with pytest.raises(DeviceError, match="give 5, 15 or 30"):
+    with pytest.raises(DeviceError, match="use 5, 15 or 30"):
         device("azure-kinect", {"frame_rate_hz": "20"}).open()
 
 
@@ -174,9 +174,9 @@ def test_options_and_packages_that_are_missing(monkeypatch: pytest.MonkeyPatch) 
         device("webcam", {})
     with pytest.raises(InputError, match="unknown option 'serail'"):
         device("realsense", {"serail": "1"})
-    with pytest.raises(InputError, match="give a whole number"):
+    with pytest.raises(InputError, match="use a whole number"):
         device("realsense", {"width": "wide"})
-    with pytest.raises(InputError, match="give true or false"):
+    with pytest.raises(InputError, match="use true or false"):
         device("orbbec", {"infrared": "1"})
     for name, kind in devices().items():
         monkeypatch.setitem(sys.modules, kind.package[1], None)  # as if it weren't there

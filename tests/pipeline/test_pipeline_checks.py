@@ -209,7 +209,7 @@ def test_views_in_no_order_are_told_of_once() -> None:
     at = np.random.default_rng(1).permutation(16)
     mixed = evidence(("tracked",) * 16, steps=[(0, 0, 0, 0, 0.4 * k, 0) for k in at])
     (jumped,) = [r for r in judge(mixed)[1] if r.code == "jumped"]
-    assert "views were in no order" in jumped.text
+    assert "views were unordered" in jumped.text
 
 
 def test_every_reason_has_a_case() -> None:
@@ -278,7 +278,7 @@ def test_a_few_directions_that_are_not_held_do_not_drift() -> None:
     [
         ((0.1, 0.12, 0.3), None, "is 0.12 m, nearer than"),
         ((13.0, 30.0, 14.0), None, "is 14 m, farther than"),
-        ((6.0, 6.5, 7.0), 5.0, "is 6.5 m, but this camera's phase repeats after 5 m"),
+        ((6.0, 6.5, 7.0), 5.0, "is 6.5 m, but the camera's ambiguity range is 5 m"),
         ((6.0, 6.5, 7.0), 7.5, ""),
         ((0.25, 0.2, 11.0), None, ""),
     ],
@@ -291,7 +291,7 @@ def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) ->
     # Odometry of the same length verifies the unit, but not that the phase is unwrapped.
     sensor = SensorRecord("odometry", 8, 8, 1.0, "", metric=True)
     known = evidence(depths=depths, ambiguity_m=ambiguity_m, priors=(sensor,))
-    assert bool(judge(known)[1]) is ("phase" in words)
+    assert bool(judge(known)[1]) is ("ambiguity" in words)
 
 
 def test_repeated_images_are_one_line() -> None:
@@ -364,7 +364,9 @@ def test_a_path_is_good_within_the_tolerance() -> None:
     assert 0.01 < bound < 0.03
     (reason,) = judge(e)[1]
     assert (reason.code, reason.frames) == ("uncertain_poses", (0, 8))
-    assert f"off by {bound * 1e3:.0f} mm rms (95 % bound); the tolerance is 10 mm." in reason.text
+    assert (
+        f"may reach {bound * 1e3:.0f} mm rms (95 % bound); the tolerance is 10 mm." in reason.text
+    )
     assert "Frame " in reason.text
     assert codes(replace(e, diagonal_m=201 * bound)) == []
     assert codes(replace(e, diagonal_m=199 * bound)) == ["uncertain_poses"]
@@ -440,7 +442,7 @@ def test_reasons_are_merged_and_sorted() -> None:
 def test_disconnected_parts_are_named() -> None:
     (reason,) = judge(CASES["disconnected"])[1]
     assert reason.ranges == ((7, 8),)
-    text = "The recording falls into 2 disconnected parts: frames 0-6, 7-8; no overlap found."
+    text = "The recording consists of 2 disconnected parts: frames 0-6, 7-8; no overlap found."
     assert reason.text == text
     (bridged,) = judge(CASES["bridged_gap"])[1]
     text = "Frames 5-8 are connected to the rest by extrapolated motion only."
@@ -472,7 +474,7 @@ def test_of_many_parts_the_largest_are_named() -> None:
     others = [apart((k, k + 1)) for k in range(10, 26, 2)]
     reasons = judge(in_components(*others, frames=26))[1]
     (reason,) = [r for r in reasons if r.code == "disconnected"]
-    assert "falls into 9 disconnected parts: frames 0-9, " in reason.text
+    assert "consists of 9 disconnected parts: frames 0-9, " in reason.text
     assert "and 3 smaller; no overlap found." in reason.text
 
 
@@ -518,7 +520,7 @@ def test_moving_objects_and_doubtful_frames_are_told() -> None:
 def test_loops_given_by_hand_are_listed_once() -> None:
     pairs = [(0, k) for k in range(1, 9)]
     (reason,) = judge(evidence(rejected=pairs, given=pairs))[1]
-    assert reason.text.startswith("8 loops given by hand were not used: 0-1 (only 3% ")
+    assert reason.text.startswith("8 given loop closures were not used: 0-1 (only 3% ")
     assert reason.text.endswith("and 2 more.")
     (one,) = judge(CASES["loop_rejected"])[1]
     assert one.ranges == ((1, 1), (7, 7))

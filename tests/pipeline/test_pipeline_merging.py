@@ -1,4 +1,4 @@
-"""Several sessions in one map: joined where they overlap, kept apart and named where they don't."""
+"""Several sessions in one map: joined if they overlap, otherwise separate and reported."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def both(results):
 
 
 def copied(folder: Path, to: Path) -> Path:
-    """A result beside its recording, elsewhere."""
+    """A result next to its recording, in another folder."""
     shutil.copytree(folder, to / "out")
     return to / "out"
 
@@ -248,7 +248,7 @@ def test_results_of_clouds_are_refused(results, tmp_path) -> None:
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
     changed_run_json(again, input=run["input"])
-    refused([results["here"], again], "clouds", "give their clouds together")
+    refused([results["here"], again], "clouds", "pass their clouds together")
 
 
 def test_a_result_that_knows_its_recording_by_the_path_alone(results, tmp_path) -> None:

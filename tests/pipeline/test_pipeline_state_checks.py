@@ -1,4 +1,4 @@
-"""States whose sums are right and whose contents are not: forged, or of another recording."""
+"""States with valid checksums and invalid contents: forged, or of another recording."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ FORGED: dict[str, tuple[str, Callable[[Any], None], str]] = {
     "a pose of whole numbers": (
         "tracking",
         lambda t: put(step(t), "T_component_camera", np.eye(4, dtype=int)),
-        "is no array of f8",
+        "is not an array of f8",
     ),
     "a mesh without its vertices": (
         "fusion",
@@ -114,7 +114,7 @@ def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
 
 
 def test_what_was_put_away_is_looked_at_too(kept: Kept) -> None:
-    """Views that memory can't hold are bytes in a file, and their shapes lie beside."""
+    """Views that exceed the memory budget are bytes in a file, with their shapes."""
     view = kept.load("tracking").mapper.views[0].view
     spill: Spill[PreparedView] = Scratch(0).part(1.0)
     for _ in range(2):
@@ -157,7 +157,7 @@ def test_what_is_of_another_recording_is_refused(
 
 
 def test_all_that_is_listed_takes_part_in_a_run(kept: Kept) -> None:
-    """Else a class was renamed, and nobody looks at it any more."""
+    """Otherwise a class was renamed and is no longer checked."""
     from tofuse.pipeline import state_checks
 
     told = "".join(nodes for nodes, _ in kept.states.values())

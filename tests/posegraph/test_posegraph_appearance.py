@@ -1,4 +1,4 @@
-"""Loops found by how views look, where the trajectory has drifted too far to tell."""
+"""Loop detection by appearance, after large drift."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def room(yaw, index, *, half=(2.5, 1.2, 2.0), boxes=BOXES, spots=60, noise=0.004
 
 
 def turning(count, step, **options):
-    """Surfaces and true poses of a camera that turns on the spot by `step` at a time."""
+    """Surfaces and true poses of a camera that rotates on the spot in increments of `step`."""
     xi = np.zeros((count, 6))
     xi[:, 4] = step * np.arange(count)
     views = [
@@ -79,7 +79,7 @@ def turning(count, step, **options):
 
 
 def drifted(truth, degrees):
-    """The same path, with a turn added evenly: more than any covariance of it would say."""
+    """The same path with additional rotation drift, far beyond its covariance."""
     T = [truth[0]]
     wrong = se3.exp(np.array([0, 0, 0, 0, np.radians(degrees) / (len(truth) - 1), 0]))
     for k in range(1, len(truth)):
@@ -119,7 +119,7 @@ def test_a_loop_is_closed_where_the_trajectory_is_45_degrees_off(once_round):
         gap = se3.inverse(true) @ c.T_i_j
         assert np.linalg.norm(gap[:3, 3]) < 0.04
         assert np.degrees(se3.angle(gap)) < 1.5
-        assert "looks alike" in c.record.reason
+        assert "looks similar" in c.record.reason
         assert np.linalg.eigvalsh(c.information).min() > 0
 
 
@@ -127,7 +127,7 @@ def test_a_room_that_looks_the_same_four_times_gives_no_false_loop():
     """Square, bare: each wall looks like the one before, and a pose that fits is found."""
     views, truth = turning(12, np.radians(22.5), half=(2.0, 1.2, 2.0), boxes=[], spots=0)
     asked = found_in(views, truth, Appearance(pairs=2, min_difference=0.02))
-    alike = [c for c in asked if "looks alike" in c.record.reason]
+    alike = [c for c in asked if "looks similar" in c.record.reason]
     assert len(alike) >= 2  # they do look alike
     assert sum("can't have drifted that far" in c.record.reason for c in alike) >= 2
     assert not any(c.record.accepted for c in asked)
@@ -135,7 +135,7 @@ def test_a_room_that_looks_the_same_four_times_gives_no_false_loop():
 
 
 def test_what_would_need_too_much_drift_is_another_place(once_round):
-    """The same views, but the trajectory says that the camera hardly turned at all."""
+    """The same views, with a trajectory in which the camera hardly rotates."""
     views, truth = once_round
     still = truth.copy()
     still[:] = se3.exp(np.linspace(0, 1, len(truth))[:, None] * np.array([0.1, 0, 0, 0, 3.0, 0]))

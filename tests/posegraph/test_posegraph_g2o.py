@@ -1,4 +1,4 @@
-"""g2o files: what is written comes back, and what can't be meant is refused in one line."""
+"""g2o files: round trip, and one-line errors for invalid files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_fixed_vertices_comments_and_order_are_tolerated(tmp_path):
         (VERTICES.replace("7 1", "7 inf"), 2, "not finite"),
         (VERTICES.replace("0.6", "0.1"), 2, "quaternion has length 0.8062"),
         (VERTICES.replace("0.6 0.8", "0 0"), 2, "quaternion has length 0"),
-        (VERTICES.replace("0.6", "x"), 2, "no number"),
+        (VERTICES.replace("0.6", "x"), 2, "not a number"),
         (VERTICES.replace("QUAT 7", "QUAT 7.5"), 2, "not a whole number"),
         (VERTICES.replace(" 0.8", ""), 2, "has 7 numbers, not 8"),
         (VERTICES + EDGE.rsplit(" ", 1)[0], 3, "has 29 numbers, not 30"),

@@ -1,4 +1,4 @@
-"""Loops: which cameras may see each other again, and what confirms it (section 3.4)."""
+"""Loop closure: candidates, and their verification (section 3.4)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def pose(x: float = 0.0, z: float = 0.0, *, heading: float = 0.0, pitch: float =
 
 
 def turning(n: int) -> Float64:
-    """A camera that turns once on the spot, and n / 4 frames more."""
+    """A camera that rotates once on the spot, and n / 4 frames more."""
     return np.array([pose(heading=2 * np.pi * k / n) for k in range(n + n // 4)])
 
 
@@ -73,7 +73,7 @@ def test_a_full_turn_meets_its_beginning_and_nothing_else():
 
 @dataclass(frozen=True)
 class Scripted:
-    """A registrar that finds what it is told to, by how far its guess is from the truth."""
+    """A registrar with scripted results, by the error of its guess."""
 
     truth: Float64
     reach: float = 1.0
@@ -247,8 +247,8 @@ def test_loops_given_in_a_file(tmp_path):
         ("-1 4", "joins frames -1 and 4"),
         ("1 99", "there is no frame 99"),
         ("3 0", "is given twice"),
-        ("1 2 0 0 0 0 0 0 0", "is no rigid motion"),
-        ("1 2 nan 0 0 0 0 0 1", "is no rigid motion"),
+        ("1 2 0 0 0 0 0 0 0", "is not a rigid motion"),
+        ("1 2 nan 0 0 0 0 0 1", "is not a rigid motion"),
         ("1 2 0 0 0 0 0 x 1", "is not understood"),
     ],
 )

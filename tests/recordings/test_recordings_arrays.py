@@ -1,4 +1,4 @@
-"""NumPy archives, Pico Zense folders, and sources of one's own."""
+"""NumPy archives, Pico Zense folders, and custom sources."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_zense(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.z[1:], made.COUNTS[1, 1:] * 0.001, rtol=1e-6)
     path = tmp_path / "scan" / "camera.toml"
     path.write_text(path.read_text().replace("camera_cy = 5.5", ""))
-    with pytest.raises(InputError, match=r"camera\.toml: camera_cy: is missing; give a number"):
+    with pytest.raises(InputError, match=r"camera\.toml: camera_cy: is missing; use a number"):
         open_recording(tmp_path / "scan")
 
 

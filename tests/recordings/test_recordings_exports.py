@@ -1,4 +1,4 @@
-"""What viewers of ToF cameras export: a point for each pixel, TIFF images; and what none reads."""
+"""Exports of ToF viewers: organised clouds, TIFF images; and unsupported files."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_other_tiffs_are_depth_when_asked_for(tmp_path: Path) -> None:
     counts[0, 0] = 65535
     cv2.imwrite(str(folder / "depth_1.tiff"), counts)
     cv2.imwrite(str(folder / "confidence_1.tiff"), counts)
-    with pytest.raises(InputError, match="give --format tiff and --camera"):
+    with pytest.raises(InputError, match="use --format tiff and --camera"):
         open_recording(folder)
     camera = camera_json(tmp_path, depth_unit_m=1e-4, depth_kind="z")
     frame = open_recording(folder, format="tiff", camera=camera)[0]

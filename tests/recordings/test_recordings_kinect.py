@@ -101,7 +101,7 @@ def test_sizes_need_not_be_known_nor_the_mode_told(tmp_path: Path) -> None:
 
 
 def test_color_is_registered_and_hidden_points_have_none(tmp_path: Path) -> None:
-    """A near strip hides from the colour camera what the depth camera sees beside it."""
+    """A near strip occludes for the colour camera what the depth camera sees next to it."""
     depth = np.full((1, 288, 320), 2000, np.uint16)
     depth[:, :, 150:170] = 500
     v, u = np.mgrid[:720, :1280]
@@ -157,7 +157,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only infrared"):
         open_recording(path)
     made.make_mkv(path, depth, without="calibration")
-    with pytest.raises(InputError, match=r"calibration\.json: is missing; give .* --camera"):
+    with pytest.raises(InputError, match=r"calibration\.json: is missing; pass .* --camera"):
         open_recording(path)
     camera = {"schema": 1, "model": "pinhole", "width": 320, "height": 288, "fx": 250, "fy": 250}
     camera |= {"cx": 160, "cy": 144, "depth_unit_m": 0.001, "depth_kind": "z"}

@@ -232,14 +232,14 @@ def test_unknown_keys_warn(tmp_path: Path) -> None:
         ({"model": "hexagonal"}, "model: is 'hexagonal'; write one of pinhole"),
         ({"model": ["pinhole"]}, "model: is"),
         ({"model": "rays"}, "no rays.npy"),
-        ({"width": 41}, "40 x 30 pixels, camera.json says 41 x 30"),
+        ({"width": 41}, "40 x 30 pixels, camera.json states 41 x 30"),
         ({"width": 40.5}, "width: is 40.5"),
         ({"height": "30"}, "height: is '30'"),
         ({"height": -1}, "height: is -1"),
         ({"width": 10**9}, "width"),
-        ({"fx": None}, "fx: is missing; give a positive number"),
-        ({"fx": float("nan")}, "fx: is nan; give a finite"),
-        ({"cy": float("inf")}, "cy: is inf; give a finite"),
+        ({"fx": None}, "fx: is missing; use a positive number"),
+        ({"fx": float("nan")}, "fx: is nan; use a finite"),
+        ({"cy": float("inf")}, "cy: is inf; use a finite"),
         ({"fx": 10**400}, "fx: is inf"),
         ({"fy": 0}, "fy: is 0"),
         ({"fy": True}, "fy: is True"),
@@ -399,7 +399,7 @@ def test_camera_of_other_images(tmp_path: Path) -> None:
     # The first image is cut off: the next readable one decides.
     (folder / "depth" / "000000.png").write_bytes(b"\x89PNG")
     edit(folder, width=80)
-    with pytest.raises(InputError, match=r"camera.json says 80 x 30") as caught:
+    with pytest.raises(InputError, match=r"camera.json states 80 x 30") as caught:
         NativeSource(folder)
     assert not isinstance(caught.value, UnreadableFrameError)
 

@@ -101,7 +101,7 @@ def test_limits_of_depth(tmp_path: Path) -> None:
     for limits in ({"min_depth": -1.0}, {"max_depth": float("nan")}):
         with pytest.raises(InputError, match="depth"):
             open_recording(folder, **limits)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="smaller first"):
+    with pytest.raises(InputError, match="smaller one first"):
         open_recording(folder, min_depth=2.0, max_depth=1.0)
 
 

@@ -251,7 +251,7 @@ def test_realsense_color_is_that_of_each_point(
 
 
 def test_realsense_color_through_an_inverse_lens(tmp_path: Path) -> None:
-    """The lens is told from pixels to rays; it must bring each ray back to its pixel."""
+    """The lens maps pixels to rays; projection must map each ray back to its pixel."""
     k = (0.12, -0.05, 0.002, -0.001, 0.01)
     name = "Intel RealSense D455"
     path = real_sense(tmp_path, "ros2", "None", name=name, color="rgb8", distortion=k)
@@ -315,7 +315,7 @@ def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
-    with pytest.raises(InputError, match=r"has no CameraInfo for .*; give .* --camera"):
+    with pytest.raises(InputError, match=r"has no CameraInfo for .*; pass .* --camera"):
         open_recording(bag.close())
     (tmp_path / "b").mkdir()
     bag = Bag(tmp_path / "b", "ros1")

@@ -1,4 +1,4 @@
-"""Files of Arducam's and Analog Devices' cameras, made by their published layouts."""
+"""Files of Arducam's and Analog Devices' cameras, in their published layouts."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_arducam_without_a_camera(tmp_path: Path) -> None:
     made_tof.make_arducam(tmp_path / "scan")
     camera = tmp_path / "camera.json"
     shutil.move(tmp_path / "scan" / "camera.json", camera)
-    with pytest.raises(InputError, match="give --format arducam with --camera: lens and unit"):
+    with pytest.raises(InputError, match="use --format arducam with --camera: lens and unit"):
         open_recording(tmp_path / "scan")
     with pytest.raises(InputError, match="contain neither lens nor unit"):
         open_recording(tmp_path / "scan", format="arducam")
@@ -148,7 +148,7 @@ def test_aditof_one_frame_a_file(tmp_path: Path) -> None:
 def test_aditof_without_points(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"".join(adi_frame(k, points=False) for k in range(3)))
-    with pytest.raises(InputError, match=r"has no points .* give the lens by --camera") as error:
+    with pytest.raises(InputError, match=r"has no points .* pass the lens with --camera") as error:
         open_recording(path)
     assert len(str(error.value).splitlines()) == 1
     about = {"schema": 1, "model": "rational", "width": 64, "height": 48, "depth_unit_m": 0.001}

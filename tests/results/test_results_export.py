@@ -1,4 +1,4 @@
-"""Results in other formats, read back by libraries that are not ours."""
+"""Results in other formats, read back by third-party libraries."""
 
 from __future__ import annotations
 
@@ -408,7 +408,7 @@ def test_by_the_command_line(result: Path, tmp_path: Path, capsys) -> None:
 
 def test_what_is_not_there(result: Path, monkeypatch) -> None:
     (result / "mesh.ply").unlink()
-    with pytest.raises(InputError, match="clouds without a camera model give no surface"):
+    with pytest.raises(InputError, match="clouds without a camera model have no surface"):
         export(result, ["obj"])
     monkeypatch.setitem(__import__("sys").modules, "pye57", None)
     with pytest.raises(InputError, match=r"needs the package pye57; pip install 'tofuse\[scan\]'"):

@@ -191,7 +191,7 @@ class BatchFolder:
 
 def _record_of(data: Any) -> Record:
     if not isinstance(data, dict):
-        raise ValueError("it is no table")
+        raise ValueError("it is not a table")
     known = {f.name for f in fields(Record)}
     record = Record(**{name: value for name, value in data.items() if name in known})
     if record.state not in get_args(State):

@@ -48,7 +48,7 @@ class Board:
             raise InputError(
                 f"has squares of {self.square_m} m",
                 where="--board",
-                remedy="give the side of a square in m",
+                remedy="set the side of a square in m",
             )
 
     @classmethod
@@ -69,7 +69,7 @@ class Board:
         raise InputError(
             f"is {text!r:.60}",
             where="--board",
-            remedy="give inner corners and metres of a square, such as 8x6:0.1",
+            remedy="use inner corners and metres of a square, such as 8x6:0.1",
         )
 
     @property

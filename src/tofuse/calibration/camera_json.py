@@ -71,12 +71,12 @@ def write_camera_json(
     table = path.with_name("rays.npy")
     files = [table, path] if isinstance(camera, RayTable) else [path]
     if not overwrite and (there := [file for file in files if file.exists()]):
-        raise OutputError("exists already", where=there[0], remedy="give --overwrite to replace it")
+        raise OutputError("exists already", where=there[0], remedy="use --overwrite to replace it")
     if table.exists() and table not in files:
         raise OutputError(
             "would override the lens that is written to the same folder",
             where=table,
-            remedy="move it away, or give --out in another folder",
+            remedy="move it away, or choose an --out in another folder",
         )
     fields = {"schema": SCHEMA} | camera_fields(camera)
     content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
@@ -100,6 +100,6 @@ def check_new(path: Path, *, overwrite: bool) -> None:
         If it is a folder.
     """
     if is_folder(path):
-        raise InputError("is a folder", where="--out", remedy="give a file, such as camera.json")
+        raise InputError("is a folder", where="--out", remedy="pass a file, such as camera.json")
     if path.exists() and not overwrite:
-        raise OutputError("exists already", where=path, remedy="give --overwrite to replace it")
+        raise OutputError("exists already", where=path, remedy="use --overwrite to replace it")

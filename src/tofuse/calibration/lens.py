@@ -146,7 +146,7 @@ def board_views(
             raise InputError(
                 f"frame {item.index} has no {image} on the pixels of its depth",
                 where=recording.path,
-                remedy=f"give --image {other}, or record it",
+                remedy=f"use --image {other}, or record it",
             )
         camera = camera or item.camera
         corners = find_corners(seen, board)

@@ -111,7 +111,7 @@ def _mat_values(path: Path) -> dict[str, list[float]]:
         raise InputError(
             f"can't be read as a .mat file ({error})",
             where=path,
-            remedy="save it by the toolbox again, with -v7 or older, or give Calib_Results.m",
+            remedy="save it by the toolbox again, with -v7 or older, or pass Calib_Results.m",
         ) from error
 
 
@@ -119,14 +119,14 @@ def _bouguet(values: dict[str, list[float]], path: Path) -> LensFile:
     for name, count in (("fc", 2), ("cc", 2), ("nx", 1), ("ny", 1)):
         if len(values.get(name, [])) != count:
             raise InputError(
-                f"gives no {name}", where=path, remedy="save the results of the toolbox again"
+                f"has no {name}", where=path, remedy="save the results of the toolbox again"
             )
     k = values.get("kc", [])
     if len(k) > 5:
         raise InputError(
             f"has {len(k)} distortion coefficients",
             where=f"{path}: kc",
-            remedy="give the results of a perspective lens, [k1 k2 p1 p2 k3]",
+            remedy="pass the results of a perspective lens, [k1 k2 p1 p2 k3]",
         )
     skew = (values.get("alpha_c") or [0.0])[0] * values["fc"][0]
     size = _size(values["nx"][0], values["ny"][0], path)
@@ -149,7 +149,7 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
     origin = pairs.get("origin", "center")
     if origin not in ("center", "corner"):
         raise InputError(
-            f"is {origin!r:.60}", where=f"{path}: origin", remedy="give center or corner"
+            f"is {origin!r:.60}", where=f"{path}: origin", remedy="use center or corner"
         )
     cameras = sorted({int(k.split(".")[1]) for k in pairs if re.fullmatch(r"camera\.\d+\.A", k)})
     prefix = "camera."
@@ -165,7 +165,7 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
             raise InputError(
                 f"contains no camera {chosen}",
                 where=path,
-                remedy=f"give --index {' or '.join(map(str, cameras))}",
+                remedy=f"use --index {' or '.join(map(str, cameras))}",
             )
         prefix = f"camera.{chosen}."
     own = {k.removeprefix(prefix): _numbers(v) for k, v in pairs.items() if k.startswith(prefix)}
@@ -180,7 +180,7 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
     matrix = own.get("A", [])
     if len(matrix) != 9:
         raise InputError(
-            "is no 3x3 matrix", where=f"{path}: {prefix}A", remedy="write nine numbers"
+            "is not a 3x3 matrix", where=f"{path}: {prefix}A", remedy="write nine numbers"
         )
     width, height = (_one(own, name, f"{path}: {prefix}{name}") for name in ("width", "height"))
     size = _size(width, height, path)
@@ -279,14 +279,14 @@ def _number(text: str) -> float:
 def _one(values: dict[str, list[float]], name: str, where: str) -> float:
     found = values.get(name, [])
     if len(found) != 1:
-        raise InputError("is missing", where=where, remedy="give a number")
+        raise InputError("is missing", where=where, remedy="use a number")
     return found[0]
 
 
 def _size(width: float, height: float, path: Path) -> tuple[int, int]:
     if not (2 <= width <= 16384 and 2 <= height <= 16384):
         raise InputError(
-            f"is {width:g} x {height:g}", where=f"{path}: image size", remedy="give pixels"
+            f"is {width:g} x {height:g}", where=f"{path}: image size", remedy="state it in pixels"
         )
     return round(width), round(height)
 
@@ -312,20 +312,20 @@ def _lens(
     extra = k[len(order) :]
     if not np.isfinite(extra).all() or len(k) > 14:
         raise InputError(
-            f"has {len(k)} distortion coefficients", where=path, remedy="give 14 at most"
+            f"has {len(k)} distortion coefficients", where=path, remedy="use 14 at most"
         )
     if any(extra) and model == "fisheye":
         raise InputError(
             f"has {len(k)} distortion coefficients for a fisheye lens",
             where=path,
-            remedy="give four",
+            remedy="use four",
         )
     if any(extra):
         table = _opencv_rays(camera, skew, k)
         return table, ("thin prism or tilted sensor: the lens becomes a table of rays",)
     if abs(skew) * size[1] / camera.fy > _NO_SKEW_PX:
         if not abs(skew) <= camera.fx:
-            raise InputError(f"is {skew}", where=f"{path}: skew", remedy="give 0, or pixels")
+            raise InputError(f"is {skew}", where=f"{path}: skew", remedy="use 0, or pixels")
         return _skewed_rays(camera, skew), (
             f"a skew of {skew:.3g} px: the lens becomes a table of rays",
         )

@@ -63,7 +63,7 @@ class NoiseFit:
     law
         The law that applies to frames of this recording.
     frames, stretches, pixels
-        Numbers of frames in static stretches, of stretches, and of pixels in all stretches.
+        Numbers of frames in static segments, of segments, and of pixels in all segments.
     rms_log_error
         Rms, over the bins, of the log ratio of predicted to measured sigma: 0.1 is about 10 %.
     before
@@ -136,7 +136,7 @@ class _Samples:
 
 
 def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
-    """Fit a noise model to the static stretches of a recording.
+    """Fit a noise model to the static segments of a recording.
 
     In each stretch of at least three frames the variance over time of each pixel's range is
     computed, and the medians of these over bins of raw amplitude, confidence and range, which are
@@ -157,7 +157,7 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     """
     if not isinstance(_first_frame(recording), RangeFrame):
         raise InputError(
-            "holds clouds", where=recording.path, remedy="give a recording of depth images"
+            "contains clouds", where=recording.path, remedy="pass a recording of depth images"
         )
     prior = noise_model_for(recording)
     stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= MIN_FRAMES]
@@ -200,7 +200,7 @@ def _not_still(recording: Recording) -> InputError:
             remedy="record ten frames or more with the camera on a stand",
         )
     return InputError(
-        f"is nowhere static for {MIN_FRAMES} frames",
+        f"has no {MIN_FRAMES} consecutive static frames",
         where=recording.path,
         remedy="record ten frames or more with the camera on a stand, nothing moving",
     )
@@ -505,7 +505,7 @@ def _log_error(predicted: Float64, bins: _Binned) -> float:
 def _warnings(recording: Recording, samples: _Samples, frames: int, error: float) -> list[str]:
     out = []
     if frames < len(recording):
-        out.append(f"{frames} of {len(recording)} frames are in static stretches")
+        out.append(f"{frames} of {len(recording)} frames are in static segments")
     if not _has_range_variation(samples):
         low, high = np.quantile(samples.range_m, _MOST)
         out.append(f"ranges of {low:.2f} to {high:.2f} m only: the noise at others is extrapolated")

@@ -88,7 +88,7 @@ def board_planes(
             raise InputError(
                 f"frame {frame.index} has no {image} on the pixels of its depth",
                 where=recording.path,
-                remedy="give --image, or omit --board to use planes of the scene",
+                remedy="use --image, or omit --board to use planes of the scene",
             )
         corners = find_corners(seen, board)
         found = None if corners is None else board_pose(frame.camera, corners, board)

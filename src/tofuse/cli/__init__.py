@@ -1,7 +1,7 @@
 """The command line.
 
 Exit status: 0, a result was written and every readable frame has a pose; 3, a result was written
-but some readable frame has none; 2, nothing was written: one line on stderr says why. Of
+but some readable frame has none; 2, nothing was written: one line on stderr states the reason. Of
 `register`: 0, the pose is accepted; 3, it is rejected or cannot be verified. Terminated by a
 signal: 130 or 143; output to a closed pipe: 141; a bug in the program: 1.
 """

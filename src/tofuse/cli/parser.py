@@ -19,7 +19,7 @@ EXPORTS = (
     *("kitti", "log", "nerfstudio", "colmap"),
 )
 
-_NOTHING = "nothing was written: one line on stderr says why"
+_NOTHING = "nothing was written: one line on stderr states the reason"
 
 
 def _exit_status(zero: str, three: str, two: str = _NOTHING) -> str:
@@ -38,7 +38,7 @@ command again to resume.
 """ + _exit_status(
     "every recording has a result, and every readable frame has a pose",
     "some recording has no result, or some readable frame has no pose",
-    "there is no result: one line on stderr says why",
+    "there is no result: one line on stderr states the reason",
 )
 _REGISTER = """\
 A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
@@ -51,7 +51,7 @@ a recording, counting from 0.
 _JUDGE = _exit_status(
     "the poses were assessed",
     "the depth images contradict the poses",
-    "nothing was assessed: one line on stderr says why",
+    "nothing was assessed: one line on stderr states the reason",
 )
 _MERGE = """\
 A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
@@ -73,7 +73,7 @@ frame.
 _CHECK_RIG = _exit_status(
     "no camera has moved",
     "some camera has moved, or cannot be checked",
-    "nothing could be checked: one line on stderr says why",
+    "nothing could be checked: one line on stderr states the reason",
 )
 
 
@@ -244,7 +244,7 @@ def _run(commands: Any) -> None:
     g.add_argument(
         "--average-still",
         action="store_true",
-        help="average static stretches into one frame each",
+        help="average static segments into one frame each",
     )
     g.add_argument("--min-depth", type=_metres, metavar="M", help="discard points closer than this")
     g.add_argument(

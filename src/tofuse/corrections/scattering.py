@@ -56,7 +56,7 @@ class LensScattering(Bounded, Correction):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.widths:
-            raise ValueError("widths is empty: give one or more")
+            raise ValueError("widths is empty: set one or more")
         if not all(width in Bounds(0.005, 2) and width > 0.005 for width in self.widths):
             raise ValueError(f"widths is {self.widths}, not each above 0.005 and at most 2")
         if self.fractions is not None:

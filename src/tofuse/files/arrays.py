@@ -65,7 +65,7 @@ def read_npz(
     try:
         if not is_file(Path(path)):
             path.stat() if isinstance(path, Path) else Path(path).stat()
-            raise InputError("is not a regular file", where=path, remedy="give a file")
+            raise InputError("is not a regular file", where=path, remedy="pass a file")
         with zipfile.ZipFile(path) as archive:
             return _read(archive, limit, only, without)
     except OSError as error:

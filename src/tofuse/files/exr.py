@@ -142,7 +142,7 @@ def _header(data: bytes, path: str | Path) -> _Header:
         raise InputError(
             f"declares {width} x {height} pixels",
             where=path,
-            remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
+            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
     return _Header(width, height, top, compression, _channels(attributes["channels"], path), at)
 

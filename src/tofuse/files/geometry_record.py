@@ -87,7 +87,7 @@ class GeometryRecord:
                 raise InputError(
                     f"{name} of shape {np.shape(values)} for {n} points",
                     where=path,
-                    remedy=f"give an array of shape {shape}",
+                    remedy=f"pass an array of shape {shape}",
                 )
         faces = self.faces
         if faces is None:
@@ -96,5 +96,5 @@ class GeometryRecord:
             raise InputError(
                 f"faces of shape {faces.shape} don't fit {n} points",
                 where=path,
-                remedy="give (M, 3) vertex indices",
+                remedy="pass (M, 3) vertex indices",
             )

@@ -67,7 +67,7 @@ def _header(data: bytes, path: str | Path) -> ImageHeader:
         raise InputError(
             f"declares {header.width} x {header.height} pixels",
             where=path,
-            remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
+            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
     return header
 
@@ -221,7 +221,7 @@ def png_bytes(image: NDArray[np.generic]) -> bytes:
         raise InputError(
             f"is an array of shape {image.shape} and type {image.dtype}",
             where="image",
-            remedy="give (H, W) uint8 or uint16, or (H, W, 3) uint8",
+            remedy="pass (H, W) uint8 or uint16, or (H, W, 3) uint8",
         )
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])

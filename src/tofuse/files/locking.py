@@ -199,7 +199,7 @@ def _refusal(what: str | Path, holder: dict[str, Any]) -> OutputError:
     return OutputError(
         f"is being written by another process ({who})",
         where=what,
-        remedy="wait until it is done, or give another folder",
+        remedy="wait until it is done, or choose another folder",
     )
 
 

@@ -236,7 +236,7 @@ def _invalid_plan(path: Path, why: object) -> OutputError:
     return OutputError(
         f"was not left by this program, or has changed since ({why}); nothing was touched",
         where=path,
-        remedy=f"move {path.parent.name} away if it is not yours, or give another --out",
+        remedy=f"move {path.parent.name} away if it is not yours, or choose another --out",
     )
 
 
@@ -316,7 +316,7 @@ def check_error(path: Path) -> OutputError:
     return OutputError(
         "is not a file of an earlier result",
         where=path,
-        remedy="move it away, or give another --out",
+        remedy="move it away, or choose another --out",
     )
 
 

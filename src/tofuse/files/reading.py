@@ -29,7 +29,7 @@ _REASONS = {
     errno.EACCES: ("may not be read (permission denied)", "change its permissions"),
     errno.EPERM: ("may not be read (permission denied)", "change its permissions"),
     errno.ELOOP: ("is a link that leads back to itself", "replace the link"),
-    errno.EISDIR: ("is a folder", "give a file"),
+    errno.EISDIR: ("is a folder", "pass a file"),
     errno.ENOTDIR: ("is inside something that is not a folder", "check the path"),
     errno.ENAMETOOLONG: ("has too long a name", "check the path"),
 }
@@ -55,7 +55,7 @@ def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
     try:
         if path.exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "not a regular file"
-            raise InputError(f"is {kind}", where=path, remedy="give a file")
+            raise InputError(f"is {kind}", where=path, remedy="pass a file")
         size = path.stat().st_size
         if size > limit:
             raise InputError(
@@ -75,7 +75,7 @@ def read_head(path: str | Path, size: int) -> bytes:
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
-            raise InputError("is not a regular file", where=path, remedy="give a file")
+            raise InputError("is not a regular file", where=path, remedy="pass a file")
         with path.open("rb") as file:
             return file.read(size)
     except OSError as error:

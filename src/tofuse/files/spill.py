@@ -356,5 +356,5 @@ def _no_room(error: OSError, where: Path) -> OutputError:
     return OutputError(
         f"temporary data {cause.problem}",
         where=where,
-        remedy="free some space there, name another folder in TMPDIR, or give more --memory",
+        remedy="free some space there, name another folder in TMPDIR, or increase --memory",
     )

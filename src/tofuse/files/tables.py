@@ -80,12 +80,12 @@ def read_columns(path: str | Path) -> dict[str, Float64]:
             raise InputError(
                 f"has {len(row)} cells in row {k + 1} and {len(names)} column names",
                 where=path,
-                remedy="give each row a cell for each column",
+                remedy="add a cell for each column to each row",
             )
         try:
             values[k] = [float(cell) if cell.strip() else np.nan for cell in row]
         except ValueError as error:
-            raise InputError(f"row {k + 1}: {error}", where=path, remedy="give numbers") from error
+            raise InputError(f"row {k + 1}: {error}", where=path, remedy="use numbers") from error
     return {name: values[:, k] for k, name in enumerate(names)}
 
 

@@ -82,7 +82,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
         raise InputError(
             f"declares {width} x {height} pixels",
             where=path,
-            remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
+            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
     if channels != 1:
         raise InputError(f"has {channels} channels", where=path, remedy="store one channel")

@@ -77,7 +77,7 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
         raise InputError(
             f"{times.shape} timestamps and poses of shape {T.shape}",
             where="trajectory",
-            remedy="give (N,) and (N, 4, 4)",
+            remedy="pass (N,) and (N, 4, 4)",
         )
     known = np.isfinite(T).all((1, 2))
     times, T = times[known], T[known]

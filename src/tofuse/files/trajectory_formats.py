@@ -117,7 +117,7 @@ def read_poses(path: str | Path) -> TimedPoses:
         return _transforms(text, path)
     rows = list(_rows(text))
     if not rows:
-        raise InputError("contains no poses", where=path, remedy=f"give {_KNOWN}")
+        raise InputError("contains no poses", where=path, remedy=f"use {_KNOWN}")
     return _reader(rows, path)(rows, path)
 
 
@@ -142,7 +142,7 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
     raise InputError(
         f"is not a trajectory of a known format: its first line has {count} columns",
         where=path,
-        remedy=f"give {_KNOWN}",
+        remedy=f"use {_KNOWN}",
     )
 
 
@@ -259,7 +259,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
         raise InputError(f"is not valid JSON ({error})", where=path) from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError("has no list 'frames'", where=path, remedy=f"give {_KNOWN}")
+        raise InputError("has no list 'frames'", where=path, remedy=f"use {_KNOWN}")
     poses, names = [], []
     for k, frame in enumerate(frames):
         where = f"{path}, frame {k}"

@@ -84,6 +84,6 @@ class FittedBackground(Background):
                 f"is {frame.depth.shape[1]} x {frame.depth.shape[0]}, the background "
                 f"{columns} x {rows}",
                 where=f"frame {frame.index}",
-                remedy="give images of one size",
+                remedy="use images of one size",
             )
         return self._found.mask(frame.z)

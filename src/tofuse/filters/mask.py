@@ -35,7 +35,7 @@ class Mask(Filter):
 
     def __post_init__(self) -> None:
         if not self.image:
-            raise ValueError("image is empty: give the path of a mask")
+            raise ValueError("image is empty: set the path of a mask")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`; InputError if the image can't be read, or has another size."""
@@ -46,7 +46,7 @@ class Mask(Filter):
             raise InputError(
                 f"is {keep.shape[1]} x {keep.shape[0]}, the depth images are {columns} x {rows}",
                 where=self.image,
-                remedy="give a mask of their size",
+                remedy="use a mask of their size",
             )
         return keep
 
@@ -61,7 +61,7 @@ def _read(path: str) -> Bool:
         ) from error
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if image is None:
-        raise InputError("is no image", where=path, remedy="give a PNG or JPEG")
+        raise InputError("is not an image", where=path, remedy="pass a PNG or JPEG")
     keep = image[..., :3].any(-1) if image.ndim == 3 else image != 0
     keep.setflags(write=False)
     return np.asarray(keep)

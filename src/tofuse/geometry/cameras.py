@@ -268,9 +268,9 @@ class RayTable:
     def __post_init__(self) -> None:
         table = np.asarray(self.table)
         if table.ndim != 3 or table.shape[2] != 2 or min(table.shape[:2]) < 2:
-            raise InputError(f"has shape {table.shape}", where="rays", remedy="give (H, W, 2)")
+            raise InputError(f"has shape {table.shape}", where="rays", remedy="pass (H, W, 2)")
         if np.isfinite(table).all(-1).sum() < 16:
-            raise InputError("holds no finite rays", where="rays")
+            raise InputError("contains no finite rays", where="rays")
         if _is_mirrored(table):
             raise InputError(
                 "mirror the image: either x/z or y/z runs against the pixels",
@@ -377,20 +377,20 @@ def check_intrinsics(camera: Pinhole) -> None:
     for f in fields(camera):
         value = getattr(camera, f.name)
         if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-            raise InputError(f"is {value!r}", where=f"camera {f.name}", remedy="give a number")
+            raise InputError(f"is {value!r}", where=f"camera {f.name}", remedy="use a number")
         if not np.isfinite(value):
-            raise InputError(f"is {value}", where=f"camera {f.name}", remedy="give a finite number")
+            raise InputError(f"is {value}", where=f"camera {f.name}", remedy="use a finite number")
     if not (2 <= camera.width <= 16384 and 2 <= camera.height <= 16384):
         raise InputError(
             f"is {camera.width} x {camera.height}",
             where="camera width x height",
-            remedy="give the image size in pixels",
+            remedy="set the image size in pixels",
         )
     if camera.fx <= 0 or camera.fy <= 0:
         raise InputError(
             f"is {camera.fx}, {camera.fy}",
             where="camera fx, fy",
-            remedy="give positive focal lengths in pixels",
+            remedy="use positive focal lengths in pixels",
         )
 
 

@@ -233,7 +233,7 @@ def angle(R: ArrayLike) -> Float64:
 
 
 def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
-    """Return T as a float64 (4, 4) array, or raise InputError if it is no rigid motion."""
+    """Return T as a float64 (4, 4) array, or raise InputError if it is not a rigid motion."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError("is not a finite 4x4 matrix", where=where)

@@ -99,7 +99,7 @@ def check_color(sample: Sample) -> Iterator[Finding]:
             "color_unregistered",
             f"Colour is not registered to depth: its edges lie {pixels:.0f} pixels away from "
             "those of depth.",
-            "Give the colour camera's intrinsics and T_color_depth, or remove the colour.",
+            "Add the colour camera's intrinsics and T_color_depth, or remove the colour.",
             {"shift_px": pixels, "lead": float(lead.mean())},
         )
 

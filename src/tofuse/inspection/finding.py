@@ -14,7 +14,7 @@ CODES: dict[str, tuple[Severity, str]] = {
     "depth_unit": ("severe", "Depths are implausible for a ToF camera, or in another unit."),
     "range_taken_for_z": ("severe", "Radial ranges are declared as z: walls bulge."),
     "z_taken_for_range": ("severe", "z depths are declared as radial ranges: walls are concave."),
-    "focal_length": ("severe", "The focal length is not that of these images."),
+    "focal_length": ("severe", "The focal length does not match these images."),
     "other_intrinsics": ("severe", "The intrinsics are of another resolution or another camera."),
     "lens_distortion": ("severe", "Planes are distorted as by an uncorrected lens."),
     "mirrored": (
@@ -23,7 +23,7 @@ CODES: dict[str, tuple[Severity, str]] = {
     ),
     "color_unregistered": ("severe", "Colour is declared as registered to depth, and is not."),
     "time_unsorted": ("severe", "Timestamps decrease."),
-    "phase_wrap": ("severe", "Surfaces beyond the ambiguity range are measured as near ones."),
+    "phase_wrap": ("severe", "Surfaces beyond the ambiguity range appear too close."),
     "time_repeated": ("warning", "Timestamps are repeated."),
     "frames_missing": ("warning", "The timestamps have gaps."),
     "frames_repeated": ("warning", "Images are identical to the previous one."),

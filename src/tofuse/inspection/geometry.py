@@ -88,7 +88,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
     if abs(stretch) > max(_STRETCH, max(_STRETCH_SIGMAS, by_chance) * sigma):
         yield Finding(
             "lens_distortion",
-            f"Planes are distorted as by an uncorrected lens: rays at the corners are off by "
+            f"Planes are distorted as by an uncorrected lens: rays at the corners deviate by "
             f"{stretch:+.1%} (+-{sigma:.1%}).",
             "Add the distortion of the lens, or its rays, to camera.json; or remove them if depth "
             "is undistorted already.",
@@ -100,8 +100,8 @@ def wrong_focal(factor: float, sigma: float, why: str) -> Finding:
     """Return the finding that the focal length is wrong by `factor`, at which `why` is weakest."""
     return Finding(
         "focal_length",
-        f"The focal length is not that of these images: {why} least at {factor:.2f} times the "
-        f"given one (+-{sigma:.2f}).",
+        f"The focal length does not match these images: {why} least at {factor:.2f} times the "
+        f"stated one (+-{sigma:.2f}).",
         "Use the intrinsics of the depth camera, at this resolution; not those of the colour "
         "camera.",
         {"factor": factor, "sigma": sigma},

@@ -35,8 +35,8 @@ def check_still(sample: Sample) -> Iterator[Finding]:
             "static",
             f"The camera does not move in the {len(sample.views)} sampled frames: the model will "
             "contain only what one view shows.",
-            "Move the camera; average still frames by --average-still; or, if an object turns in "
-            "front of it, use --object.",
+            "Move the camera; average static frames with --average-still; or, if an object turns "
+            "in front of it, use --object.",
             {"frames": len(sample.views)},
         )
 

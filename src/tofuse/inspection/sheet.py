@@ -75,7 +75,9 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
         figure.savefig(path, dpi=110, metadata={"Software": None})
     except OSError as error:
         raise OutputError(
-            f"can't be written ({error.strerror or error})", where=path, remedy="give another name"
+            f"can't be written ({error.strerror or error})",
+            where=path,
+            remedy="choose another name",
         ) from error
     return path
 

@@ -52,7 +52,7 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
     period = sample.period_m
     evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
     if period is not None and median > period:
-        problem = f"and the phase of this camera repeats after {period:.3g} m"
+        problem = f"but the ambiguity range of this camera is {period:.3g} m"
     elif median > _FARTHEST_M:
         problem = "farther than ToF cameras measure"
     elif median < _NEAREST_M:
@@ -114,7 +114,7 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
     if width > _WIDE and fraction > _MANY_FLYING:
         yield Finding(
             "flying_pixels",
-            f"{fraction:.1%} of the pixels fly between near and far surfaces: edges "
+            f"{fraction:.1%} of the pixels are flying pixels between near and far surfaces: edges "
             f"are {width:.1f} pixels wide.",
             "Keep the filters against flying pixels on; clean the lens, and check its focus.",
             {"flying_fraction": fraction, "edge_width_px": width},
@@ -189,10 +189,9 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
     if seam_fraction > _SEAM_FRACTION or dark_fraction > _DARK_FRACTION:
         yield Finding(
             "phase_wrap",
-            f"Surfaces beyond {period:.3g} m, after which the phase of this camera repeats, are "
-            f"measured as near ones: {seam_fraction:.2%} of the pixels are at seams from far to "
-            f"near, and {dark_fraction:.1%} are near and yet {1 / _DARK:.0f} times darker than the "
-            "rest.",
+            f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "
+            f"close: {seam_fraction:.2%} of the pixels are at seams from far to near, and "
+            f"{dark_fraction:.1%} are near but {1 / _DARK:.0f} times darker than the rest.",
             "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
             "drop weak pixels by an amplitude filter.",
             {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},

@@ -380,5 +380,5 @@ def _spread(work: Callable[[int, int], None], size: int) -> None:
 def _rows(points: ArrayLike, what: str) -> Float64:
     array = np.ascontiguousarray(points, np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"have shape {array.shape}", where=what, remedy="give an (N, 3) array")
+        raise InputError(f"have shape {array.shape}", where=what, remedy="pass an (N, 3) array")
     return array

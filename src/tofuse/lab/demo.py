@@ -95,7 +95,7 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
             raise OutputError(
                 "is no simulated recording, or holds something else as well",
                 where=folder,
-                remedy="move it away, or give another --out",
+                remedy="move it away, or choose another --out",
             )
     shutil.rmtree(fresh, ignore_errors=True)
     if not path.exists() and old.exists():  # interrupted in between

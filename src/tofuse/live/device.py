@@ -140,13 +140,13 @@ def device(name: str, options: Mapping[str, str]) -> Device:
 def _read(text: str, kind: str, where: str) -> object:
     if kind == "bool":
         if text not in ("true", "false"):
-            raise InputError(f"is {text!r}", where=where, remedy="give true or false")
+            raise InputError(f"is {text!r}", where=where, remedy="use true or false")
         return text == "true"
     if kind == "int":
         try:
             return int(text)
         except ValueError as error:
-            raise InputError(f"is {text!r}", where=where, remedy="give a whole number") from error
+            raise InputError(f"is {text!r}", where=where, remedy="use a whole number") from error
     return text
 
 

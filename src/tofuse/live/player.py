@@ -45,7 +45,7 @@ class Player:
 
     def __post_init__(self) -> None:
         if not self.speed > 0:
-            raise InputError(f"is {self.speed}", where="speed", remedy="give more than 0")
+            raise InputError(f"is {self.speed}", where="speed", remedy="use more than 0")
         if (np.diff(self.recording.timestamps) < 0).any():
             raise InputError(
                 "has timestamps that decrease, so it can't be played",

@@ -81,7 +81,7 @@ def record(
         If the folder isn't empty, or can't be written.
     """
     if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
-        raise InputError("there is nothing to record", remedy="give more seconds, or frames")
+        raise InputError("there is nothing to record", remedy="use more seconds, or frames")
     with new_folder(folder) as temporary, _Reader(stream) as reader:
         first = reader.next()
         if first is None:

@@ -1,7 +1,7 @@
 """Constant-velocity motion model: the predicted pose of the next frame, and its validation gate.
 
-A camera that is carried or turned changes its velocity little from one frame to the next, so that
-a good fit at a wrong place (another place that looks alike, say) violates the gate. Time is that of
+A camera that is carried or turned changes its velocity little from one frame to the next, so that a
+good fit at a wrong place (another place that looks similar, say) violates the gate. Time is that of
 the timestamps, or the frame index where there are none: after missing frames the predicted motion
 is longer and the gate wider.
 """

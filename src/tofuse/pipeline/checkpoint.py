@@ -288,17 +288,17 @@ def _header(path: Path) -> dict[str, Any]:
 def _header_in(arrays: Arrays) -> dict[str, Any]:
     header = _json(arrays.pop(_HEADER, None))
     if not isinstance(header, dict) or header.get("version") != _VERSION:
-        raise StateError("it is no checkpoint of this version")
+        raise StateError("it is not a checkpoint of this version")
     return header
 
 
 def _json(data: NDArray[Any] | None) -> Any:
     if data is None or data.dtype != np.uint8:
-        raise StateError("it is no checkpoint")
+        raise StateError("it is not a checkpoint")
     try:
         return json.loads(data.tobytes())
     except (ValueError, RecursionError):
-        raise StateError("it is no checkpoint") from None
+        raise StateError("it is not a checkpoint") from None
 
 
 def _text(data: Any) -> UInt8:

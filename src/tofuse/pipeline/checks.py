@@ -212,7 +212,7 @@ def _connections(e: Evidence) -> Iterator[Reason]:
         yield Reason(
             "disconnected",
             union(r for c in apart for r in c.frames),
-            f"The recording falls into {len(parts)} disconnected parts: {_listed(parts)}; no "
+            f"The recording consists of {len(parts)} disconnected parts: {_listed(parts)}; no "
             "overlap found.",
         )
     for how, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
@@ -256,7 +256,7 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     if len(found) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (
             f"{len(found)} of {sum(has_pose)} poses are far from the predicted motion, as if the "
-            "views were in no order: the motion does not show whether they are right."
+            "views were unordered: the motion cannot confirm them."
         )
         yield Reason("jumped", ((frames[0], frames[-1]),), text)
     elif found:
@@ -295,7 +295,7 @@ def _depths(e: Evidence) -> Iterator[Reason]:
     typical = float(np.median(e.depths))
     what = f"The typical distance is {typical:.3g} m"
     if e.ambiguity_m is not None and typical > e.ambiguity_m:
-        text = f"{what}, but this camera's phase repeats after {e.ambiguity_m:.3g} m"
+        text = f"{what}, but the camera's ambiguity range is {e.ambiguity_m:.3g} m"
     elif unit_verified:
         return
     elif typical > MAX_DEPTH_M:
@@ -346,12 +346,12 @@ def _loops(e: Evidence) -> Iterator[Reason]:
         return
     if len(rejected) == 1:
         (p,) = rejected
-        text = f"Loop {p.i}-{p.j}, given by hand, was not used: {p.reason}."
+        text = f"Given loop closure {p.i}-{p.j} was not used: {p.reason}."
     else:
         named = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:MAX_LISTED])
         more = len(rejected) - MAX_LISTED
         named += f" and {more} more" if more > 0 else ""
-        text = f"{len(rejected)} loops given by hand were not used: {named}."
+        text = f"{len(rejected)} given loop closures were not used: {named}."
     yield Reason("loop_rejected", union((k, k) for p in rejected for k in (p.i, p.j)), text)
 
 
@@ -438,7 +438,7 @@ def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[R
         off, limit = _length(a.position_m), _length(tolerance_m)
         if a.position_m <= tolerance_m:
             off, limit = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
-        text = f"The poses may be off by {off} rms (95 % bound); the tolerance is {limit}."
+        text = f"Pose errors may reach {off} rms (95 % bound); the tolerance is {limit}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {_length(a.worst.position_m)}."
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
@@ -498,7 +498,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         cure = " or ".join(camera_in_words(found.unconfirmed))
         text = (
             f"Views agree better with {cure}, but no loop closure confirms it: the stated accuracy "
-            "includes what it would change."
+            "includes its effect."
         )
     else:
         return

@@ -157,7 +157,7 @@ def read_changes(path: str | Path) -> dict[str, Any]:
     if path.suffix == ".json":
         config = read_run_json(path).get("config")
         if not isinstance(config, dict):
-            raise InputError("holds no config", where=path, remedy="give a run.json of tofuse")
+            raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
         return config
     return parse_toml(read_text(path), where=path)
 

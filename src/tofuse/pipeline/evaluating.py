@@ -104,7 +104,7 @@ def evaluate(
         raise InputError(
             "has poses by frame, the other file by time",
             where=names[0] if found.timestamps is None else names[1],
-            remedy="give the recording, which knows the times: --recording",
+            remedy="pass the recording, which has the times, with --recording",
         )
     times, poses = _timed(found, estimate, clock, names[0])
     reference_times, reference_poses = _timed(known, reference, clock, names[1])
@@ -135,7 +135,7 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
     try:
         return CameraErrors.made_with(read_run_json(path)["config"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError("holds no config", where=path, remedy="copy it again") from error
+        raise InputError("contains no config", where=path, remedy="copy it again") from error
 
 
 def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
@@ -143,7 +143,7 @@ def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses
         return read_reference(given) if is_reference else read_poses(given)
     poses = np.asarray(given, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
-        raise InputError(f"has shape {poses.shape}", where=name, remedy="give (N, 4, 4) poses")
+        raise InputError(f"has shape {poses.shape}", where=name, remedy="pass (N, 4, 4) poses")
     return TimedPoses(poses, frames=np.arange(len(poses)))
 
 

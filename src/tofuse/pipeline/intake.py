@@ -30,7 +30,7 @@ class Intake:
             raise InputError(
                 f"is a {kind} view among {self.kind} views",
                 where=f"frame {frame.index}",
-                remedy="give images only, or clouds only",
+                remedy="pass images only, or clouds only",
             )
         return self.kind is None
 

@@ -2,7 +2,7 @@
 
 The poses replace tracking; the rest is as in a run: loops are closed, and all views are refined
 jointly. The error bound of the given poses is their distance from the refined ones plus the error
-bound of those. If images contradict even the refined poses, the recording is tracked anew, and the
+bound of those. If images contradict even the refined poses, the recording is tracked again, and the
 trajectory with more support by the images counts.
 
 Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
@@ -58,7 +58,7 @@ Views = Sequence[PosedView[PreparedView]]
 
 # Number of frames whose images are compared under the poses.
 _CHECKED = 60
-# With a smaller fraction of supporting measurements the recording is tracked anew.
+# With a smaller fraction of supporting measurements the recording is tracked again.
 _SUPPORTED = 0.95
 # With fewer overlapping views, relative to the refined poses, most poses are wrong.
 _MIN_OVERLAPPING = 0.5
@@ -327,7 +327,7 @@ def sentence(found: Judgement, name: str) -> str:
     diagonal = found.refined.cloud.diagonal_m
     given = bound(found.accuracy, diagonal)
     better = bound(found.refined.diagnostics.accuracy, diagonal)
-    how = "refined" if found.started else "tracked anew"
+    how = "refined" if found.started else "tracked again"
     return f"{name}: {given}; {how}: {better}.{_agreement(found.deviation)}"
 
 
@@ -382,7 +382,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
             raise InputError(
                 f"has shape {poses.shape}, for {len(recording)} frames",
                 where=where,
-                remedy="give one (4, 4) pose for each frame, NaN where there is none",
+                remedy="pass one (4, 4) pose for each frame, NaN where there is none",
             )
         for T in poses[np.isfinite(poses).all((1, 2))]:
             se3.check_pose(T, where=where)
@@ -391,7 +391,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
         raise InputError(
             f"has a pose for {known} of the {len(recording)} frames",
             where=where,
-            remedy="give timestamps in seconds on the clock of the recording",
+            remedy="pass timestamps in seconds on the clock of the recording",
         )
     return poses
 

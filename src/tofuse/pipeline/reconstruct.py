@@ -135,7 +135,7 @@ def _track(
         raise InputError(
             f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
             where=recording.path,
-            remedy="check that the files are complete, or give --format",
+            remedy="check that the files are complete, or use --format",
         )
     return tracked.mapper
 

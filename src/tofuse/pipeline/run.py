@@ -327,7 +327,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
             raise InputError(
                 f"is {options.max_depth} m and the minimum depth {low} m",
                 where="--max-depth",
-                remedy="give a larger one",
+                remedy="use a larger one",
             )
         front.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
     chosen = config.to_dict()
@@ -354,10 +354,10 @@ def _check_unwrap(recording: Recording) -> None:
     """Raise InputError if the recording can't be unwrapped."""
     if not any(range_and_amplitude(frame, None) for frame in recording.readable(_SAMPLED)):
         raise InputError(
-            "the recording can't be unwrapped: that needs its amplitude, and the range after which "
-            "the phase of its camera repeats",
+            "the recording can't be unwrapped: that needs its amplitude, and the ambiguity range "
+            "of its camera",
             where="--unwrap",
-            remedy='give "ambiguity_m" in a camera.json by --camera, or leave --unwrap out',
+            remedy='set "ambiguity_m" in a camera.json passed with --camera, or omit --unwrap',
         )
 
 

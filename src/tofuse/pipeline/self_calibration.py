@@ -121,7 +121,7 @@ def _gain(before: float, after: float) -> str:
     """Describe the change of the bound."""
     if not np.isfinite([before, after]).all():
         return ""
-    return f" The poses are off by up to {length(after)} (95 % bound) instead of {length(before)}."
+    return f" The bound of the pose error is {length(after)} (95 %) instead of {length(before)}."
 
 
 def _support(result: Reconstruction) -> float:

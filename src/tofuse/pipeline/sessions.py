@@ -25,7 +25,7 @@ from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
 
-_REMEDY = "give the --out of `tofuse run`"
+_REMEDY = "pass the --out of `tofuse run`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def read_sessions(
     folders = [Path(each) for each in results]
     for a, b in combinations(folders, 2):
         if a.resolve() == b.resolve():
-            raise InputError("is given twice", where=b, remedy="give each result once")
+            raise InputError("is given twice", where=b, remedy="pass each result once")
     sessions: list[Session] = []
     components = 0
     for folder in folders:
@@ -94,7 +94,7 @@ def read_sessions(
         raise InputError(
             "is a single session",
             where=folders[0] if folders else None,
-            remedy="give two or more results of `tofuse run`",
+            remedy="pass two or more results of `tofuse run`",
         )
     for one, other in combinations(sessions, 2):
         _check_different(one, other)
@@ -130,7 +130,7 @@ def _read_parts(
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
     finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
-        raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
+        raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
     try:
         stated = _stated(folder, run, components)
@@ -139,7 +139,7 @@ def _read_parts(
         return posed, _links(run, parts)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
-            "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
+            "is damaged, or not a run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
         ) from error
 
 
@@ -164,7 +164,7 @@ def _session(
         raise InputError(
             "is of clouds, and only results of images can be merged",
             where=folder,
-            remedy="give their clouds together to one `tofuse run`",
+            remedy="pass their clouds together to one `tofuse run`",
         )
     config = _config(part.config, recording, folder, threads, progress)
     opening = locate_recording(part.opening, folder)
@@ -239,7 +239,7 @@ def _check_different(one: Session, other: Session) -> None:
         raise InputError(
             f"is of the same recording as {one.result}: {len(both)} frames are in both",
             where=other.result,
-            remedy="give one of the two results",
+            remedy="pass one of the two results",
         )
 
 

@@ -106,7 +106,7 @@ def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
             continue
         code, *wanted = promised.split()
         if not isinstance(array, np.ndarray) or array.dtype != np.dtype(code.rstrip("!")):
-            raise ValueError(f"{name} of a {kind.__name__} is no array of {code.rstrip('!')}")
+            raise ValueError(f"{name} of a {kind.__name__} is not an array of {code.rstrip('!')}")
         fits = len(array.shape) == len(wanted) and all(
             size == (int(want) if want.isdecimal() else sizes.setdefault(want, size))
             for size, want in zip(array.shape, wanted, strict=True)

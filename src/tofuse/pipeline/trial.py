@@ -128,7 +128,7 @@ class Trial:
     def in_words(self) -> str:
         """Describe the result."""
         if len(self.predicted) < _MIN_RUNS or not np.isfinite(self.strength):
-            return "too few views overlap to tell"
+            return "too few views overlap to decide"
         found = f"strength {self.strength:.2f}, standard error {self.error:.2f}"
         if self.helps:
             return f"overlapping views disagree as it predicts ({found})"

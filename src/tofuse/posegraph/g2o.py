@@ -71,7 +71,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
                 f"holds {words[0]!r}", where=where, remedy=f"only {VERTEX} and {EDGE} are read"
             )
     if not vertices:
-        raise InputError("holds no vertex", where=path, remedy=f"give {VERTEX} lines")
+        raise InputError("contains no vertex", where=path, remedy=f"use {VERTEX} lines")
     for (i, j), number in zip(ends, edge_lines, strict=True):
         for vertex in (i, j):
             if vertex not in position:
@@ -126,7 +126,7 @@ def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[i
         raise InputError(
             f"{words[0]} has {len(words) - 1} numbers, not {ids + count}",
             where=where,
-            remedy="give the whole line",
+            remedy="write the whole line",
         )
     try:
         vertices = [int(word) for word in words[1 : 1 + ids]]
@@ -135,9 +135,9 @@ def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[i
     try:
         values = [float(word) for word in words[1 + ids :]]
     except ValueError as error:
-        raise InputError(f"holds something that is no number ({error})", where=where) from error
+        raise InputError(f"contains a value that is not a number ({error})", where=where) from error
     if not np.isfinite(values).all():
-        raise InputError(f"{words[0]} holds a number that is not finite", where=where)
+        raise InputError(f"{words[0]} contains a number that is not finite", where=where)
     length = float(quaternion.length(values[3:7]))
     if abs(length - 1) > _UNIT:
         raise InputError(
@@ -157,7 +157,7 @@ def _check_information(
         raise InputError(
             "the information matrix is not positive",
             where=place,
-            remedy="give the 21 numbers of its upper triangle, row by row, with none negative "
+            remedy="use the 21 numbers of its upper triangle, row by row, with none negative "
             "along the diagonal",
         )
 

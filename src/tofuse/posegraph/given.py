@@ -36,7 +36,7 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
         for index in (loop.i, loop.j):
             if frames is not None and index not in frames:
                 raise InputError(
-                    f"there is no frame {index}", where=where, remedy="give indices of frames"
+                    f"there is no frame {index}", where=where, remedy="use indices of frames"
                 )
         if (loop.i, loop.j) in loops:
             raise InputError(f"the loop {loop.i} {loop.j} is given twice", where=where)
@@ -54,14 +54,14 @@ def _loop(words: list[str], where: str) -> GivenLoop:
     except ValueError as error:
         raise InputError(f"is not understood ({error})", where=where, remedy=form) from error
     if i < 0 or j < 0 or i == j:
-        raise InputError(f"joins frames {i} and {j}", where=where, remedy="give two frames")
+        raise InputError(f"joins frames {i} and {j}", where=where, remedy="use two frames")
     if len(values) == 0:
         return GivenLoop(min(i, j), max(i, j))
     if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > _UNIT:
         raise InputError(
-            "is no rigid motion",
+            "is not a rigid motion",
             where=where,
-            remedy="give finite numbers and a quaternion qx qy qz qw of length 1",
+            remedy="use finite numbers and a quaternion qx qy qz qw of length 1",
         )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]

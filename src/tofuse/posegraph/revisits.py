@@ -55,7 +55,7 @@ _WEAK_PRIOR = ProjectiveOptions(
     levels=_NEAR, prior_m=3.0, prior_rad=3.0, constrained=1e6, common_tilt=0.0, common_slope=0.0
 )
 _REJECTED = "does not fit as views of this camera usually do, or not the same from both ends"
-_TOO_FAR = "looks alike, but the trajectory can't have drifted that far"
+_TOO_FAR = "looks similar, but the trajectory can't have drifted that far"
 # Selection of the views that are tried: neighbours overlap by most of an image.
 _SPACING = Spacing(angle=0.15, distance=0.08, most=200)
 # A candidate revisits a place if some view in between overlaps either view by less than this.
@@ -374,7 +374,7 @@ class _RevisitLoops(Loops):
         Returns accepted loops, and rejected ones with the reason.
         """
         found, margins = {}, {}
-        rejected = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
+        rejected = {p: "looks similar" if p in alike else closed[p].record.reason for p in pairs}
         made_all = executor().map(
             register_anywhere,
             len(pairs),
@@ -408,7 +408,7 @@ class _RevisitLoops(Loops):
                 continue
             how = made.how if alone else f"{made.how}; another loop agrees"
             if (i, j) in alike:
-                how = f"looks alike, {how}"
+                how = f"looks similar, {how}"
             record = LoopRecord(
                 i,
                 j,

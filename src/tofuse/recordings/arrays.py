@@ -71,7 +71,7 @@ def from_arrays(
     images = _images("depth", depth, None)
     shape = images[0].shape
     if len(shape) != 2:
-        raise InputError(f"has images of shape {shape}", where="depth", remedy="give (N, H, W)")
+        raise InputError(f"has images of shape {shape}", where="depth", remedy="pass (N, H, W)")
     checked_camera = _camera(camera, shape)
     times = _times(timestamps, len(images))
     colors = _optional("color", color, images, np.uint8, 3)
@@ -108,7 +108,7 @@ def _images(name: str, given: Any, shape: tuple[int, ...] | None) -> list[NDArra
         images = [np.asarray(image) for image in given]
     except TypeError as error:
         raise InputError(
-            "is not an array of images", where=name, remedy="give (N, H, W)"
+            "is not an array of images", where=name, remedy="pass (N, H, W)"
         ) from error
     if not images:
         raise InputError("contains no image", where=name)
@@ -135,7 +135,7 @@ def _optional(
     if len(optional) != len(images):
         raise InputError(f"contains {len(optional)} images, and depth {len(images)}", where=name)
     if dtype is np.uint8 and any(image.dtype != np.uint8 for image in optional):
-        raise InputError(f"is {optional[0].dtype}", where=name, remedy="give uint8, from 0 to 255")
+        raise InputError(f"is {optional[0].dtype}", where=name, remedy="use uint8, from 0 to 255")
     return [image.astype(dtype, copy=False) for image in optional]
 
 
@@ -145,7 +145,7 @@ def _to_metres(
     whole = images[0].dtype.kind in "iub"
     scale = unit_m if unit_m is not None else (_MILLIMETRES if whole else 1.0)
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"is {scale}", where="depth_unit_m", remedy="give metres, above 0")
+        raise InputError(f"is {scale}", where="depth_unit_m", remedy="use metres, above 0")
     if unit_m is None and not whole:
         sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
         sample = sample[np.isfinite(sample) & (sample > 0)]
@@ -153,7 +153,7 @@ def _to_metres(
             raise InputError(
                 f"has a median of {np.median(sample):.4g}, which can't be metres",
                 where="depth",
-                remedy="give depth_unit_m=0.001 if it is in millimetres",
+                remedy="use depth_unit_m=0.001 if it is in millimetres",
             )
     return lambda image: image.astype(np.float64) * scale
 
@@ -171,13 +171,13 @@ def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
         K = np.asarray(given, float)
     except (TypeError, ValueError) as error:
         raise InputError(
-            "is neither a camera nor a matrix", where="camera", remedy="give K (3, 3)"
+            "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
         ) from error
     if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
         raise InputError(
             f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
             where="camera",
-            remedy="give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
+            remedy="pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
         )
     return Pinhole(width, height, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
@@ -190,7 +190,7 @@ def _times(given: ArrayLike | None, count: int) -> Float64:
         raise InputError(
             "must be one finite number for each image, ascending",
             where="timestamps",
-            remedy="give seconds",
+            remedy="use seconds",
         )
     return times
 
@@ -201,6 +201,6 @@ def _poses(name: str, given: ArrayLike | None, count: int) -> Float64 | None:
     poses = np.asarray(given, float)
     if poses.shape != (count, 4, 4):
         raise InputError(
-            f"has shape {poses.shape}", where=name, remedy=f"give ({count}, 4, 4) T_world_camera"
+            f"has shape {poses.shape}", where=name, remedy=f"pass ({count}, 4, 4) T_world_camera"
         )
     return poses

@@ -156,7 +156,7 @@ def number_in(
     value = data.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         problem = "is missing" if value is None else f"is {value!r:.60}"
-        raise InputError(problem, where=f"{where}: {name}", remedy="give a number")
+        raise InputError(problem, where=f"{where}: {name}", remedy="use a number")
     try:
         return float(value)
     except OverflowError as error:
@@ -195,7 +195,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         camera, size = _lens(get)
         unit = get.positive("depth_unit_m", required=True, hint=_METRES) or 0.001
         if not 1e-9 <= unit <= 1:
-            raise get.error("depth_unit_m", f"is {unit}", "give the metres of one count, at most 1")
+            raise get.error("depth_unit_m", f"is {unit}", "set the metres per count, at most 1")
         kind = get.choice("depth_kind", ("z", "range"), required=True)  # type: ignore[assignment]
         color = _color(get)
     return CameraFile(
@@ -237,7 +237,7 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
             f"is of {' x '.join(map(str, description.size or ()))} pixels, depth of "
             f"{size[0]} x {size[1]}",
             where=path,
-            remedy="give the camera of these images",
+            remedy="pass the camera of these images",
         )
     table = path.parent / "rays.npy"
     if not is_file(table):
@@ -245,7 +245,7 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
             raise InputError(
                 "is 'rays' and there is no rays.npy",
                 where=f"{path}: model",
-                remedy="add rays.npy, or give a lens model",
+                remedy="add rays.npy, or use a lens model",
             )
         return description, description.camera
     camera = read_rays(table)
@@ -279,7 +279,7 @@ def camera_file_of(folder: Path, given: Path | None, lacking: str) -> Path:
         raise InputError(
             f"is missing: such files contain {lacking}",
             where=path,
-            remedy="give a camera.json by --camera",
+            remedy="pass a camera.json with --camera",
         )
     return path
 
@@ -291,7 +291,7 @@ def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
             f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
             f"{camera.width} x {camera.height}",
             where=where,
-            remedy="give the camera of these images by --camera",
+            remedy="pass the camera of these images with --camera",
         )
 
 
@@ -328,7 +328,7 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
         raise InputError(
             f"is a {type(camera).__name__}",
             where="camera",
-            remedy="give one of the models, or a RayTable of its rays",
+            remedy="use one of the models, or a RayTable of its rays",
         )
     out: dict[str, Any] = {"model": camera.model, "width": camera.width, "height": camera.height}
     out |= {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
@@ -350,16 +350,16 @@ class _Fields:
         value = self.data.get(field)
         if value is None:
             if required:
-                raise self.error(field, "is missing", f"give {hint}")
+                raise self.error(field, "is missing", f"use {hint}")
             return None
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(field, f"is {value!r:.60}", f"give {hint}")
+            raise self.error(field, f"is {value!r:.60}", f"use {hint}")
         try:
             value = float(value)
         except OverflowError:
             value = math.inf
         if not math.isfinite(value):
-            raise self.error(field, f"is {value}", f"give a finite {hint.removeprefix('a ')}")
+            raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
         return value
 
     def positive(
@@ -367,19 +367,19 @@ class _Fields:
     ) -> float | None:
         value = self.number(field, required=required, hint=hint)
         if value is not None and value <= 0:
-            raise self.error(field, f"is {value}", f"give {hint}")
+            raise self.error(field, f"is {value}", f"use {hint}")
         return value
 
     def within(self, field: str, low: float, high: float) -> float | None:
         value = self.positive(field)
         if value is not None and not low <= value <= high:
-            raise self.error(field, f"is {value:g}", f"give a number from {low:g} to {high:g}")
+            raise self.error(field, f"is {value:g}", f"use a number from {low:g} to {high:g}")
         return value
 
     def pixels(self, field: str) -> int:
         value = self.number(field, required=True, hint="a number of pixels")
         if value is None or value != int(value) or not 2 <= value <= 16384:
-            raise self.error(field, f"is {value}", "give a whole number of pixels, 2 to 16384")
+            raise self.error(field, f"is {value}", "use a whole number of pixels, 2 to 16384")
         return int(value)
 
     def text(self, field: str) -> str | None:
@@ -418,7 +418,7 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
     given = get.data.get("distortion")
     given = [] if given is None else given
     if not isinstance(given, list):
-        raise get.error("distortion", f"is {given!r:.60}", f"give a list [{' '.join(order)}]")
+        raise get.error("distortion", f"is {given!r:.60}", f"use a list [{' '.join(order)}]")
     for k, value in enumerate(given):
         _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", required=True)
     extra = given[len(order) :]
@@ -426,7 +426,7 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
         raise get.error(
             "distortion",
             f"has {len(given)} numbers, the model {model!r} takes {len(order)}",
-            f"give [{' '.join(order)}], or another model",
+            f"use [{' '.join(order)}], or another model",
         )
     values |= {name: float(v) for name, v in zip(order, given, strict=False)}
     cls = MODELS[model]
@@ -460,7 +460,7 @@ def checked_lens(
         low = 0.01 if name in ("fx", "fy") else -1e6
         if not low <= value <= 1e6:
             raise InputError(
-                f"is {value}", where=f"{where}: {name}", remedy=f"give {low:g} to 1000000"
+                f"is {value}", where=f"{where}: {name}", remedy=f"use {low:g} to 1000000"
             )
     try:
         return cls(size[0], size[1], **values)
@@ -475,17 +475,15 @@ def _color(get: _Fields) -> ColorCamera | None:
     if data is None:
         return None
     if not isinstance(data, dict) or not isinstance(data.get("intrinsics"), dict):
-        raise get.error(
-            "color", "has no intrinsics", "give {intrinsics: {...}, T_color_depth: ...}"
-        )
+        raise get.error("color", "has no intrinsics", "use {intrinsics: {...}, T_color_depth: ...}")
     camera, _ = _lens(
         _Fields({"model": "pinhole"} | data["intrinsics"], f"{get.where}: color.intrinsics")
     )
     if camera is None:
-        raise get.error("color.intrinsics.model", "is 'rays'", "give a lens model")
+        raise get.error("color.intrinsics.model", "is 'rays'", "use a lens model")
     field = "color.T_color_depth"
     try:
         matrix = np.array(data.get("T_color_depth"), float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise get.error(field, "is not a 4x4 matrix", "give four rows of four numbers") from error
+        raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
     return ColorCamera(camera, check_pose(matrix, where=f"{get.where}: {field}"))

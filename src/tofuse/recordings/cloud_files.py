@@ -216,7 +216,7 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     if not files:
         return None
     if is_folder(path) and is_file(path / "run.json"):
-        return Sniff(0.1, "a result of tofuse, not a recording", "give the recording itself")
+        return Sniff(0.1, "a result of tofuse, not a recording", "pass the recording itself")
     kinds = sorted({f.suffix.lower() for f in files})
     return Sniff(SURE, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
 

@@ -153,7 +153,7 @@ def _camera(row: object, k: int, data: dict[str, Any], path: Path) -> CwipcCamer
             raise InputError(
                 f"{at}.{field} is {text!r:.80}, not the name of a file in the same folder",
                 where=path,
-                remedy="put the recordings next to the file, and give their names",
+                remedy="put the recordings next to the file, and set their names",
             )
     return CwipcCamera(name, path.parent / file, _trafo(row, at, path), _of_color(kind, data))
 

@@ -67,7 +67,7 @@ class DepthImageSource(FileSource):
             where, sensor = str(options.camera), description.sensor or sensor
         if camera is None:
             raise InputError(
-                "has no camera", where=self.files[0].parent, remedy="give one by --camera"
+                "has no camera", where=self.files[0].parent, remedy="pass one with --camera"
             )
         self.camera, self.depth_unit_m, self.depth_kind = camera, depth_unit_m, kind
         self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
@@ -89,7 +89,7 @@ class DepthImageSource(FileSource):
                     f"is {header.width} x {header.height} pixels, {where} "
                     f"{self.camera.width} x {self.camera.height}",
                     where=path,
-                    remedy="give the camera of these images by --camera",
+                    remedy="pass the camera of these images with --camera",
                 )
             return
 

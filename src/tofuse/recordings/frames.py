@@ -266,7 +266,7 @@ class CloudFrame:
             raise InputError(
                 f"points have shape {self.points.shape}",
                 where=f"frame {self.index}",
-                remedy="give an (N, 3) array",
+                remedy="pass an (N, 3) array",
             )
 
     @classmethod
@@ -285,7 +285,7 @@ class CloudFrame:
             raise InputError(
                 f"is an array of shape {array.shape} and type {array.dtype}",
                 where="points",
-                remedy="give (N, 3) numbers in metres",
+                remedy="pass (N, 3) numbers in metres",
             )
         array = array[np.isfinite(array).all(1)].astype(np.float32)
         return cls(index, timestamp, array)

@@ -82,7 +82,7 @@ class BagSource(FileSource):
             raise InputError(
                 "does not apply to this maker's bags",
                 where="--topic",
-                remedy="leave it out, or give --format ros",
+                remedy="omit it, or use --format ros",
             )
         self.bag = self.open_bag(path)
         weakref.finalize(self, self.bag.close)

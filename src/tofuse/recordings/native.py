@@ -106,7 +106,7 @@ class NativeSource(FileSource):
             raise InputError(
                 "is missing, and there is sigma/",
                 where=f"{self.folder / 'camera.json'}: sigma_unit_m",
-                remedy="give the metres of one count of sigma",
+                remedy="set the metres per count of sigma",
             )
         if is_file(folder / "groundtruth.txt"):
             self.reference = tum_poses(self, folder / "groundtruth.txt")
@@ -219,7 +219,7 @@ class NativeSource(FileSource):
             raise self._count_error(path, f"{len(table)} lines")
         if table.shape[1] != 1:
             raise InputError(
-                f"has {table.shape[1]} numbers per line", where=path, remedy="give one, in seconds"
+                f"has {table.shape[1]} numbers per line", where=path, remedy="use one, in seconds"
             )
         self.timestamps = table[:, 0]
         check_timestamps(self.timestamps, path, self.warnings)
@@ -255,7 +255,7 @@ class NativeSource(FileSource):
                 raise self._count_error(part, f"{len(images[hertz])} images")
         if len(images) == 1:
             raise InputError(
-                "has only one frequency", where=folder, remedy="give two or more, or remove it"
+                "has only one frequency", where=folder, remedy="use two or more, or remove it"
             )
         return images
 
@@ -335,7 +335,7 @@ class NativeSource(FileSource):
                 continue  # an error of that frame alone, raised when it is read
             if (header.width, header.height) != size:
                 raise InputError(
-                    f"is {header.width} x {header.height} pixels, camera.json says "
+                    f"is {header.width} x {header.height} pixels, camera.json states "
                     f"{size[0]} x {size[1]}",
                     where=path,
                     remedy=f"use the camera.json of these images{hint}",
@@ -517,7 +517,7 @@ class RecordingWriter:
     def _write_images(self, frame: RangeFrame) -> None:
         camera = self.camera
         if camera is None:
-            raise InputError("is an image", where=f"frame {frame.index}", remedy="give a camera")
+            raise InputError("is an image", where=f"frame {frame.index}", remedy="pass a camera")
         if frame.depth.shape != (camera.height, camera.width):
             raise InputError(
                 f"is {frame.depth.shape[1]} x {frame.depth.shape[0]}, the recording's camera "
@@ -552,7 +552,7 @@ class RecordingWriter:
                 raise InputError(
                     "has another lens model than the first",
                     where=f"frame {len(self)}",
-                    remedy="give a RayTable as the common camera",
+                    remedy="use a RayTable as the common camera",
                 )
             self._lenses.append((own.fx, own.fy, own.cx, own.cy))
             return
@@ -566,7 +566,7 @@ class RecordingWriter:
             raise InputError(
                 f"has {sorted(names)} where the first frame has {sorted(self._channels)}",
                 where=f"frame {frame.index}",
-                remedy="give all frames the same channels",
+                remedy="use the same channels in all frames",
             )
 
     def _counts(self, depth: Float32) -> UInt16:

@@ -23,7 +23,7 @@ CLOSED = {
     ".rrf": (
         "contains raw phases of a pmd camera, whose layout and calibration aren't published",
         "play it by pmd's Royale and export its frames as PLY (sampleExportPLY), or record the "
-        "camera's ROS topics, and give those",
+        "camera's ROS topics, and use those",
     ),
     ".xef": (
         "is of Kinect Studio, whose layout isn't published",
@@ -73,7 +73,7 @@ def open_recording(
         can be read.
     """
     if not paths:
-        raise InputError("no recording was given", remedy="give a path")
+        raise InputError("no recording was given", remedy="pass a path")
     _check_depths(min_depth, max_depth)
     options = ReaderOptions(None if camera is None else Path(camera), topic)
     rig_file = rig_file_in(paths[0]) if len(paths) == 1 else None
@@ -137,7 +137,7 @@ def _check_kind(path: Path) -> None:
         return  # reported when it is opened
     if special:
         raise InputError(
-            "is neither a file nor a folder", where=path, remedy="give a recording's path"
+            "is neither a file nor a folder", where=path, remedy="pass a recording's path"
         )
 
 
@@ -165,7 +165,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         raise InputError(
             f"could be several formats ({saw})",
             where=path,
-            remedy=f"give --format {' or '.join(sure)}",
+            remedy=f"use --format {' or '.join(sure)}",
         )
     if not sniffs and (parts := _parts(path)):
         return parts
@@ -218,7 +218,7 @@ def _parts(path: Path) -> list[_Located]:
         raise InputError(
             f"contains several recordings: {listed}",
             where=path,
-            remedy="give the one you mean, or several in their order",
+            remedy="pass one of them, or several in order",
         )
     return [_Located(p, reader) for p in found]
 
@@ -226,7 +226,7 @@ def _parts(path: Path) -> list[_Located]:
 def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     if sniffs:
         saw = "; ".join(dict.fromkeys(sniff.saw for sniff in sniffs.values()))
-        remedies = [sniff.remedy or f"give --format {name}" for name, sniff in sniffs.items()]
+        remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
         return InputError(
             f"could not be identified: it has {saw}",
             where=path,
@@ -242,19 +242,19 @@ def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> Input
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
     return InputError(
-        problem, where=path, remedy=f"{remedy}, or give --format ({', '.join(readers())})"
+        problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
     )
 
 
 def _check_depths(nearest: float | None, farthest: float | None) -> None:
     for name, value in (("--min-depth", nearest), ("--max-depth", farthest)):
         if value is not None and not value >= 0:
-            raise InputError(f"is {value}", where=name, remedy="give metres, 0 or more")
+            raise InputError(f"is {value}", where=name, remedy="use metres, 0 or more")
     if nearest is not None and farthest is not None and nearest >= farthest:
         raise InputError(
             f"{nearest} and {farthest} leave no points",
             where="--min-depth, --max-depth",
-            remedy="give the smaller first",
+            remedy="pass the smaller one first",
         )
 
 
@@ -268,7 +268,7 @@ def _check_usable(source: Source, path: str | Path) -> None:
         except UnreadableFrameError as error:
             first = first or error
     if first is None:
-        raise InputError("has no frames", where=path, remedy="give a recording")
+        raise InputError("has no frames", where=path, remedy="pass a recording")
     count = len(source.timestamps)
     problem = first.problem if count == 1 else f"none of {count} frames can be read: {first}"
     raise InputError(
@@ -314,7 +314,7 @@ def read_reference(path: str | Path) -> TimedPoses:
         raise InputError(
             "has no reference poses",
             where=path,
-            remedy="give a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
+            remedy="pass a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
         )
     known = np.isfinite(poses).all((1, 2))
     return TimedPoses(poses[known], timestamps=recording.timestamps[known])

@@ -165,7 +165,7 @@ class Recording:
             If the selection is empty.
         """
         if every < 1:
-            raise InputError(f"is {every}", where="--every", remedy="give 1 or more")
+            raise InputError(f"is {every}", where="--every", remedy="use 1 or more")
         chosen = self.indices[slice(start, end, every)]
         if len(chosen) == 0:
             raise InputError(
@@ -198,7 +198,7 @@ class Recording:
         for frame in self.readable(count):
             if not isinstance(frame, RangeFrame):
                 raise InputError(
-                    "contains clouds", where=self.path, remedy="give a recording of depth images"
+                    "contains clouds", where=self.path, remedy="pass a recording of depth images"
                 )
             out.append(frame)
         return out

@@ -171,7 +171,7 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
         raise InputError(
             f"{at}.name is {name!r:.80}, which is not a folder name",
             where=path,
-            remedy="give it one without / \\ : and not . or ..",
+            remedy="choose one without / \\ : and not . or ..",
         )
     if not isinstance(recording, str):
         raise InputError(f"{at}.recording is not a path", where=path, remedy=_REMEDY)

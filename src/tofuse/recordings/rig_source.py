@@ -47,7 +47,7 @@ class RigSource:
             raise InputError(
                 "no images of its cameras are of the same time",
                 where="the rig",
-                remedy="give recordings of the same time, or calibrate the clocks again",
+                remedy="pass recordings of the same time, or calibrate the clocks again",
             )
         self.instant, self.camera, self._row = rows.T
         self.timestamps = np.array(

@@ -147,7 +147,7 @@ def camera_info(message: Any, where: str) -> Info:
     K = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
     D = [float(v) for v in getattr(message, "d", getattr(message, "D", ()))]
     if K.shape != (9,):
-        raise InputError("has no 3x3 matrix K", where=where, remedy="give --camera camera.json")
+        raise InputError("has no 3x3 matrix K", where=where, remedy="use --camera camera.json")
     values = {"fx": float(K[0]), "fy": float(K[4]), "cx": float(K[2]), "cy": float(K[5])}
     return Info((int(message.width), int(message.height)), values, str(message.distortion_model), D)
 
@@ -174,11 +174,11 @@ def lens(message: Any, where: str) -> Pinhole:
             raise InputError(
                 f"has the distortion model {model!r:.40}",
                 where=where,
-                remedy="give --camera camera.json",
+                remedy="use --camera camera.json",
             )
         if any(D[len(DISTORTION_ORDER[name]) :]):
             raise InputError(
-                f"has {len(D)} coefficients for {model}", where=where, remedy="give --camera"
+                f"has {len(D)} coefficients for {model}", where=where, remedy="use --camera"
             )
     coefficients = dict(zip(DISTORTION_ORDER[name], D, strict=False))
     return checked_lens(MODELS[name], info.size, info.values | coefficients, where)

@@ -31,5 +31,5 @@ def required_file(path: Path, *suffixes: str) -> Path:
     raise InputError(
         f"doesn't contain exactly one {' or '.join(suffixes)} file",
         where=path,
-        remedy="give the file",
+        remedy="pass the file",
     )

@@ -120,7 +120,7 @@ def read_timestamps(path: Path, count: int, things: str, warnings: list[str]) ->
         raise InputError(
             f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {things}s",
             where=path,
-            remedy=f"give one time in seconds for each {things}",
+            remedy=f"use one time in seconds for each {things}",
         )
     times = table[:, 0]
     check_timestamps(times, path, warnings)
@@ -132,7 +132,7 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     if not np.isfinite(times).all():
         k = int(np.argmin(np.isfinite(times)))
         raise InputError(
-            f"line {k + 1} is {times[k]}", where=path, remedy="give every frame a time in seconds"
+            f"line {k + 1} is {times[k]}", where=path, remedy="assign every frame a time in seconds"
         )
     steps = np.diff(times)
     if (steps < 0).any():

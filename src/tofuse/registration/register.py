@@ -122,7 +122,7 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
     try:
         array = np.asarray(points)
     except ValueError as error:
-        raise InputError("is not an array", where=name, remedy="give (N, 3) numbers") from error
+        raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise InputError(
             f"is an array of shape {array.shape} and type {array.dtype}",
@@ -134,10 +134,10 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
         raise InputError(
             f"has {len(good)} finite points",
             where=name,
-            remedy=f"give {FEWEST_POINTS} or more",
+            remedy=f"use {FEWEST_POINTS} or more",
         )
     if np.abs(good).max() > _FURTHEST_M:
         raise InputError(
-            f"has coordinates up to {np.abs(good).max():.0e} m", where=name, remedy="give metres"
+            f"has coordinates up to {np.abs(good).max():.0e} m", where=name, remedy="use metres"
         )
     return good

@@ -73,7 +73,7 @@ class _Result:
         path = self.folder / "mesh.ply"
         if not path.is_file():
             raise InputError(
-                "doesn't exist: clouds without a camera model give no surface",
+                "doesn't exist: clouds without a camera model have no surface",
                 where=path,
                 remedy="choose a format for clouds",
             )

@@ -29,9 +29,9 @@ REASONS: dict[str, tuple[str, str]] = {
     "weak_registration": ("degraded", "Frames have too few correspondences."),
     "not_converged": ("degraded", "Registrations stopped before they converged."),
     "rig_changed": ("degraded", "A camera of the rig has moved from its pose in rig.json."),
-    "uncertain_rig": ("degraded", "The rig's cameras may be off by more than the tolerance."),
+    "uncertain_rig": ("degraded", "The pose errors of the rig's cameras may exceed the tolerance."),
     "inconsistent_poses": ("degraded", "Registrations contradict the poses that were given."),
-    "uncertain_poses": ("degraded", "Poses may be off by more than the tolerance."),
+    "uncertain_poses": ("degraded", "Pose errors may exceed the tolerance."),
     "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
     "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
     "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
@@ -49,7 +49,10 @@ REASONS: dict[str, tuple[str, str]] = {
     "bounded_by_odometry": ("note", "Only the recorded odometry constrains the motion there."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("degraded", "Single view: nothing to register, accuracy not assessed."),
-    "stood_still": ("note", "The camera did not move: the model shows what one view sees."),
+    "stood_still": (
+        "note",
+        "The camera did not move: the model contains only the surfaces of one view.",
+    ),
     "no_surface": ("note", "No surface could be reconstructed, only a point cloud."),
     "loop_rejected": ("note", "A loop closure given by the user could not be confirmed."),
 }
@@ -72,7 +75,7 @@ ADVICE: dict[str, str] = {
     "weak_registration": "Record with smaller steps between frames, or with more structure in "
     "view.",
     "not_converged": "Use more iterations, or record with smaller steps between frames.",
-    "inconsistent_poses": "Use the refined poses, or find out what bent the given ones.",
+    "inconsistent_poses": "Use the refined poses, or find what distorted the given ones.",
     "uncertain_poses": "Revisit these places, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",

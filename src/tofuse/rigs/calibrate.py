@@ -127,7 +127,7 @@ def cameras_of(
             f"has {len(names)} cameras ({', '.join(names)}), "
             f"and {len(recordings)} recordings are given",
             where="the rig",
-            remedy="give one recording for each, in this order",
+            remedy="pass one recording for each, in this order",
         )
     opened = open_cameras(recordings, format)
     return [replace(camera, name=name) for camera, name in zip(opened, names, strict=True)]
@@ -149,8 +149,8 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
         raise InputError(
             f"{' and '.join(names)} stood still while other cameras moved",
             where="the rig",
-            remedy="give recordings of cameras that are fixed to each other, or say what they do "
-            "by --motion still or --motion moving",
+            remedy="pass recordings of cameras that are fixed to each other, or set the motion "
+            "with --motion still or --motion moving",
         )
     return not all(still)
 

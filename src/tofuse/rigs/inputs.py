@@ -89,15 +89,15 @@ def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list
         If there are fewer than two or too many, one can't be opened, or one is given twice.
     """
     if len(paths) < 2:
-        raise InputError("is one camera", where="a rig", remedy="give two recordings or more")
+        raise InputError("is one camera", where="a rig", remedy="pass two recordings or more")
     if len(paths) > _MAX_CAMERAS:
         raise InputError(
-            f"has {len(paths)} cameras", where="a rig", remedy=f"give at most {_MAX_CAMERAS}"
+            f"has {len(paths)} cameras", where="a rig", remedy=f"pass at most {_MAX_CAMERAS}"
         )
     resolved = [Path(path).resolve() for path in paths]
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
-            raise InputError("is given twice", where=paths[k], remedy="give each camera once")
+            raise InputError("is given twice", where=paths[k], remedy="pass each camera once")
     names = unique_names(resolved)
     return [
         Camera(name, open_recording(path, format=format))

@@ -80,7 +80,7 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
         raise InputError(
             "has no trajectory",
             where=cameras[0].recording.path,
-            remedy="give the camera that tracks best first",
+            remedy="pass the camera with the best tracking first",
         )
     progress.stage("fitting trajectories")
     fits: dict[int, HandEye] = {}
@@ -128,26 +128,26 @@ def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: li
         if abs(lag.seconds) > _SAME_CLOCK_S:
             notes.append(
                 f"the clock of {cameras[k].name} differs by {lag.seconds:.3f} s from that of "
-                f"{cameras[0].name}, as they turn"
+                f"{cameras[0].name}, by their rotations"
             )
         return lag.seconds
     if len(tracks[k].times) < 2:
-        raise RegistrationError("has no trajectory", remedy="see how it is tracked by itself")
+        raise RegistrationError("has no trajectory", remedy="check its tracking with `tofuse run`")
     first, last = tracks[0].times[[0, -1]]
     if min(last, tracks[k].times[-1]) - max(first, tracks[k].times[0]) <= 0:
         raise RegistrationError(
             f"its timestamps begin {tracks[k].times[0] - first:+.1f} s after those of "
-            f"{cameras[0].name} and don't overlap with them, and it did not turn alike",
-            remedy="record all cameras at the same time, and turn the rig",
+            f"{cameras[0].name} and don't overlap with them, and its rotation differs",
+            remedy="record all cameras at the same time, and rotate the rig",
         )
     if lag is not None and lag.correlation < 0.5:
         raise RegistrationError(
-            f"it did not turn as {cameras[0].name} did",
+            f"its rotation differs from that of {cameras[0].name}",
             remedy="record all cameras at the same time, fixed to each other",
         )
     notes.append(
-        f"{cameras[k].name}: how the rig turns does not tell its clock; its timestamps are taken "
-        f"to be those of {cameras[0].name}"
+        f"{cameras[k].name}: the rotation of the rig does not determine its clock; its timestamps "
+        f"are assumed to be those of {cameras[0].name}"
     )
     return 0.0
 
@@ -161,8 +161,8 @@ def _too_loose(fit: HandEye, depth: float) -> str:
     if position <= _MAX_SIGMA_FRACTION * depth and rotation <= _MAX_SIGMA_RAD:
         return ""
     return (
-        f"the motion leaves its place open ({1000 * position:.0f} mm, "
-        f"{np.degrees(rotation):.1f} deg); turn the rig about two axes"
+        f"the motion does not constrain its pose ({1000 * position:.0f} mm, "
+        f"{np.degrees(rotation):.1f} deg); rotate the rig about two axes"
     )
 
 

@@ -323,8 +323,8 @@ class _Placer:
             return probability, evidence.objection()
         if chance > _CHANCE:
             return probability, (
-                f"another place fits nearly as well, less {max(score - rival, 0.0):.1%} of the "
-                f"points: a lead that chance gives in {chance:.0%} of the cases"
+                f"another pose fits nearly as well, with {max(score - rival, 0.0):.1%} fewer of "
+                f"the points: the margin occurs by chance in {chance:.0%} of the cases"
             )
         return 1 - chance, ""
 

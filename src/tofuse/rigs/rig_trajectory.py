@@ -96,7 +96,7 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
         raise InputError(
             "no camera has a pose at the instants that all of them saw",
             where="the rig",
-            remedy="calibrate the clocks anew",
+            remedy="calibrate the clocks again",
         )
     progress.stage("refining the rig")
     found = refined(cameras, recording, mean, T_rig_frame, at)

@@ -281,7 +281,7 @@ def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
         f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
         for m in knocked
     )
-    text = f"Cameras are not where the rig says: {changes}."
+    text = f"Camera poses differ from those of the rig: {changes}."
     everything = ((d.frames[0].index, d.frames[-1].index),)
     reasons = ranked((*d.reasons, Reason("rig_changed", everything, text)))
     verdict = verdict_of(reasons)

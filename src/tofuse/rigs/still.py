@@ -202,7 +202,7 @@ def _finer_offsets(
                 lags[column] = np.mean(apart)
         lag = minimum_cost_lag(lags, costs)
         if lag is None:
-            notes.append(f"{cameras[c].name}: its clock can't be estimated from what moves")
+            notes.append(f"{cameras[c].name}: its clock can't be estimated from the motion")
         elif abs(lag) > 0.02 * interval:
             out[c] -= lag
         known[k] = [_kept(v) for v in _at_times(cameras[c], out[c], at)]
@@ -338,12 +338,12 @@ def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
                 f"begins {own[0] - first[0]:+.1f} s after {cameras[0].name} by its clock, when "
                 f"that had ended, and no motion that both see determines the offset of the clocks",
                 where=cameras[k].recording.path,
-                remedy="give recordings of the same time",
+                remedy="pass recordings of the same time",
             )
         offsets[k] = lag.seconds
         notes.append(
             f"the clock of {cameras[k].name} differs by {lag.seconds:.2f} s from that of "
-            f"{cameras[0].name}, by when things move"
+            f"{cameras[0].name}, by the timing of motion"
         )
     return offsets
 

@@ -50,7 +50,7 @@ class DepthCorrection:
             raise InputError(
                 f"range_m has shape {knots.shape} and bias_m {bias.shape}",
                 where="correction",
-                remedy="give one bias for each knot",
+                remedy="use one bias for each knot",
             )
         for name, array in (("range_m", knots), ("bias_m", bias)):
             _check_numbers(name, array)
@@ -64,7 +64,7 @@ class DepthCorrection:
                 raise InputError(
                     f"pixel_bias_m has shape {pixel.shape}",
                     where="correction",
-                    remedy="give one offset for each pixel, (H, W)",
+                    remedy="use one offset for each pixel, (H, W)",
                 )
             _check_numbers("pixel_bias_m", pixel)
             object.__setattr__(self, "pixel_bias_m", pixel.astype(np.float32))
@@ -121,7 +121,7 @@ class DepthCorrection:
             ) from error
         for key in KEYS[:2]:
             if key not in arrays:
-                raise InputError(f"has no {key}", where=path, remedy=f"give the keys {list(KEYS)}")
+                raise InputError(f"has no {key}", where=path, remedy=f"use the keys {list(KEYS)}")
         try:
             return cls(arrays["range_m"], arrays["bias_m"], arrays.get("pixel_bias_m"))
         except InputError as error:
@@ -130,10 +130,10 @@ class DepthCorrection:
 
 def _check_numbers(name: str, array: NDArray[np.generic]) -> None:
     if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} holds {array.dtype}", where="correction", remedy="give numbers")
+        raise InputError(f"{name} holds {array.dtype}", where="correction", remedy="use numbers")
     if not np.isfinite(array).all():
         raise InputError(
-            f"{name} holds a number that is not finite",
+            f"{name} contains a number that is not finite",
             where="correction",
             remedy="use 0 where nothing is known",
         )

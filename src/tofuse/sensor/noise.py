@@ -94,7 +94,7 @@ class AmplitudeLaw(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.shot == 0 and self.dark == 0:
-            raise ValueError("shot and dark are both 0: give at least one")
+            raise ValueError("shot and dark are both 0: set at least one")
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class ConfidenceLaw(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.sigma_m:
-            raise ValueError("sigma_m is empty: give one number for each level of confidence")
+            raise ValueError("sigma_m is empty: set one number for each level of confidence")
         for value in self.sigma_m:
             if value not in Bounds(0, _LARGEST_M):
                 raise ValueError(f"sigma_m must be {Bounds(0, _LARGEST_M)}, not {value!r}")
@@ -133,7 +133,7 @@ class RangeLaw(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.a == 0 and self.b == 0:
-            raise ValueError("a and b are both 0: give at least one")
+            raise ValueError("a and b are both 0: set at least one")
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ class NoiseModel(Bounded):
             Naming the field, for invalid content.
         """
         if not isinstance(data, dict):
-            raise InputError("holds no JSON object", where=where, remedy="write {...}")
+            raise InputError("contains no JSON object", where=where, remedy="write {...}")
         data = dict(data)
         schema = data.pop("schema", None)
         if schema != SCHEMA or isinstance(schema, bool):
@@ -297,7 +297,7 @@ def _check_finite(model: Any, where: str) -> None:
         if is_dataclass(value):
             _check_finite(value, f"{where}.{field.name}")
         elif isinstance(value, float) and not math.isfinite(value):
-            raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="give a number")
+            raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="use a number")
 
 
 def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:

@@ -97,7 +97,7 @@ class Features(Bounded, Registrar):
 
     def _found(self, view: Frame) -> tuple[Keypoints, PreparedView]:
         if not isinstance(view, RangeFrame):
-            raise RegistrationError("is no image", where=f"frame {view.index}")
+            raise RegistrationError("is not an image", where=f"frame {view.index}")
         surface = prepare_view(view, SurfaceOptions())
         points = keypoints(
             view,

@@ -93,7 +93,7 @@ class PlaneSets(Bounded, Registrar):
 
     def _prepared(self, view: Frame) -> PreparedView:
         if not isinstance(view, RangeFrame):
-            raise RegistrationError("is no image", where=f"frame {view.index}")
+            raise RegistrationError("is not an image", where=f"frame {view.index}")
         return prepare_view(view, SurfaceOptions())
 
     def _planes(self, view: PreparedView, rng: np.random.Generator) -> list[Plane]:

@@ -72,11 +72,9 @@ class Effects:
 
     def __post_init__(self) -> None:
         if not 0 <= self.scatter < 1:
-            raise InputError(
-                f"is {self.scatter}", where="scatter", remedy="give a fraction, 0 to 1"
-            )
+            raise InputError(f"is {self.scatter}", where="scatter", remedy="use a fraction, 0 to 1")
         if self.ambient < 0:
-            raise InputError(f"is {self.ambient}", where="ambient", remedy="give 0 or more")
+            raise InputError(f"is {self.ambient}", where="ambient", remedy="use 0 or more")
         if self.noise not in ("poisson", "other"):
             raise InputError(f"is {self.noise!r}", where="noise", remedy="use poisson or other")
 

@@ -70,7 +70,7 @@ class Passing:
             raise InputError(f"is {self.kind!r}", where="passing", remedy="use person or box")
         if not 0 < self.fraction < 1:
             raise InputError(
-                f"is {self.fraction}", where="fraction", remedy="give one between 0 and 1"
+                f"is {self.fraction}", where="fraction", remedy="use one between 0 and 1"
             )
         if not 0 < self.seconds <= self.period_s:
             raise InputError(

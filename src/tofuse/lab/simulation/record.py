@@ -107,10 +107,10 @@ def plan(
     stride = sequence.stride if every is None else every
     for name, value in (("every", stride), ("frames", 1 if frames is None else frames)):
         if value < 1:
-            raise InputError(f"is {value}", where=name, remedy="give 1 or more")
+            raise InputError(f"is {value}", where=name, remedy="use 1 or more")
     if not 0 <= first < sequence.frames:
         raise InputError(
-            f"is {first}", where="first", remedy=f"give one from 0 to {sequence.frames - 1}"
+            f"is {first}", where="first", remedy=f"use one from 0 to {sequence.frames - 1}"
         )
     raw = np.arange(first, sequence.frames, stride)[:frames]
     if passing is not None:

@@ -56,7 +56,7 @@ class AzureKinectStream(Stream):
         rates = {5: "FPS_5", 15: "FPS_15", 30: "FPS_30"}
         if options.frame_rate_hz not in rates:
             raise DeviceError(
-                f"is {options.frame_rate_hz}", where="frame_rate_hz", remedy="give 5, 15 or 30"
+                f"is {options.frame_rate_hz}", where="frame_rate_hz", remedy="use 5, 15 or 30"
             )
         self._errors: tuple[type[Exception], ...] = (k4a.K4AException, k4a.K4ATimeoutException)
         try:

@@ -118,7 +118,7 @@ def _is_tof(rs: Any, serial: str) -> bool:
         raise DeviceError(
             f"no camera {serial} is connected" if serial else "no camera is connected",
             where="RealSense",
-            remedy="connect it, or give its --serial",
+            remedy="connect it, or pass its --serial",
         )
     return str(cameras[0].get_info(rs.camera_info.product_line)) == "L500"
 
@@ -136,5 +136,5 @@ def _camera(rs: Any, lens: Any) -> Camera:
     raise DeviceError(
         f"has a lens of the model {lens.model}",
         where="RealSense",
-        remedy="record the undistorted stream, or give a camera.json with rays",
+        remedy="record the undistorted stream, or pass a camera.json with rays",
     )

@@ -36,7 +36,7 @@ _SAMPLES = 16
 _DEGREE = 7
 _FITTED = 20_000  # pixels
 _ROUNDING_MM = 0.5  # the largest error of a coordinate from rounding
-_REMEDY = "give the lens by --camera camera.json, or save frames with XYZ"
+_REMEDY = "pass the lens with --camera camera.json, or save frames with XYZ"
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class AdiTofSource(FileSource):
             raise InputError(
                 "contains no whole frame of Analog Devices' ToF SDK",
                 where=path,
-                remedy="give a .bin file that data_collect or FrameHandler saved",
+                remedy="pass a .bin file that data_collect or FrameHandler saved",
             )
         first = self.places[0].layout
         self.size = first.width, first.height
@@ -181,7 +181,7 @@ class AdiTofSource(FileSource):
                 f"is {layout.width} x {layout.height} pixels, the first frame "
                 f"{self.size[0]} x {self.size[1]}",
                 where=f"{place.path}: frame {index}",
-                remedy="give frames of one mode",
+                remedy="pass frames of one mode",
             )
         try:
             with place.path.open("rb") as file:

@@ -38,7 +38,7 @@ class Arducam:
         saw = f"{len(images)} depth images of Arducam's examples"
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{saw} and camera.json")
-        settle = "give --format arducam with --camera: lens and unit are not in such files"
+        settle = "use --format arducam with --camera: lens and unit are not in such files"
         return Sniff(UNSURE, saw, settle)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
@@ -103,7 +103,7 @@ class ArducamSource(FileSource):
             raise InputError(
                 f"is of {image.size[0]} x {image.size[1]} pixels, its camera {size[0]} x {size[1]}",
                 where=image.path,
-                remedy="give the camera of these images by --camera",
+                remedy="pass the camera of these images with --camera",
             )
         data = read_bytes(image.path, limit=1 << 26)
         if len(data) != 4 * size[0] * size[1]:

@@ -300,23 +300,23 @@ def _mode(tags: dict[str, str], size: tuple[int, int], path: Path) -> str:
     raise InputError(
         f"has depth of {size[0]} x {size[1]} pixels, of no known mode",
         where=path,
-        remedy="give its camera by converting it to the native folder",
+        remedy="convert it to the native folder to set its camera",
     )
 
 
 def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
     if data is None:
         raise InputError(
-            "is missing", where=where, remedy="give the depth camera by --camera camera.json"
+            "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
     try:
         found = json.loads(data.rstrip(b"\0"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            "is invalid JSON", where=where, remedy="give the depth camera by --camera"
+            "is invalid JSON", where=where, remedy="pass the depth camera with --camera"
         ) from error
     if not isinstance(found, dict):
-        raise InputError("is not a JSON object", where=where, remedy="give --camera")
+        raise InputError("is not a JSON object", where=where, remedy="use --camera")
     return found
 
 
@@ -325,7 +325,7 @@ def _lens(
 ) -> tuple[KinectLens, Float64]:
     """The lens in a mode, and the transform (4, 4) of points into this camera's frame."""
     where = f"{where}: {camera}"
-    remedy = "give the depth camera by --camera"
+    remedy = "pass the depth camera with --camera"
     cameras = _get(calibration, "CalibrationInformation", "Cameras")
     found = [
         c

@@ -38,7 +38,7 @@ class Depth16:
         saw = f"{len(files)} DEPTH16 images"
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{saw} and camera.json")
-        settle = "give --format depth16 with --camera: size and lens are not in such files"
+        settle = "use --format depth16 with --camera: size and lens are not in such files"
         return Sniff(UNSURE, saw, settle)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
@@ -80,7 +80,7 @@ class Depth16Source(FileSource):
             raise InputError(
                 f"has {len(data)} bytes, not 2 for each of {width} x {height} pixels",
                 where=path,
-                remedy="give the camera of these images by --camera",
+                remedy="pass the camera of these images with --camera",
             )
         samples = np.frombuffer(data, "<u2").reshape(height, width)
         counts = samples & ((1 << _BITS) - 1)

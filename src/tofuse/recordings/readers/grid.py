@@ -231,7 +231,7 @@ def _refusal(path: Path) -> InputError:
     return InputError(
         "doesn't contain one point per pixel of a camera",
         where=path,
-        remedy="export all points, including invalid ones, or give --format ply, pcd or xyz",
+        remedy="export all points, including invalid ones, or use --format ply, pcd or xyz",
     )
 
 

@@ -91,7 +91,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
         raise InputError(
             f"has images of {size[0]} x {size[1]} pixels, unlike any Kinect v2",
             where=folder,
-            remedy="give their camera by --camera",
+            remedy="pass their camera with --camera",
         )
     name, scale = _VIEWS[size]
     path = _calibration(folder, name)
@@ -99,7 +99,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
         raise InputError(
             f"has no {name}",
             where=folder,
-            remedy="copy it from kinect2_bridge/data/ and your camera's number, or give --camera",
+            remedy="copy it from kinect2_bridge/data/ and your camera's number, or use --camera",
         )
     match = _MATRIX.search(read_text(path, limit=1 << 20))
     numbers = _numbers(match[1]) if match else np.zeros(0)

@@ -39,14 +39,14 @@ class Native:
             return Sniff(
                 UNSURE,
                 "depth/ but no camera.json",
-                "write one (docs/formats.md), or give --format native --camera camera.json",
+                "write one (docs/formats.md), or use --format native --camera camera.json",
             )
         return Sniff(SURE, "cloud/") if images == "cloud" else None
 
     def open(self, path: Path, options: ReaderOptions) -> NativeSource:
         """See `Reader.open`."""
         if not is_folder(path):
-            raise InputError("is not a folder", where=path, remedy="give the recording's folder")
+            raise InputError("is not a folder", where=path, remedy="pass the recording's folder")
         if not is_folder(path / "depth") and not is_folder(path / "cloud"):
             raise InputError(
                 "has neither depth/ nor cloud/",

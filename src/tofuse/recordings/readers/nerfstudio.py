@@ -259,7 +259,7 @@ def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
         if name in about:
             unit = number_in(about, name, file, remedy=_REMEDY)
             if not 1e-9 <= unit <= 1:
-                raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="give metres")
+                raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="use metres")
             return unit
     if not nerfstudio:
         raise InputError(

@@ -163,7 +163,7 @@ class NpzSource(FileSource):
             raise self._error(
                 "depth",
                 f"is {width} x {height}, the camera {camera.width} x {camera.height}",
-                "give the camera of these images",
+                "pass the camera of these images",
             )
         if not 1e-9 <= unit <= 1:
             raise self._error("depth_unit_m", f"is {unit}", "save the metres per count")
@@ -171,7 +171,7 @@ class NpzSource(FileSource):
 
     def _lens(self, arrays: dict[str, NDArray[Any]], width: int, height: int) -> Camera:
         if "K" not in arrays:
-            raise self._error("K", "is missing, and so is rays", "save one, or give --camera")
+            raise self._error("K", "is missing, and so is rays", "save one, or use --camera")
         K = self._floats(arrays, "K")
         if K.shape != (3, 3):
             raise self._error("K", f"has shape {K.shape}", "save (3, 3)")

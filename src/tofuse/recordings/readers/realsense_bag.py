@@ -130,7 +130,7 @@ class RealSenseSource(BagSource):
         if words.startswith("brown"):
             return brown
         raise InputError(
-            f"has the distortion model {info.model!r:.40}", where=where, remedy="give --camera"
+            f"has the distortion model {info.model!r:.40}", where=where, remedy="use --camera"
         )
 
     def _brown(self, stream: str) -> BrownConrady:
@@ -149,7 +149,7 @@ class RealSenseSource(BagSource):
     def _as_text(self, stream: str, where: str) -> Info:
         text = first_message(self.bag, f"{stream}/camera_info")
         if text is None:
-            raise InputError("has no camera_info", where=where, remedy="give --camera")
+            raise InputError("has no camera_info", where=where, remedy="use --camera")
         fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
         names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
         try:

@@ -319,7 +319,7 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
     """Return depth (H, W) in m; non-finite and implausible values become 0."""
     if depth.shape != (size[1], size[0]):
         raise InputError(
-            f"is {depth.shape[1]} x {depth.shape[0]} pixels, metadata says {size[0]} x {size[1]}",
+            f"is {depth.shape[1]} x {depth.shape[0]} pixels, metadata states {size[0]} x {size[1]}",
             where=where,
             remedy="export the recording again",
         )

@@ -55,7 +55,7 @@ class Redwood:
         return Sniff(
             UNSURE,
             f"depth/ and {color}/ but no camera",
-            "give --format redwood (a PrimeSense camera, millimetres), with --camera for another",
+            "use --format redwood (a PrimeSense camera, millimetres), with --camera for another",
         )
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
@@ -156,7 +156,7 @@ def _poses(path: Path, count: int) -> Float64:
     found = read_poses(path)
     if found.frames is None:
         raise InputError(
-            "has timestamps instead of frame numbers", where=path, remedy="give a .log"
+            "has timestamps instead of frame numbers", where=path, remedy="pass a .log"
         )
     if (found.frames >= count).any():
         raise InputError(

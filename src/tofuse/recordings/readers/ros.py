@@ -203,7 +203,7 @@ class RosSource(FileSource):
             raise InputError(
                 f"has no CameraInfo for {self.connection.topic}",
                 where=self.path,
-                remedy="give the depth camera by --camera camera.json",
+                remedy="pass the depth camera with --camera camera.json",
             )
         self.camera = self._lens_of(chosen[0])
 
@@ -296,7 +296,7 @@ class RosSource(FileSource):
         where = f"{self.path}: {info.topic}"
         for _, _, raw in self.bag.messages(connections=[info]):
             return lens(self.bag.deserialize(raw, info.msgtype), where)
-        raise InputError("has no message", where=where, remedy="give --camera camera.json")
+        raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
     def _color_image(self, track: Track, index: int, where: str) -> UInt8:
         turn = decompressed_color if track.connection.msgtype == COMPRESSED else color_image

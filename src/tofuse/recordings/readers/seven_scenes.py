@@ -66,7 +66,7 @@ class SevenScenes:
                 f"only {len(color)} of {len(files)} frames have colour: colour is ignored"
             )
         elif color:
-            source.warnings.append("colour is not registered to depth in 7-Scenes: used as it is")
+            source.warnings.append("colour is not registered to depth in 7-Scenes: used unchanged")
         stems = [file.name[: -len(".depth.png")] for file in files]
         poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
         if np.isfinite(poses).any():

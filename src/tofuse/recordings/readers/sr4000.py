@@ -58,7 +58,7 @@ class Sr4000:
         refuse_camera(options, "sr4000")
         files = _files(path)
         if not files:
-            raise InputError("has no .dat files", where=path, remedy="give the export's folder")
+            raise InputError("has no .dat files", where=path, remedy="pass the export's folder")
         return Sr4000Source(files)
 
 

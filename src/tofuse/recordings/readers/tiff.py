@@ -42,7 +42,7 @@ class Tiff:
         if not files:
             return None
         return Sniff(
-            UNSURE, f"{len(files)} .tif files", "give --format tiff and --camera camera.json"
+            UNSURE, f"{len(files)} .tif files", "use --format tiff and --camera camera.json"
         )
 
     def open(self, path: Path, options: ReaderOptions) -> TiffSource:
@@ -50,12 +50,12 @@ class Tiff:
         files = files_with(path, *_SUFFIXES) if is_folder(path) else []
         depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
         if not depth:
-            raise InputError("has no .tif of depth", where=path, remedy="give the folder of images")
+            raise InputError("has no .tif of depth", where=path, remedy="pass the folder of images")
         if options.camera is None:
             raise InputError(
                 "has no camera: the layout of .t3c files isn't published, and TIFF has none",
                 where=path,
-                remedy="give --camera camera.json with lens, depth_unit_m and depth_kind",
+                remedy="use --camera camera.json with lens, depth_unit_m and depth_kind",
             )
         amplitude = [f for f in files if f not in depth and _is_amplitude(f)]
         return TiffSource(path, depth, amplitude, options.camera)

@@ -58,7 +58,7 @@ class Tum:
             raise InputError(
                 "is a TUM folder without a camera in its name (freiburg1, 2 or 3)",
                 where=path,
-                remedy="give the colour camera by --camera camera.json",
+                remedy="pass the colour camera with --camera camera.json",
             )
         warnings: list[str] = []
         check_timestamps(times, path / "depth.txt", warnings)

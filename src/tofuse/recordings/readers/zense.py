@@ -42,7 +42,7 @@ class Zense:
         """See `Reader.open`."""
         files = _depth_files(path) if is_folder(path) else []
         if not files:
-            raise InputError("has no depth*.png", where=path, remedy="give the recording's folder")
+            raise InputError("has no depth*.png", where=path, remedy="pass the recording's folder")
         settings = _settings(path)
         camera: Pinhole | None = None
         rate = FRAME_RATE_HZ
