@@ -1,4 +1,4 @@
-"""Pictures of a result as of a dolls' house: surfaces from above, and the paths of the camera."""
+"""Oblique views of a result from above, with the camera trajectories."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEVELS = np.uint8(0xFC)  # noise in the lowest bits swells the file, and nobody 
 
 
 class Picture:
-    """A canvas that looks down at a slant, without perspective.
+    """A canvas with an oblique orthographic view from above.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The gallery of the documentation: what comes out well, and what does not.
+"""The gallery of the documentation: successful and failed reconstructions.
 
     python website/gallery.py [DIR]        default: docs/gallery
 

@@ -1,4 +1,4 @@
-"""What the documentation site does to the pages that a code hosting site shows as they are."""
+"""Changes that the documentation site makes to the Markdown pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of the thesis, and of the works that it cites, is where: the tables of docs/thesis.md.
+"""Where the methods of the thesis and of its references are implemented: tables of docs/thesis.md.
 
     python website/thesis.py          write them into the page
     python website/thesis.py --check  end with status 1 if the page says otherwise

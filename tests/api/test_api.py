@@ -1,4 +1,4 @@
-"""The Python interface: one line for each task."""
+"""The Python API: one call per task."""
 
 from __future__ import annotations
 

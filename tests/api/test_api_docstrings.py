@@ -1,4 +1,4 @@
-"""Every public name has a docstring that names each parameter."""
+"""Every public name documents all of its parameters."""
 
 from __future__ import annotations
 

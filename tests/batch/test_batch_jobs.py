@@ -1,4 +1,4 @@
-"""Lists of jobs: text and tables, names, and what is refused."""
+"""Lists of jobs: text and tables, names, invalid lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One long recording whose pieces of work are spread over a Dask cluster of two processes."""
+"""One long recording, computed in parts on a Dask cluster of two processes."""
 
 from __future__ import annotations
 

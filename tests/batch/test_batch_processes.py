@@ -1,4 +1,4 @@
-"""Batches as a person starts them: here and on Dask, whole, killed and told once more."""
+"""Batches from the command line: locally and on Dask, uninterrupted, killed and resumed."""
 
 from __future__ import annotations
 

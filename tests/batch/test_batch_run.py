@@ -1,4 +1,4 @@
-"""The loop of a batch, its records and its tables, with workers that do as they are told."""
+"""The loop of a batch, its records and its tables, with scripted workers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def cancelled(task: Task) -> Record:
 
 
 class Scripted(Workers):
-    """Do at once what the script says of the next start of a job, else finish it; one at a time."""
+    """Follow the script for the next start of a job, else finish it; one at a time."""
 
     def __init__(self, script: dict[str, Sequence[Outcome]] | None = None) -> None:
         self.script = {name: list(steps) for name, steps in (script or {}).items()}

@@ -1,4 +1,4 @@
-"""What is seen while a job runs: on a terminal, in a log, and by a program."""
+"""Progress of a job: on a terminal, in a log, and as JSON lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``tofuse register``: every kind of view and guess, what is printed and written, every refusal."""
+"""``tofuse register``: all kinds of views and guesses, its output, and its errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
 
 @pytest.fixture
 def light_page(monkeypatch) -> None:
-    """Leave out the page where the test doesn't look at it."""
+    """Skip the page if the test does not use it."""
     monkeypatch.setattr("tofuse.report.pair.render_pair", lambda result: "<html>")
 
 
@@ -335,7 +335,7 @@ def test_a_bad_guess_is_refused(name, clouds, tmp_path, capfd) -> None:
 
 
 def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ...]]:
-    """A view that can't be used, and what is said of it."""
+    """An unusable view, and its error message."""
     path = folder / "bad.ply"
     match name:
         case "missing":

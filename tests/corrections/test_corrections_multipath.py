@@ -1,4 +1,4 @@
-"""Compensation of light that surfaces reflect onto each other."""
+"""Multipath compensation."""
 
 from __future__ import annotations
 

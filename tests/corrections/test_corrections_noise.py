@@ -1,4 +1,4 @@
-"""What is known of a camera's noise reaches the frames, by way of the default method."""
+"""The default method attaches the camera's noise model to the frames."""
 
 from __future__ import annotations
 

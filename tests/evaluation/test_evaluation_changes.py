@@ -1,4 +1,4 @@
-"""What changed between two sessions, and what did not."""
+"""Changes between two sessions are detected, without false detections."""
 
 from __future__ import annotations
 

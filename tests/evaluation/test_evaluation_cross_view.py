@@ -1,4 +1,4 @@
-"""Images of the same side support poses, space seen through contradicts them, backs say nothing."""
+"""Images of the same side support poses, free-space violations contradict them, backs do not."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def ball(T: np.ndarray, index: int, radius: float = 0.4, noise: float = 0.001) -
 
 
 def round_it(count: int) -> np.ndarray:
-    """(count, 4, 4) poses on a circle round the ball, which they look at."""
+    """(count, 4, 4) poses on a circle around the ball, facing it."""
     about, back = np.eye(4), np.eye(4)
     about[:3, 3], back[:3, 3] = CENTRE, -CENTRE
     turns = [se3.exp(np.array([0, 0, 0, 0, 2 * np.pi * k / count, 0])) for k in range(count)]

@@ -1,4 +1,4 @@
-"""Given poses against registrations: how far off they are at least, and whether it is chance."""
+"""Given poses against registrations: lower bound of their error, and its significance."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_errors_are_compared_with_those_of_this_recording(truth) -> None:
 
 
 def test_a_chain_has_nothing_but_what_it_states(truth) -> None:
-    """Without spare pairs no residual tells the size of errors."""
+    """Without redundant pairs no residual shows the size of errors."""
     fit = fitted(measured(truth, reach=1), DEPTH_M)
     assert fit.scale == pytest.approx(1.0)
     assert deviation(fit, truth).consistent

@@ -1,4 +1,4 @@
-"""Accuracy and completeness of surfaces, against distances worked out by hand."""
+"""Accuracy and completeness of surfaces, against distances computed by hand."""
 
 from __future__ import annotations
 

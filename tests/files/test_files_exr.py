@@ -1,4 +1,4 @@
-"""OpenEXR images, written here by the published layout."""
+"""OpenEXR images, written here according to the specification."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""glTF binary: read back by a parser that shares nothing with the writer."""
+"""glTF binary, read back by an independent parser."""
 
 from __future__ import annotations
 

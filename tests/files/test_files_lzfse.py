@@ -1,4 +1,4 @@
-"""LZFSE: a stream of Apple's own encoder, and streams that are damaged."""
+"""LZFSE: a stream of Apple's own encoder, and damaged streams."""
 
 from __future__ import annotations
 

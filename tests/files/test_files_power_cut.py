@@ -1,4 +1,4 @@
-"""Whatever was done when the power went, a folder holds the old, or the new, or how to go on."""
+"""After a power cut at any point, a folder has the old result, the new one, or a recovery plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectories of other programs: each format gives the same poses, bad files one clear error."""
+"""Trajectories of other programs: all formats give the same poses, invalid files a clear error."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""An object told from its background, and the lens's scattering learnt from both, as simulated.
+"""Segmentation of an object from its background, and lens scattering estimated from both.
 
-All of the camera's errors are on. The truth is what the rays of the pixels' middles hit.
+All camera errors are simulated. The ground truth is what the central ray of each pixel hits.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Filters that judge each point by itself: confidence, amplitude, distance, box, foreground."""
+"""Filters of single points: confidence, amplitude, distance, box, foreground."""
 
 from __future__ import annotations
 

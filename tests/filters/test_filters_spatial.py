@@ -1,4 +1,4 @@
-"""Filters that compare a point with its neighbours: angle, median, nearest neighbours, time."""
+"""Filters over neighbours: angle, median, nearest neighbours, time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pixels that wrapped are left out of the model; dark and near ones stay."""
+"""Wrapped pixels are excluded from the model; dark and near ones are kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fused cloud: exact averages of voxels, normals, colours, bounded memory."""
+"""The fused cloud: exact voxel averages, normals, colours, bounded memory."""
 
 from __future__ import annotations
 

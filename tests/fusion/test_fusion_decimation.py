@@ -1,4 +1,4 @@
-"""Decimation by collapsing edges: shape, orientation, attributes, and meshes that are unusual."""
+"""Decimation by edge collapse: shape, orientation, attributes, and unusual meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The accuracy of a surface has that of the poses in it."""
+"""The accuracy of a surface includes that of the poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fusion in regions that fit into memory: what they hold, who sees them, and that no seam shows."""
+"""Fusion in regions that fit into memory: their blocks and views, and seamless borders."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_regions_make_the_same_surface_to_the_byte(room, memory_mb, least) -> No
 
 
 def test_turns_colours_and_views_of_two_cameras_make_no_seam() -> None:
-    """Views have turns by the numbers of blocks and views, whichever are looked at together."""
+    """Round-robin depends on the numbers of blocks and views, not on how they are grouped."""
     frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
     rng = np.random.default_rng(4)
     color = rng.integers(0, 255, (72, 88, 3)).astype(np.uint8)
@@ -138,7 +138,7 @@ def test_views_that_are_passed_over_would_have_told_nothing(room, which) -> None
 
 
 def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
-    """Blocks also where no surface is: what is told of free space reaches to the camera."""
+    """Blocks also in free space, which is integrated up to the camera."""
     rng = np.random.default_rng(11)
     T = look([0.2, -0.1, 0.3], [0.6, 0.2, 2.3])
     view = RangeView.of(frame_of(rng.uniform(0.8, 2.0, (72, 88)), sigma=0.01))

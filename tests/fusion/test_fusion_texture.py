@@ -1,4 +1,4 @@
-"""Textures: layout, content, files; and what is done to meshes before."""
+"""Textures: layout, content, files; and the preparation of meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The surface of range images: where it is, that it closes, what it leaves out, and its bytes."""
+"""TSDF surfaces: position, closedness, excluded parts, and reproducibility."""
 
 from __future__ import annotations
 

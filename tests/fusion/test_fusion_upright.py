@@ -1,4 +1,4 @@
-"""Which way up a model is, without gravity."""
+"""The up direction of a model, without gravity."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def surface(points: np.ndarray, normals: np.ndarray) -> Mesh:
 
 
 def room(*, floor: int = 900, ceiling: int = 0, walls: int = 400, turned: float = 0.3) -> Mesh:
-    """A room of 4 x 2.5 x 3 m with so many vertices of each part, turned about the vertical."""
+    """A room of 4 x 2.5 x 3 m with a number of vertices per part, rotated about the vertical."""
     x, y, z = (RNG.uniform(-1, 1, 4000) * half for half in (2.0, 1.25, 1.5))
     one = np.ones(4000)
     sides = [

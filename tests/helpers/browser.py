@@ -1,4 +1,4 @@
-"""A headless Chromium that may reach nothing but what a test shows it."""
+"""A headless Chromium without access to anything but the page of a test."""
 
 from __future__ import annotations
 

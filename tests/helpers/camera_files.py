@@ -1,4 +1,4 @@
-"""Small recordings of camera makers' formats, and a full read of one."""
+"""Small recordings in manufacturers' formats, and a full read of one."""
 
 from __future__ import annotations
 

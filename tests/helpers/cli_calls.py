@@ -1,4 +1,4 @@
-"""Call the command line in this process and check refusals."""
+"""Call the command line in this process and check its errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def listing(folder: Path) -> list[str]:
 
 
 def refuses(capfd, *words: object, says: tuple[str, ...], prefix: str = "tofuse: ") -> str:
-    """Call the command and check that it says one line, with all of `says` in it."""
+    """Call the command and check that it prints one line that contains all of `says`."""
     capfd.readouterr()
     assert call(*words) == 2
     done = capfd.readouterr()

@@ -1,4 +1,4 @@
-"""Stand-ins for the makers' packages, with the names and units of their documentation."""
+"""Mocks of the manufacturers' packages, with the names and units of their documentation."""
 
 from __future__ import annotations
 

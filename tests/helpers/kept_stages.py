@@ -15,7 +15,7 @@ class Stopped(BaseException):
 
 
 class Kept(Stages):
-    """Keeps states as bytes after every frame, and stops when told."""
+    """Stores the state as bytes after every frame, and stops on request."""
 
     def __init__(self, stop_at: int) -> None:
         self.states: dict[str, tuple[str, dict[str, np.ndarray]]] = {}

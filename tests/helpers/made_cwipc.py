@@ -1,4 +1,4 @@
-"""Folders of cwipc: cameras around a floor and two walls, seen by the recorders of their makers."""
+"""Folders of cwipc: cameras around a floor and two walls, in the formats of their recorders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T_COLOR_DEPTH[:3, 3] = BASELINE
 
 
 def looking(position: tuple[float, float, float], turn: float) -> np.ndarray:
-    """T_world_camera of a camera that looks along -z and down, turned about the vertical."""
+    """T_world_camera of a camera that looks along -z and down, rotated about the vertical."""
     T = rotation([0.0, turn, 0.0]) @ rotation([-0.4, 0.0, 0.0]) @ rotation([np.pi, 0.0, 0.0])
     T[:3, 3] = position
     return T

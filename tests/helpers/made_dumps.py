@@ -1,4 +1,4 @@
-"""Small recordings as other programs lay them out: Polycam, nerfstudio, HoloLens 2 and others."""
+"""Small recordings in the layouts of other programs: Polycam, nerfstudio, HoloLens 2 and others."""
 
 from __future__ import annotations
 

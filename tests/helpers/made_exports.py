@@ -1,7 +1,7 @@
 """Clouds with a point for each pixel, and TIFF images, as viewers of ToF cameras export them.
 
-The coordinates are those that the makers document (Helios: from the front of the housing, x to the
-right and y down, in steps of 0.25 mm; blaze: mm, 0 where invalid; pmd's Royale: m).
+The coordinates are those that the manufacturers document (Helios: from the front of the housing, x
+to the right and y down, in steps of 0.25 mm; blaze: mm, 0 where invalid; pmd's Royale: m).
 """
 
 from __future__ import annotations

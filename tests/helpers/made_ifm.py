@@ -1,4 +1,4 @@
-"""PCIC streams of an O3R head, written by the maker's layout."""
+"""PCIC streams of an O3R head, in the manufacturer's layout."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def chunk(kind: int, content: bytes, size: tuple[int, int], format_: int, k: int
 
 
 def head_info(unit: float = UNIT, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
-    """Chunk 420: what the head says of a frame."""
+    """Chunk 420: metadata of a frame."""
     info = struct.pack("<I2f3f6fI32f", 1, unit, 1e-8, 1, 1, 1, *([0.0] * 6), model,
                        *numbers, *([0.0] * 22))  # fmt: skip
     return info + bytes(4 + 128)  # the lens the other way round, which isn't used

@@ -1,4 +1,4 @@
-"""Small recordings of phones, as their apps lay them out."""
+"""Small recordings of phones, in the layouts of their apps."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def make_record3d(folder: Path) -> None:
 
 
 def lzfse_raw(data: bytes) -> bytes:
-    """An LZFSE stream of one block that is stored as it is."""
+    """An LZFSE stream of one uncompressed block."""
     return b"bvx-" + struct.pack("<I", len(data)) + data + b"bvx$"
 
 

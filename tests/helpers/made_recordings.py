@@ -1,4 +1,4 @@
-"""Small recordings in foreign formats, made by tests that know their truth."""
+"""Small recordings in other formats, with known ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small results, and what is in a folder."""
+"""Small results, and contents of a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of runs on small recordings of one room, or of another one of the same plan."""
+"""Results of runs on small recordings of one room, or of another one with the same plan."""
 
 from __future__ import annotations
 

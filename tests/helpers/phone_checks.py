@@ -1,4 +1,4 @@
-"""Checks of what a phone's recording must give."""
+"""Checks of a phone's recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A path that leaves a place and comes back to it."""
+"""A path that leaves a place and returns to it."""
 
 from __future__ import annotations
 

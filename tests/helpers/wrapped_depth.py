@@ -8,7 +8,7 @@ import numpy as np
 
 
 def wrapping(frames, period):
-    """Of a camera whose phase repeats after so many metres, which compensates light by range."""
+    """Frame of a camera with this ambiguity range and range-compensated amplitude."""
     out = []
     for f in frames:
         radial = np.maximum(f.radial_range, np.float32(1e-6))

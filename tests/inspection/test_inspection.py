@@ -1,4 +1,4 @@
-"""What `inspect` says of a recording, and what it warns of."""
+"""Properties and findings that `inspect` reports."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def room_depth(camera, T: np.ndarray, rng: np.random.Generator) -> tuple[np.ndar
 
 
 def turning(count: int = 16, degrees: float = 8.0, camera=ROOM, seed: int = 0):
-    """Frames of a camera that turns and slides a little, with time stamps at 10 Hz."""
+    """Frames of a camera that rotates and translates slightly, with timestamps at 10 Hz."""
     rng = np.random.default_rng([seed, 7])
     frames = []
     for k in range(count):

@@ -1,4 +1,4 @@
-"""Kernels that a second process compiles beside the first run."""
+"""Kernels that a second process compiles during the first run."""
 
 from __future__ import annotations
 

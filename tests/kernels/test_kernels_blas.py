@@ -1,4 +1,4 @@
-"""BLAS keeps to one thread inside the block, and is as before after it."""
+"""BLAS is limited to one thread inside the block, and restored after it."""
 
 from __future__ import annotations
 

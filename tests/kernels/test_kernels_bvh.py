@@ -1,4 +1,4 @@
-"""The tree of boxes against every ray tried on every triangle, and its promises."""
+"""The bounding volume hierarchy against brute-force intersection, and its guarantees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Groups of vertices and sums over their triangles, beside slow twins."""
+"""Groups of vertices and sums over their triangles, against slow references."""
 
 from __future__ import annotations
 

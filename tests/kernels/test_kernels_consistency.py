@@ -1,4 +1,4 @@
-"""Kernels of map consistency against what they stand for."""
+"""Kernels of map consistency against their definitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernels of registration by surfaces equal their slow twins."""
+"""The kernels of surface registration equal their slow references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled kernels where the cache can't be written, and a cache that can't go stale."""
+"""Compiled kernels without a writable cache, and a cache that can't become stale."""
 
 from __future__ import annotations
 

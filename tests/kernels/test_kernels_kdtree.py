@@ -1,4 +1,4 @@
-"""The kd-tree finds exactly what a search through all points finds."""
+"""The kd-tree against brute-force search."""
 
 from __future__ import annotations
 

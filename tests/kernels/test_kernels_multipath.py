@@ -1,4 +1,4 @@
-"""The kernels of multipath compensation against slow NumPy twins."""
+"""The kernels of multipath compensation against slow NumPy references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Neighbourhood kernels against slow twins in NumPy."""
+"""Neighbourhood kernels against slow NumPy references."""
 
 from __future__ import annotations
 

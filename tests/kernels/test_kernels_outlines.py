@@ -1,4 +1,4 @@
-"""Planes carried to the pixels beside them, against a slow NumPy twin."""
+"""Planes extended to adjacent pixels, against a slow NumPy reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The normal equations of a pair of views, against derivatives by differences."""
+"""The normal equations of a pair of views, against finite differences."""
 
 from __future__ import annotations
 

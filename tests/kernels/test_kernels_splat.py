@@ -1,4 +1,4 @@
-"""Which point is seen at each pixel, beside a slow twin."""
+"""The visible point at each pixel, against a slow reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plane fits, halving and slopes of range images, against slow NumPy twins."""
+"""Plane fits, halving and slopes of range images, against slow NumPy references."""
 
 from __future__ import annotations
 

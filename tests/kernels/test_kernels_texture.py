@@ -1,4 +1,4 @@
-"""Procedural albedo against its NumPy twin, and its promises."""
+"""Procedural albedo against a NumPy reference, and its guarantees."""
 
 from __future__ import annotations
 

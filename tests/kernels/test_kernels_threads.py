@@ -1,4 +1,4 @@
-"""The pool: the same results, in order, for any number of threads."""
+"""The thread pool: the same results, in order, for any number of threads."""
 
 from __future__ import annotations
 

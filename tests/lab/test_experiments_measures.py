@@ -1,4 +1,4 @@
-"""What is measured on trajectories and models is what it says, on shapes that are known."""
+"""Measures of trajectories and models, on known shapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiments' page: what is judged follows the numbers, and nothing of others is touched."""
+"""The experiments' page: verdicts follow the numbers, and foreign files are untouched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bound of a recording: the noise that it rests on, and how it changes with what is seen."""
+"""The Cramér-Rao bound of a recording: its noise model, and its dependence on the scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Methods for two views that no configuration uses: what their papers claim."""
+"""Methods for two views that no configuration uses: claims of their papers."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_ls3d_leaves_out_what_is_no_part_of_the_other_surface():
 
 
 def test_ls3d_with_intensity_does_not_slide_along_a_wall():
-    """Akca 2007: the intensity is a second surface that holds what the first does not."""
+    """Akca 2007: the intensity is a second surface that constrains what the first does not."""
 
     def wall(seed, T):
         p = np.column_stack([rng(seed).uniform(-0.6, 0.6, (5000, 2)), np.full(5000, 2.0)])

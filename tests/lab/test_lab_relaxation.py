@@ -1,4 +1,4 @@
-"""Lu and Milios in six dimensions, and ELCH: what their papers claim of them."""
+"""6D Lu-Milios and ELCH: claims of their papers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph
 
 
 def test_one_linear_system_is_the_whole_of_a_linear_problem():
-    """Of cameras that don't turn, one step is the weighted mean, by dense least squares."""
+    """Without rotation one step is the weighted mean, by dense least squares."""
     rng = np.random.default_rng(0)
     n = 7
     pairs = [(k, k + 1) for k in range(n - 1)] + [(0, 6), (1, 5), (2, 6)]

@@ -1,4 +1,4 @@
-"""Stochastic gradient descent over a pose graph: what Olson claims of it."""
+"""Stochastic gradient descent over a pose graph: claims of Olson's paper."""
 
 from __future__ import annotations
 

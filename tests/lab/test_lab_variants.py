@@ -1,4 +1,4 @@
-"""Choices of parts that have a name: each does what its paper claims."""
+"""Named combinations of parts: claims of their papers."""
 
 from __future__ import annotations
 

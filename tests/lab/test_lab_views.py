@@ -1,4 +1,4 @@
-"""Methods for many views that no configuration uses: what their papers claim."""
+"""Methods for many views that no configuration uses: claims of their papers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VIEWS = 8
 
 
 def rock(n, seed):
-    """A body half a metre in radius that no turn brings into itself."""
+    """A body with a radius of half a metre without rotational symmetry."""
     d = directions(n, seed)
     radius = 0.5 + 0.05 * np.sin(9 * d[:, 0] + 1) * np.cos(8 * d[:, 1]) * np.sin(7 * d[:, 2] + 2)
     radius += 0.04 * np.sin(6 * d[:, 1] + 3 * d[:, 2]) + 0.06 * d[:, 0] * d[:, 2]

@@ -1,4 +1,4 @@
-"""The synthetic case of the thesis: its geometry, and what the noise sweep shows."""
+"""The synthetic case of the thesis: its geometry, and results of the noise sweep."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes and paths: sizes, counts and motion of the test cases, and exact truth."""
+"""Scenes and paths: sizes, counts and motion of the test cases, and exact ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels of the simulated camera against slow NumPy twins."""
+"""Kernels of the simulated camera against slow NumPy references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole simulated recordings: on disk, in memory, and the truth beside them."""
+"""Whole simulated recordings: on disk, in memory, and their ground truth."""
 
 from __future__ import annotations
 

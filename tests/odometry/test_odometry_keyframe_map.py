@@ -1,4 +1,4 @@
-"""Which keyframes are kept, and how often lost views are searched for among them."""
+"""Selection of stored keyframes, and the frequency of relocalization among them."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_view_becomes_a_keyframe_by_its_motion() -> None:
 
 @pytest.fixture(scope="module")
 def around():
-    """Keyframes of two components that look different ways."""
+    """Keyframes of two components with different viewing directions."""
     keyframes = KeyframeMap(0.2, 0.1)
     poses = [at(0, 0.3, 0.7 * k) for k in range(6)]
     for k, T in enumerate(poses):

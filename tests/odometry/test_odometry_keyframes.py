@@ -1,4 +1,4 @@
-"""Odometry against keyframes: follows, begins anew what it can't connect, and links it."""
+"""Odometry against keyframes: tracking, new components for unconnected views, and links."""
 
 from __future__ import annotations
 
@@ -459,7 +459,7 @@ def test_a_real_camera_close_to_a_door_stays_where_it_is(shared_data):
 
 
 def test_a_box_that_turns_by_half_a_corner_is_not_taken_for_its_other_sides():
-    """At 46 degrees an alignment from where it was may as well end a quarter of a turn off."""
+    """At 46 degrees an alignment from the initial pose may converge to an error of 90 degrees."""
     scene = Sequence("box", range(0, 4 * 72, 72))
     steps = run([f.keep(f.z < 1.8) for f in scene.frames])
     assert_right(steps, scene.poses)

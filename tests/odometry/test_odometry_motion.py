@@ -1,4 +1,4 @@
-"""How cameras move: what goes on is expected, what comes out of nowhere is a surprise."""
+"""The motion model: continued motion is expected, a jump is outside of the gate."""
 
 from __future__ import annotations
 
@@ -257,7 +257,7 @@ def test_deviations_are_multiples_of_what_is_usual() -> None:
 
 
 def turning(count):
-    """Poses of a camera that begins to turn quickly at the last one."""
+    """Poses of a camera that starts to rotate fast at the last one."""
     poses = walk(count)
     poses[-1] = poses[-1] @ se3.exp(np.array([0, 0, 0, 0, 0.5, 0]))
     return poses

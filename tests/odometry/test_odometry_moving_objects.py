@@ -1,4 +1,4 @@
-"""What moves by itself is segmented, the static scene is not, and a wrong pose is no motion."""
+"""Moving objects are segmented, the static scene is not, nor do wrong poses cause segments."""
 
 from __future__ import annotations
 

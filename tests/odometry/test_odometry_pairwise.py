@@ -1,4 +1,4 @@
-"""Views that are registered one by one: where the motion is thought to lead."""
+"""Views that are registered one by one: predicted motion."""
 
 from __future__ import annotations
 

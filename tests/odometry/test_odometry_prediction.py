@@ -1,4 +1,4 @@
-"""How far off an extrapolated motion is."""
+"""The error of extrapolated motion."""
 
 import itertools
 
@@ -75,7 +75,7 @@ def test_predicted_error_is_that_of_the_recording() -> None:
 
 
 def test_degenerate_directions_do_not_count() -> None:
-    """A direction that goes on by its prediction agrees with it, and says nothing."""
+    """A direction that follows its prediction agrees with it, and is no evidence."""
     motions = around_a_mean(np.random.default_rng(7), 300)
     motions[:, 1] = 0.02
     poses = path(motions * [1, 1, 1, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""Which explanation of a view is accepted: the camera, what moves by itself, or a quick motion."""
+"""Accepted explanations of a view: camera motion, a moving object, or a fast motion."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def found(T, share=0.5):
 
 @dataclass(frozen=True)
 class Scripted(Registrar):
-    """Answers in turn with the given motions, shares or errors, and remembers the questions."""
+    """Returns the given motions, ratios or errors one after the other, and records the calls."""
 
     answers: list
     asked: list = field(default_factory=list)
@@ -174,7 +174,7 @@ def test_rotations_stay_rotations_over_long_sequences():
 
 
 def room_views(count, seed=0):
-    """Views from a camera that moves 15 mm and turns 0.5 degrees a frame before three walls."""
+    """Views of a camera in front of three walls that moves 15 mm and 0.5 degrees per frame."""
     T = se3.exp(np.arange(count)[:, None] * [0.012, -0.005, 0.008, 0.004, 0.008, -0.003])
     views = []
     for k in range(count):

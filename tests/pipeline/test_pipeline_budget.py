@@ -1,4 +1,4 @@
-"""What `--memory` is divided into."""
+"""Division of `--memory`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that were stopped go on, and give what they would have given."""
+"""Interrupted runs resume, with the results of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -417,7 +417,7 @@ sys.exit(main(sys.argv[4:]))
 
 
 def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[int, str]:
-    """Exit status and what was said of a run that is killed on its way."""
+    """Exit status and messages of a run that is killed."""
     job = ["run", "--out", out, *words]
     command = [sys.executable, "-c", _KILLED, out, event, move, *job]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)

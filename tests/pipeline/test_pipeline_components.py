@@ -1,4 +1,4 @@
-"""Recordings that were not tracked in one go: joined where they belong together, else apart."""
+"""Recordings tracked in several components: joined if they overlap, else separate."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def forward() -> list[RangeFrame]:
 
 @pytest.fixture(scope="module")
 def wall() -> list[RangeFrame]:
-    """Along a wall with pictures on it, which only light tells from standing still."""
+    """Along a wall with pictures, where only amplitude shows the motion."""
     scene, path = build("wall", texture=True)
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")

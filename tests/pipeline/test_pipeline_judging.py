@@ -1,4 +1,4 @@
-"""Poses from elsewhere: how far off they are is found without a reference."""
+"""The error of given poses is estimated without a reference."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def truth(recording):
 
 
 def bent(truth):
-    """The second half is 8 cm and 3 degrees beside the first."""
+    """The second half is displaced from the first by 8 cm and 3 degrees."""
     out = truth.copy()
     out[4:] = se3.exp(np.array([0.06, 0.04, -0.03, 0.02, -0.05, 0])) @ out[4:]
     return out
@@ -212,7 +212,7 @@ def test_command_refuses(room_recording, tmp_path, capsys) -> None:
 
 
 def test_poses_that_a_phone_found_are_judged_unasked(recording, truth) -> None:
-    """What it says of them holds for the poses that the phone would have got wrong."""
+    """Its statements also hold for wrong poses of the phone."""
     result = tofuse.reconstruct(recording)
     assert device_sentence(recording, result) == ""  # poses of a simulation are nobody's
     phone = phone_of(recording, bent(truth))

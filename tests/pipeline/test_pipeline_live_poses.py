@@ -1,4 +1,4 @@
-"""Loops that close while frames arrive."""
+"""Loop closure during tracking."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_an_error_in_a_job_is_not_swallowed():
 
 
 class _AlwaysClosing:
-    """Loops of which every look finds one."""
+    """Loops of which every search finds one."""
 
     points: ClassVar[bool] = False
 

@@ -1,4 +1,4 @@
-"""The engine: online and whole runs agree, and what is pushed wrongly is refused."""
+"""The mapper: online and whole runs agree, and invalid frames are rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole reconstructions with gravity and odometry beside the images, and without."""
+"""Whole reconstructions with gravity and odometry priors, and without."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a device knows of its poses counts as far as it was asked for and agrees."""
+"""A device's own poses are used if requested and consistent."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_an_unknown_prior_is_refused(recording) -> None:
 
 
 def test_poses_of_another_place_do_not_count(recording) -> None:
-    """A phone that lost itself: what it says disagrees with the images."""
+    """A phone that lost tracking: its poses disagree with the images."""
     rng = np.random.default_rng(0)
     wrong = recording.reference.copy()
     wrong[:, :3, 3] = rng.uniform(-2, 2, (len(wrong), 3))

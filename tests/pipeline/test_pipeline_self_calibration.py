@@ -1,4 +1,4 @@
-"""A recording that shows an error of its camera is reconstructed without it."""
+"""A recording that reveals a calibration error is reconstructed with a correction."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def seen_by(recording: Recording, share: float, kind: str = "z") -> Recording:
-    """The recording as if its camera had so many times its focal length.
+    """The recording with the focal length multiplied by a factor.
 
     The camera measures z, or `kind` "range".
     """

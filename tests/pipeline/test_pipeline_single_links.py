@@ -1,4 +1,4 @@
-"""Frames that a single link connects with the rest are told of."""
+"""Frames connected to the rest by a single link are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Corrections that are on trial are applied where what they take off is there, and only there."""
+"""Corrections with a trial are applied only if there is evidence of the error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Listener(Silent):
 
 @pytest.fixture(scope="module")
 def straight() -> Recording:
-    """A turn in a room without indirect light."""
+    """A rotation in a room without multipath."""
     effects = Effects.none(shot_noise=True)
     return simulate_recording("empty-room", every=6, frames=40, effects=effects)
 

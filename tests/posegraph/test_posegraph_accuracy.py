@@ -1,4 +1,4 @@
-"""Bounds hold as often as they say, and what nothing measures is not bounded."""
+"""Coverage of the error bounds; unobservable poses are not bounded."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_directions_that_differ_slightly_do_not_bound_each_other() -> None:
 
 
 def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> None:
-    """That its keyframe was degenerate beside an earlier one says nothing of it."""
+    """Degeneracy of its keyframe with an earlier one does not affect it."""
     graph = walk()
     own = {
         (i, j) for (i, j), loop in zip(graph.edges.tolist(), graph.loop, strict=True) if not loop
@@ -162,7 +162,7 @@ def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> No
 
 @pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
 def test_what_a_pair_sees_decides(view, degenerate) -> None:
-    """A frame that was degenerate beside its keyframe need not be beside other views."""
+    """A frame that is degenerate with its keyframe need not be so with other views."""
     surface = flat_wall() if view == "wall" else surface_of_corner()
     steps = [Measured(0, 1, np.eye(4), np.eye(6) * 1e6)]
     graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), steps)

@@ -1,4 +1,4 @@
-"""Graphs that can not be meant or improved: each optimiser says so, and harms nothing."""
+"""Invalid or degenerate graphs: each optimiser reports them, and leaves them unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views that tell what is wrong with their camera, and views that don't."""
+"""Views that determine the calibration error of their camera, and views that don't."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Castellani's optimisation: the objective of eq 2.10, and what the paper claims of it."""
+"""Castellani's optimisation: the objective of eq 2.10, and claims of the paper."""
 
 from __future__ import annotations
 

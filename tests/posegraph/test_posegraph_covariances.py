@@ -1,4 +1,4 @@
-"""What a graph knows of its poses agrees with how far off they are when it is solved often."""
+"""Covariances of a graph agree with the errors over repeated solutions."""
 
 from __future__ import annotations
 

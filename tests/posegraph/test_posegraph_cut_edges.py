@@ -1,4 +1,4 @@
-"""Edges that alone hold a graph together."""
+"""Bridges: edges whose removal disconnects a graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gravity and odometry priors the camera: how they are weighed, and that wrong ones do no harm."""
+"""Gravity and odometry priors: their weights, and robustness to wrong ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DOWN = np.array([0.1, 0.97, -0.2]) / np.linalg.norm([0.1, 0.97, -0.2])
 
 
 def truth() -> np.ndarray:
-    """A turn with some nodding."""
+    """A rotation with some pitching."""
     a = np.linspace(0, 2 * np.pi, N)
     turn = se3.so3_exp(np.stack([0.1 * np.sin(3 * a), a, 0.1 * np.cos(2 * a) - 0.1], 1))
     out = np.tile(np.eye(4), (N, 1, 1))
@@ -77,7 +77,7 @@ def seen_down(poses: np.ndarray, sigma: float = 0.02, seed: int = 1) -> np.ndarr
 
 
 def tilt(poses: np.ndarray, right: np.ndarray) -> float:
-    """Rms angle between the vertical as the poses have it and as it is, rad."""
+    """Rms angle between the vertical by the poses and the true one, rad."""
     d = np.einsum("kij,klj,l->ki", poses[:, :3, :3], right[:, :3, :3], DOWN)
     return float(np.sqrt(((d - DOWN) ** 2).sum(1).mean()))
 
@@ -265,7 +265,7 @@ def test_options_that_make_no_sense_are_refused(part, options):
 
 
 def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
-    """Views of a bare wall, which any turn about its normal and shift along it leaves as it is."""
+    """Views of a bare wall, invariant to rotation about its normal and translation along it."""
     poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))
     views = []
     for k, T in enumerate(poses):

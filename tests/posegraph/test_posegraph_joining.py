@@ -1,4 +1,4 @@
-"""Components of one recording, joined by what links between them say together."""
+"""Components of one recording, joined by consistent links."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
 
 
 def stretch(component, frames, path=PATH, every=3, dark=False, late=0.0, **scene):
-    """A component with exact poses in a frame of its own, and every so many-th view."""
+    """A component with exact poses in its own frame, and every n-th view."""
     frames = list(frames)
     poses = np.stack([se3.inverse(path[frames[0]]) @ path[k] for k in frames])
     views = []
@@ -40,7 +40,7 @@ def stretch(component, frames, path=PATH, every=3, dark=False, late=0.0, **scene
 
 
 def linked(first, second, certain=True, off=None):
-    """A true link between frames of two stretches, or one that is off by a motion."""
+    """A true link between frames of two components, or one with an error."""
     a, b = first.views[-1], second.views[0]
     T = se3.inverse(PATH[a.index]) @ PATH[b.index]
     return link_of(a, b, T if off is None else T @ off, certain)
@@ -194,7 +194,7 @@ def test_one_link_that_is_not_certain_needs_another_view_that_says_the_same(
 
 
 def turned_back(late):
-    """A slow turn to the right, and a view from where it began, some time after its end."""
+    """A slow rotation to the right, and a view from its start, some time after its end."""
     turn = [at(0.0, 0.2, 0.05 * k) for k in range(31)]
     path = [*turn, *(at(0.0, 0.2, 0.05 * k) for k in range(8))]
     before = stretch(0, range(31), path, every=5)
@@ -205,7 +205,7 @@ def turned_back(late):
 
 @pytest.mark.parametrize(("late", "joined"), [(0.0, False), (5.0, True)])
 def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) -> None:
-    """It turned by 0.5 rad/s, and would have had to turn by 1.5 rad at once."""
+    """It rotated at 0.5 rad/s, and would have to rotate by 1.5 rad at once."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(late)
     groups = SPARSELY.join(parts, [link])
@@ -233,7 +233,7 @@ def two_rooms_that_look_alike():
 
 
 def test_a_single_link_waits_for_links_elsewhere() -> None:
-    """The views at the gap are alike, and a link between them would be certain."""
+    """The views at the gap are similar, and a link between them would be certain."""
     path, parts = two_rooms_that_look_alike()
     a, b = parts[0].views[-1], parts[1].views[0]
     wrong = link_of(a, b, np.eye(4))
@@ -247,7 +247,7 @@ def test_a_single_link_waits_for_links_elsewhere() -> None:
 
 
 def views_in_no_order(off):
-    """A few frames of a walk, then single ones; a certain link between the first two is off."""
+    """A few frames of a walk, then single ones; a certain link between the first two is wrong."""
     order = [0, 1, 2, 14, 4, 16, 6, 18, 8, 12, 10]
     path = [PATH[k] for k in order]
     frames = [range(3), *([k] for k in range(3, len(order)))]
@@ -266,7 +266,7 @@ def test_what_hangs_on_a_single_link_is_reconsidered() -> None:
 
 
 def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) -> None:
-    """Without a motion between them, a single link need not wait; but not where it says one."""
+    """Without motion between them, a single link is used at once; but not if it implies motion."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
     joiner = joining._Joiner(Joining(), three[:2], SearchOptions())
@@ -288,7 +288,7 @@ BARE = {"boxes": (), "spots": 0, "dark": True}
 
 
 def along_a_wall(shake=0.0):
-    """A camera that goes along a bare wall, which no view can tell from any other place."""
+    """A camera that moves along a bare wall, where all places look the same."""
     rng = np.random.default_rng(4)
     path = [
         at(0.02 * k, 1.0, 0.0, pitch=0.0) @ se3.exp(shake * rng.standard_normal(6))
@@ -382,7 +382,7 @@ def probable(first, second, p, T=None):
 
 @pytest.fixture
 def min_probability(three, monkeypatch):
-    """Joins two stretches by links alone, and says how sure that is; None if it refuses."""
+    """Join two components by links alone, and return the probability; None if rejected."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
 

@@ -1,4 +1,4 @@
-"""Neighbouring views must agree after loops were closed as they did before."""
+"""Neighbouring views must agree after loop closure as well as before."""
 
 from __future__ import annotations
 

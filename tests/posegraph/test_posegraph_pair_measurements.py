@@ -1,4 +1,4 @@
-"""Pairs of views measure the motion between them, each by itself."""
+"""Independent relative pose measurements of pairs of views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refinement of clouds by common planes: against the peaks, a slow twin and the bound."""
+"""Refinement of clouds by common planes: against the peaks, a slow reference and the bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loops of range images: the camera looks away from a corner, and comes back."""
+"""Loops of range images: the camera turns away from a corner, and returns."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_views_that_never_left_each_other_are_no_loop(turn):
 
 
 def test_a_view_of_something_else_is_refused_with_a_reason(turn):
-    """The last views show another place: the trajectory says that they see the first again."""
+    """The last views show another place, but overlap with the first by the trajectory."""
     frames, truth, start = turn
     strange = [
         *frames[:11],

@@ -1,4 +1,4 @@
-"""Errors that patches of views share, in a refinement: their sums, size, and what they cost."""
+"""Patch-correlated errors in a refinement: their sums, size, and cost."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
 
 @pytest.mark.parametrize("size", [0.0, 0.01])
 def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
-    """With no errors but the pixels' none are found; else about as large as they are."""
+    """None are found with pixel noise only; otherwise their size is estimated."""
     rng = np.random.default_rng(5)
     T = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
     seen = []

@@ -1,4 +1,4 @@
-"""Halves of the images show errors of the poses that leave hardly any residuals."""
+"""Halves of the images reveal pose errors that leave hardly any residuals."""
 
 from __future__ import annotations
 

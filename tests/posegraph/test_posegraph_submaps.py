@@ -1,4 +1,4 @@
-"""Refinement in submaps, beside that of all views at once, and what finds pairs among many."""
+"""Refinement in submaps, compared with that of all views at once; search for pairs."""
 
 from __future__ import annotations
 

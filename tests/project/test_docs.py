@@ -1,4 +1,4 @@
-"""What the documents say is so: code runs, commands parse, lists are complete, links lead on."""
+"""The documents are correct: code runs, commands parse, lists are complete, links are valid."""
 
 from __future__ import annotations
 

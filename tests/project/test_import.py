@@ -1,4 +1,4 @@
-"""``import tofuse`` and ``tofuse --help`` are light."""
+"""``import tofuse`` and ``tofuse --help`` are fast."""
 
 from __future__ import annotations
 

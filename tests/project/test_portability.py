@@ -1,4 +1,4 @@
-"""Nothing that Windows or macOS lack is used without a look whether it is there."""
+"""Features that Windows or macOS lack are used only after a check."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _empty(value: ast.expr) -> bool:
 
 
 def _asks(test: ast.expr) -> bool:
-    """Whether a condition looks for a system, or for what it offers."""
+    """Whether a condition checks for a system, or for a feature."""
     text = ast.unparse(test)
     return "sys.platform" in text or "os.name" in text or "hasattr(" in text
 

@@ -1,4 +1,4 @@
-"""What stands still before a still camera, on images made by hand."""
+"""The background of a static camera, on hand-made images."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def sideways(k: int) -> np.ndarray:
 
 
 def turning(k: int) -> np.ndarray:
-    """A camera that turns in a room."""
+    """A camera that rotates in a room."""
     angle = np.arctan(CAMERA.rays()[..., 0].astype(float)) + 0.3 * k
     return 2.0 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
 

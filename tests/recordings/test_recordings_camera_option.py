@@ -1,4 +1,4 @@
-"""`--camera`: every reader either takes all of it, or refuses it."""
+"""`--camera`: every reader either uses all of it, or rejects it."""
 
 from __future__ import annotations
 

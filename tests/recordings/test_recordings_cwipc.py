@@ -1,4 +1,4 @@
-"""Folders of cwipc open as rigs, with the poses of the depth cameras; others are refused."""
+"""Folders of cwipc open as rigs, with the poses of the depth cameras; others are rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of other programs, made by their published layouts, and what may be wrong with them."""
+"""Folders of other programs, in their published layouts, and their faults."""
 
 from __future__ import annotations
 

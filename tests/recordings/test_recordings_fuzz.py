@@ -1,4 +1,4 @@
-"""Damaged recordings: whatever is wrong, only the package's own errors come out."""
+"""Damaged recordings raise only the package's own errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged recordings of cameras and phones: only the package's own errors come out, on one line."""
+"""Damaged recordings of cameras and phones raise only the package's own one-line errors."""
 
 from __future__ import annotations
 

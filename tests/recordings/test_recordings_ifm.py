@@ -1,4 +1,4 @@
-"""O3R streams: written here by the maker's layout, and a real frame."""
+"""O3R streams: written here in the manufacturer's layout, and a real frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ifm's .h5 recordings, written by h5py after the maker's published layout."""
+"""ifm's .h5 recordings, written by h5py in the manufacturer's published layout."""
 
 from __future__ import annotations
 

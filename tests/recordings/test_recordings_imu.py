@@ -1,4 +1,4 @@
-"""What is down, from accelerometers: in the native folder, in a phone's, and simulated."""
+"""The gravity direction from accelerometers: native folders, phones, simulated."""
 
 from __future__ import annotations
 

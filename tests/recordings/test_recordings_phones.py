@@ -1,4 +1,4 @@
-"""Phones: what the apps export, made here and recorded."""
+"""Phones: exports of the apps, generated and real."""
 
 from __future__ import annotations
 

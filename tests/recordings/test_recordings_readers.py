@@ -1,4 +1,4 @@
-"""Each reader on small recordings made here, whose truth is known."""
+"""Each reader on small generated recordings with known ground truth."""
 
 from __future__ import annotations
 
@@ -370,7 +370,7 @@ def test_xyz(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_map_coordinates_keep_their_millimetres(tmp_path: Path, suffix: str) -> None:
-    """All clouds of a folder are moved by the same whole kilometres, and poses beside them too."""
+    """All clouds of a folder, and their poses, are shifted by the same whole kilometres."""
     rng = np.random.default_rng(5)
     clouds = np.array([500_000.123, 4_000_000.456, 3]) + rng.uniform(-3, 3, (2, 40, 3))
     for k, points in enumerate(clouds):

@@ -1,4 +1,4 @@
-"""Real recordings open with no option, and their points are where the data's own vectors say."""
+"""Real recordings open without options, and their points match the vectors in the data."""
 
 from __future__ import annotations
 

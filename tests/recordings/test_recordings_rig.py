@@ -1,4 +1,4 @@
-"""rig.json: what is written is what is read; what makes no sense is refused in one line."""
+"""rig.json: round trip, and one-line errors for invalid files."""
 
 import json
 from dataclasses import replace

@@ -82,7 +82,7 @@ def test_sens_refusals(tmp_path: Path) -> None:
 
 
 def test_sens_zip_bomb_is_one_bad_frame(tmp_path: Path) -> None:
-    """Depth that unpacks to more than the image holds is not unpacked."""
+    """Depth that decompresses to more than the image size is not decompressed."""
     import zlib
 
     path = tmp_path / "scene.sens"
@@ -133,7 +133,7 @@ def test_las_of_our_own_comes_back(tmp_path: Path) -> None:
 
 
 def test_coordinates_of_maps_keep_their_millimetres(tmp_path: Path) -> None:
-    """Easting and northing of a map don't fit into float32: they are moved, and it is said."""
+    """Easting and northing exceed float32 precision: they are shifted, with a warning."""
     laspy = pytest.importorskip("laspy")
     where = np.array([453_210.0, 5_411_870.0, 300.0])
     header = laspy.LasHeader(version="1.2", point_format=0)

@@ -1,4 +1,4 @@
-"""Where a camera stands still, and what averaging gives."""
+"""Static segments of a recording, and their averages."""
 
 from __future__ import annotations
 

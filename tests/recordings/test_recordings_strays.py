@@ -1,4 +1,4 @@
-"""What lies in a recording and is no file: a bad frame, or nothing, and never a wait."""
+"""Entries of a recording that are not files: an unreadable frame, or ignored, without blocking."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) ->
 
 
 def test_time_is_not_asked_of_what_is_no_file(tmp_path: Path) -> None:
-    """A device has no end, and a queue is waited for until somebody writes."""
+    """A device has no end, and a FIFO blocks until something is written."""
     folder = tmp_path / "rec"
     make_sr4000(folder, 4)
     first, second, *_ = sorted(folder.iterdir())

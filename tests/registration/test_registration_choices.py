@@ -1,4 +1,4 @@
-"""Which points take part, which are paired, and which pairs stay."""
+"""Selection, matching and rejection of points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds that may be far apart: their viewpoints, what they say of a pose, and the pose."""
+"""Global registration of clouds: viewpoints, evidence for a pose, and the pose."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
 
 
 def test_pixels_show_a_slanted_plane_where_their_centres_see_it() -> None:
-    """Points lie anywhere in their pixels; what they are off by must not move the surface."""
+    """Points lie anywhere in their pixels; their offsets must not displace the surface."""
     xy = np.random.default_rng(4).uniform(-0.5, 0.5, (60_000, 2))
     z = 2.0 / (1 - 0.6 * xy[:, 0] + 0.3 * xy[:, 1])  # a plane, slanted by more than 30 degrees
     points = np.column_stack([xy * z[:, None], z])
@@ -304,7 +304,7 @@ def test_views_that_share_nothing_are_rejected(scans, frames):
 
 
 def test_a_corridor_that_fits_in_several_ways_is_rejected():
-    """Two parallel walls and a floor: along them nothing tells where."""
+    """Two parallel walls and a floor: the pose along them is unobservable."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
     assert found.believed is False
     assert "degenerate" in found.reason
@@ -334,7 +334,7 @@ def test_other_units_are_named_where_nothing_is_certain(scale):
 
 
 def test_a_guess_decides_between_poses_that_are_alike():
-    """A square room without anything in it is the same after a quarter turn."""
+    """An empty square room is the same after a rotation by 90 degrees."""
     walls = box_walls(8000, 0, 0.003, "xyz")
     other = box_walls(8000, 1, 0.003, "xyz")
     guess = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])

@@ -1,4 +1,4 @@
-"""What is told of the errors of a pose between two clouds."""
+"""The covariance of a pose between two clouds."""
 
 from __future__ import annotations
 

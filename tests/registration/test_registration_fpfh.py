@@ -1,4 +1,4 @@
-"""Clouds registered without a guess: histograms of normals, and what most matches agree on."""
+"""Registration of clouds without a guess: histograms of normals, and consensus of matches."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_body_is_told_from_itself_turned():
 
 
 def test_a_cube_has_no_margin():
-    """All faces alike, so that turned by 90 degrees it fits as well."""
+    """All faces are identical, so that it fits as well after a rotation by 90 degrees."""
 
     def cube(seed):
         r = rng(seed)
@@ -173,7 +173,7 @@ def test_rows_are_matched_both_ways():
 
 
 def test_a_good_start_is_not_lost_in_coarser_levels(corners):
-    """With `coarsest`, levels that reach further than the guess is off are left out."""
+    """With `coarsest`, levels beyond the error of the guess are skipped."""
     source, _target = corners
     data, model = (seen(T, seed=k) for k, T in ((1, B), (2, A)))
     found = CoarseToFine(coarsest=0.05).register(data, model, TRUE, rng(0))

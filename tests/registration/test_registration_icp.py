@@ -1,4 +1,4 @@
-"""Algorithm 1 of the thesis, whole."""
+"""Algorithm 1 of the thesis as a whole."""
 
 from __future__ import annotations
 

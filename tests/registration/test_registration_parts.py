@@ -1,4 +1,4 @@
-"""Each part of an ICP does what its paper says, and equals its slow twin."""
+"""Each part of an ICP behaves as in its paper, and equals its slow reference."""
 
 from __future__ import annotations
 

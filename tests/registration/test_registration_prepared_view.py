@@ -1,4 +1,4 @@
-"""Views made ready for tracking, on plane scenes of which everything is known."""
+"""Views prepared for tracking, on fully known scenes of planes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Alignment of prepared views with known motions, and what is said of directions left open."""
+"""Alignment of prepared views with known motions, and unobservable directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``tofuse.register``: two clouds or views, with nothing to set up."""
+"""``tofuse.register``: two clouds or views, without options."""
 
 from __future__ import annotations
 

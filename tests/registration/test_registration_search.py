@@ -1,4 +1,4 @@
-"""Large steps between views: what both images say of a pose, and the search for the best one."""
+"""Large steps between views: evidence for a pose in both images, and the exhaustive search."""
 
 from __future__ import annotations
 
@@ -337,7 +337,7 @@ def test_no_floor_where_the_camera_looks_at_a_wall():
 
 
 def test_rough_planes_fill_what_noise_left_open():
-    """A view whose far part is much noisier than its law says has planes only near by."""
+    """A view whose far part is much noisier than its noise model has planes only nearby."""
     frame = seen(A, sigma=0.001)
     rng = np.random.default_rng(2)
     far = frame.depth > 2.4

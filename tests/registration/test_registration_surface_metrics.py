@@ -1,4 +1,4 @@
-"""Metrics with normals: the properties that their papers claim, and what they say of themselves."""
+"""Metrics with normals: claimed properties, and their stated uncertainty."""
 
 from __future__ import annotations
 

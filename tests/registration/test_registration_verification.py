@@ -1,4 +1,4 @@
-"""How views of a camera usually fit."""
+"""The typical quality of fit of a camera's views."""
 
 from __future__ import annotations
 

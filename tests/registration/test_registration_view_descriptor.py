@@ -1,4 +1,4 @@
-"""Which views look alike: the same view, turned a little, before any other."""
+"""Similarity of views: the slightly rotated view ranks first."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tofuse.sensor.models import camera_model
 
 @pytest.fixture(scope="module")
 def views():
-    """A turn in the room, every 19 degrees."""
+    """A rotation in the room, every 19 degrees."""
     scene, path = build("room")
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")

@@ -1,4 +1,4 @@
-"""``tofuse.register`` on two range images: far apart, and whether the pose is accepted."""
+"""``tofuse.register`` on two range images without a guess, and acceptance of the pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report in a browser: it turns, slides and switches, on a phone and in the dark."""
+"""The report in a browser: rotation, sliders and switches, on a phone and in dark mode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report: that it is one valid file, and that what it says is what came out."""
+"""The report: a single valid file that states the results."""
 
 from __future__ import annotations
 

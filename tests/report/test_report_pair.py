@@ -1,4 +1,4 @@
-"""The scene of a registered pair: what is shown where, and how far apart the views are."""
+"""The scene of a registered pair: its content, and the distances between the views."""
 
 from __future__ import annotations
 

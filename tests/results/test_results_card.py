@@ -1,4 +1,4 @@
-"""The accuracy card says in a line how accurate a result is, and what would improve it."""
+"""The accuracy card states the accuracy of a result in one line, and possible improvements."""
 
 from __future__ import annotations
 

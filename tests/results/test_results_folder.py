@@ -1,4 +1,4 @@
-"""Whose an output folder is: nothing is touched before that is settled, and by one at a time."""
+"""Ownership of an output folder: nothing is changed before it is established, by one process."""
 
 from __future__ import annotations
 

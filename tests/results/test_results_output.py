@@ -1,4 +1,4 @@
-"""The output folder: all files of a result or none, and nobody else's files."""
+"""The output folder: all files of a result or none, and no foreign files."""
 
 from __future__ import annotations
 

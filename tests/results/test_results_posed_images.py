@@ -1,4 +1,4 @@
-"""Images with poses for nerfstudio and COLMAP, by a reading of their conventions that is not ours.
+"""Images with poses for nerfstudio and COLMAP, by an independent reading of their conventions.
 
 nerfstudio and COLMAP have the corner of the first pixel at (0, 0), so its centre at (0.5, 0.5).
 nerfstudio's cameras look along -z with y up.
@@ -151,7 +151,7 @@ def test_rectified_where_asked_for(tmp_path: Path) -> None:
 
 
 def test_amplitude_stands_in_for_colour(tmp_path: Path) -> None:
-    """What is shown is the albedo: alike at all distances, and masked where nothing was seen."""
+    """The image is the albedo: equal at all distances, and masked without a measurement."""
     (folder,) = export(made_result(tmp_path, PLAIN, color="amplitude"), ["nerfstudio"])
     data = json.loads((folder / "transforms.json").read_text())
     for frame in data["frames"]:

@@ -1,4 +1,4 @@
-"""Large surfaces as 3D Tiles: what the specification asks for, levels, cracks, the folder."""
+"""Large surfaces as 3D Tiles: requirements of the specification, levels, cracks, the folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From recordings to a rig: still cameras, bad input, the commands, one model from all cameras."""
+"""From recordings to a rig: static cameras, bad input, the commands, one model of all cameras."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Which camera of a rig was moved: found where one was, no false alarm where none was."""
+"""Detection of displaced cameras of a rig, without false alarms."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Trajectories of one rig with clocks of their own: synchronised, and fitted to each other."""
+"""Trajectories of one rig with separate clocks: synchronisation and hand-eye calibration."""
 
 import numpy as np
 import pytest

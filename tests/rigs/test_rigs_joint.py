@@ -1,4 +1,4 @@
-"""All cameras of a rig at once: poses, depth offsets, and how sure they are.
+"""Joint calibration of a rig: poses, depth offsets, and their covariances.
 
 The scene is made of planes that are rendered exactly, with noise: an open box that four cameras
 look into from four sides.

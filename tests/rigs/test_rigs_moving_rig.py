@@ -1,4 +1,4 @@
-"""A rig that is carried through a room: from the cameras' own trajectories to the rig and back."""
+"""A rig carried through a room: from the trajectories of the cameras to the rig and back."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Cameras that stand still around something that moves: their poses and their clocks."""
+"""Static cameras around a moving object: their poses and clocks."""
 
 from __future__ import annotations
 

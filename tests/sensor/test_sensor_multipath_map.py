@@ -1,4 +1,4 @@
-"""Surfaces out of view: remembered from earlier views, placed by the motion of the camera."""
+"""Surfaces out of view: taken from earlier views, placed by the camera motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALBEDO = 0.6
 
 
 def surfaces_of(seen: Seen, step: int = 1) -> Surfaces:
-    """Surfaces of a view that no indirect light has spoilt."""
+    """Surfaces of a view without multipath."""
     z = (seen.range / seen.length).astype(np.float32)
     nodes = block_nodes(z, seen.camera.rays(), seen.own.astype(np.float32), step)
     fit_planes(nodes)

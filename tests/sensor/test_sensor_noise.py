@@ -1,4 +1,4 @@
-"""Noise models: the physics of amplitude, tables over confidence, JSON, and nonsense refused."""
+"""Noise models: the physics of amplitude, tables over confidence, JSON, and invalid models."""
 
 from __future__ import annotations
 

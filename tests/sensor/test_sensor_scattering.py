@@ -1,4 +1,4 @@
-"""Light scattered in the lens: taken off, and learnt from what moves before what stands still."""
+"""Lens scattering: its removal, and its estimation from motion in front of a static background."""
 
 from __future__ import annotations
 

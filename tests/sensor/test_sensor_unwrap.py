@@ -1,4 +1,4 @@
-"""Whole periods: by amplitude and neighbourhood, and by several frequencies."""
+"""Phase unwrapping: by amplitude and neighbourhood, and by several frequencies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`tofuse view` in a browser, and what it reads; a run that is watched gives the same result."""
+"""`tofuse view` in a browser, and its input; a run with a live view gives the same result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who the viewer's server answers, and what its page may do."""
+"""Access to the viewer's server, and permissions of its page."""
 
 from __future__ import annotations
 
