@@ -1,10 +1,11 @@
-"""Bounds of the numbers that parts are configured with, and choices; ValueError for others.
+"""The values that parts may be configured with; ValueError for others.
 
 They are declared with the fields::
 
     class Median(Bounded):
         radius: Annotated[int, Bounds(1, 10)] = 1
         border: Literal["keep", "remove"] = "keep"
+        channels: Annotated[tuple[str, ...], NotEmpty()] = ("depth",)
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import dataclasses
 import functools
 import math
 import typing
+from collections.abc import Sized
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +42,16 @@ class Bounds:
         return f"{self.low:.10g} to {self.high:.10g}"
 
 
+class NotEmpty:
+    """At least one item, or character."""
+
+    def __contains__(self, value: Sized) -> bool:
+        return len(value) > 0
+
+    def __str__(self) -> str:
+        return "non-empty"
+
+
 class _Choices(tuple[object, ...]):
     """The values of a `Literal`."""
 
@@ -51,12 +63,12 @@ class Bounded:
     """A dataclass that refuses values other than those that its annotations declare.
 
     A number is declared as ``Annotated[float, Bounds(0, 1)]``, where None is within any bounds, a
-    choice as ``Literal``.
+    choice as ``Literal``, a tuple or text with content as ``Annotated[str, NotEmpty()]``.
 
     Raises
     ------
     ValueError
-        With the name of the field, its value and the bounds or choices.
+        With the name of the field, its value and what is allowed.
     """
 
     def __post_init__(self) -> None:
@@ -72,12 +84,15 @@ class Bounded:
 
 
 @functools.cache
-def _declared(cls: type) -> list[tuple[str, bool, Bounds | _Choices]]:
-    """Names of the fields with bounds or choices, whether they are whole numbers, and these."""
-    found: list[tuple[str, bool, Bounds | _Choices]] = []
+def _declared(cls: type) -> list[tuple[str, bool, Bounds | NotEmpty | _Choices]]:
+    """Names of the restricted fields, whether they are whole numbers, and what is allowed."""
+    found: list[tuple[str, bool, Bounds | NotEmpty | _Choices]] = []
     for name, hint in typing.get_type_hints(cls, include_extras=True).items():
         if typing.get_origin(hint) is typing.Literal:
             found.append((name, False, _Choices(typing.get_args(hint))))
-        bounds = [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Bounds)]
-        found += [(name, hint.__origin__ in (int, int | None), each) for each in bounds]
+        found += [
+            (name, hint.__origin__ in (int, int | None), extra)
+            for extra in getattr(hint, "__metadata__", ())
+            if isinstance(extra, Bounds | NotEmpty)
+        ]
     return found

@@ -193,7 +193,7 @@ def test_a_matcher_that_needs_images_shows_in_what_it_takes():
     ],
 )
 def test_senseless_options_are_refused(make):
-    with pytest.raises(ValueError, match=r"must be|is empty"):
+    with pytest.raises(ValueError, match="must be"):
         make()
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 import pytest
 
 from tofuse import parts
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import InputError
 from tofuse.pipeline.config import Config, changed, from_method, methods
 
@@ -165,6 +165,7 @@ class _Limits(Bounded):
     length_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     probability: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.5
     kind: Literal["disc", "ball"] = "disc"
+    channels: Annotated[tuple[str, ...], NotEmpty()] = ("depth",)
 
 
 @pytest.mark.parametrize(
@@ -176,9 +177,10 @@ class _Limits(Bounded):
         ({"length_m": 0.0}, "length_m must be above 0, not 0.0"),
         ({"length_m": math.inf}, "length_m must be above 0, not inf"),
         ({"probability": 1.0}, "probability must be between 0 and 1, not 1.0"),
+        ({"channels": ()}, r"channels must be non-empty, not \(\)"),
     ],
 )
-def test_numbers_outside_of_declared_bounds_are_refused(wrong, message) -> None:
+def test_values_outside_of_declared_bounds_are_refused(wrong, message) -> None:
     with pytest.raises(ValueError, match=f"^{message}$"):
         _Limits(**wrong)
     with pytest.raises(InputError, match=message):

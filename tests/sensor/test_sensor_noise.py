@@ -212,7 +212,7 @@ def test_json_round_trip(tmp_path: Path) -> None:
         ({"range": {"a": float("nan"), "b": 0.0}}, "a must be 0 to 5, not nan"),
         ({"confidence": {"sigma_m": [0.1, 0.2]}}, "grows with confidence"),
         ({"confidence": {"sigma_m": [604.0, 180.0, 15.0]}}, "sigma_m must be 0 to 5"),
-        ({"confidence": {"sigma_m": []}}, "sigma_m is empty"),
+        ({"confidence": {"sigma_m": []}}, "sigma_m must be non-empty, not ()"),
         ({"amplitude": {"shot": 0, "dark": 0}}, "both 0"),
         ({"amplitude": {"shot": "loud", "dark": 0}}, "is 'loud'"),
         ({"amplitude": {"shot": float("inf"), "dark": 1}}, "shot must be 0 or more, not inf"),

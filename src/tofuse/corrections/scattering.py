@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Bool, Float64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.corrections.base import Correction, Corrector
 from tofuse.corrections.raw_amplitude import frame_phasor, phasor, tof_image
 from tofuse.errors import InputError
@@ -48,15 +48,13 @@ class LensScattering(Bounded, Correction):
     """
 
     fractions: tuple[float, ...] | None = None
-    widths: tuple[float, ...] = (0.04, 0.1, 0.3)
+    widths: Annotated[tuple[float, ...], NotEmpty()] = (0.04, 0.1, 0.3)
     period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.widths:
-            raise ValueError("widths is empty: set one or more")
         if not all(width in Bounds(0.005, 2) and width > 0.005 for width in self.widths):
             raise ValueError(f"widths is {self.widths}, not each above 0.005 and at most 2")
         if self.fractions is not None:

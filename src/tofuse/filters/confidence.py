@@ -32,17 +32,14 @@ class Confidence(Bounded, Filter):
     """
 
     minimum: Annotated[int, Bounds(0)] = 7
-    highest: Annotated[int, Bounds(1)] = 7
+    highest: Annotated[int, Bounds(1, 255)] = 7
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.minimum <= self.highest <= 255:
-            raise ValueError(
-                f"minimum must be at most highest and that at most 255, not {self.minimum} of "
-                f"{self.highest}"
-            )
+        if self.minimum > self.highest:
+            raise ValueError(f"minimum must be at most {self.highest}, not {self.minimum}")
 
     def on_scale(self, highest: int) -> Confidence:
         """Return the equivalent filter for a camera whose highest level is `highest`."""

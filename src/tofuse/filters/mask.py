@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
 
 from tofuse.arrays import Bool
+from tofuse.bounds import Bounded, NotEmpty
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
 from tofuse.parts import part
@@ -20,7 +21,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 
 @part("filter", "mask")
 @dataclass(frozen=True)
-class Mask(Filter):
+class Mask(Bounded, Filter):
     """Keep the pixels at which a mask image, one for the whole recording, is not black.
 
     Attributes
@@ -29,13 +30,9 @@ class Mask(Filter):
         Path of the image, of the size of the depth images.
     """
 
-    image: str
+    image: Annotated[str, NotEmpty()]
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def __post_init__(self) -> None:
-        if not self.image:
-            raise ValueError("image is empty: set the path of a mask")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`; InputError if the image can't be read, or has another size."""

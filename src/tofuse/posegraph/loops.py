@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Protocol
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import RegistrationError
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.view_store import ViewStore
@@ -179,16 +179,11 @@ class Confirmation(Bounded):
         the corresponding points alone.
     """
 
-    registrations: tuple[Registrar, ...] = field(
+    registrations: Annotated[tuple[Registrar, ...], NotEmpty()] = field(
         default_factory=lambda: (algorithm_1(0.2), algorithm_1(0.05))
     )
     min_fraction: Annotated[float, Bounds(0, 1)] = 0.3
     max_error: Annotated[float, Bounds(0, exclusive=True)] = 0.65
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.registrations:
-            raise ValueError("registrations is empty")
 
     def objection(self, registration: Registration) -> str:
         """Return why a registration is rejected; empty if it is accepted.

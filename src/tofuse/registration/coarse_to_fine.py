@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
@@ -38,7 +38,7 @@ _FINEST = 10
 
 @part("registration", "in-turn")
 @dataclass(frozen=True)
-class InTurn(Registrar):
+class InTurn(Bounded, Registrar):
     """A sequence of registrations, each starting from the result of the previous one.
 
     Attributes
@@ -47,11 +47,7 @@ class InTurn(Registrar):
         At least one.
     """
 
-    stages: tuple[Registrar, ...]
-
-    def __post_init__(self) -> None:
-        if not self.stages:
-            raise ValueError("stages is empty")
+    stages: Annotated[tuple[Registrar, ...], NotEmpty()]
 
     @property
     def takes(self) -> frozenset[str]:

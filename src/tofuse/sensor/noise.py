@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, Protocol, Self
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
@@ -109,13 +109,11 @@ class ConfidenceLaw(Bounded):
         Exponent of the range; 0 if sigma depends on the level only.
     """
 
-    sigma_m: tuple[float, ...]
+    sigma_m: Annotated[tuple[float, ...], NotEmpty()]
     power: Annotated[float, Bounds(0, 4)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.sigma_m:
-            raise ValueError("sigma_m is empty: set one number for each level of confidence")
         for value in self.sigma_m:
             if value not in Bounds(0, _LARGEST_M):
                 raise ValueError(f"sigma_m must be {Bounds(0, _LARGEST_M)}, not {value!r}")

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import RegistrationError
 from tofuse.kernels.cloud_matching import grid_search
 from tofuse.kernels.icp import transform_points
@@ -208,15 +208,10 @@ class ClosestInvariant(Bounded, Matcher):
         Radius of the ball for moments, in resolutions.
     """
 
-    features: tuple[Invariant, ...] = ("moments",)
+    features: Annotated[tuple[Invariant, ...], NotEmpty()] = ("moments",)
     weight: Annotated[float, Bounds(0, exclusive=True)] = 20.0
     radius: Annotated[float, Bounds(0, exclusive=True)] = 6.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.features:
-            raise ValueError("features is empty")
 
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""
