@@ -159,15 +159,13 @@ def evaluate_trajectory(
     )
 
 
-def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S) -> Intp:
-    """Associate times one to one, less than `max_gap` s apart, closest first.
+def associate(times_a: ArrayLike, times_b: ArrayLike) -> Intp:
+    """Associate times one to one, less than `MAX_GAP_S` apart, closest first.
 
     Parameters
     ----------
     times_a, times_b
         (N,) and (M,) s; NaN is never associated.
-    max_gap
-        Maximum difference, s.
 
     Returns
     -------
@@ -179,11 +177,11 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S
     sorted_b = b[order_b]
     candidates = []
     for i in np.flatnonzero(np.isfinite(a)).tolist():
-        first, last = np.searchsorted(sorted_b, [a[i] - max_gap, a[i] + max_gap], "left")
+        first, last = np.searchsorted(sorted_b, [a[i] - MAX_GAP_S, a[i] + MAX_GAP_S], "left")
         candidates += [
             (abs(a[i] - sorted_b[k]), int(i), int(order_b[k]))
             for k in range(first, min(last + 1, len(sorted_b)))
-            if abs(a[i] - sorted_b[k]) < max_gap
+            if abs(a[i] - sorted_b[k]) < MAX_GAP_S
         ]
     used_a: set[int] = set()
     used_b: set[int] = set()

@@ -19,7 +19,7 @@ _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
 _OWN = "https://tofuse.org/e57"
 
 
-def write_e57(path: str | Path, cloud: GeometryRecord, *, name: str = "model") -> None:
+def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
     """Write a cloud as one scan, in single precision.
 
     Normals use the extension for surface normals, scalars an extension of tofuse, `tofuse:`.
@@ -30,8 +30,6 @@ def write_e57(path: str | Path, cloud: GeometryRecord, *, name: str = "model") -
         The file; see `replacing` for errors.
     cloud
         Of at least one point.
-    name
-        Of the scan.
 
     Raises
     ------
@@ -59,14 +57,12 @@ def write_e57(path: str | Path, cloud: GeometryRecord, *, name: str = "model") -
     with replacing(path) as temporary:
         file = E57(str(temporary), mode="w")
         try:
-            _write(file, libe57, columns, name, with_normals=cloud.normals is not None)
+            _write(file, libe57, columns, with_normals=cloud.normals is not None)
         finally:
             file.close()
 
 
-def _write(
-    file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], name: str, *, with_normals: bool
-) -> None:
+def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_normals: bool) -> None:
     image = file.image_file
     image.extensionsAdd("tofuse", _OWN)
     if with_normals:
@@ -84,7 +80,7 @@ def _write(
     for column in columns.values():
         content.update(np.ascontiguousarray(column).tobytes())
     scan.set("guid", lib.StringNode(image, f"{{{uuid.UUID(content.hexdigest())}}}"))
-    scan.set("name", lib.StringNode(image, name))
+    scan.set("name", lib.StringNode(image, "model"))
     bounds = {}
     for axis in "XYZ":
         column = columns[f"cartesian{axis}"]

@@ -149,18 +149,12 @@ def associate(
     return out
 
 
-def associated_poses(
-    timestamps: ArrayLike,
-    others: ArrayLike,
-    poses: ArrayLike,
-    *,
-    limit: float = ASSOCIATION_LIMIT_S,
-) -> Float64:
+def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
     """Return poses (N, 4, 4) at timestamps (N,), matched to (M,) others with (M, 4, 4) poses.
 
-    Timestamps without a match within `limit` seconds have NaN; see `associate`.
+    Timestamps without a match have NaN; see `associate`.
     """
-    index = associate(timestamps, others, limit=limit)
+    index = associate(timestamps, others)
     out = np.full((len(index), 4, 4), np.nan)
     out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
     return out

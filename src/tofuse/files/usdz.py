@@ -27,13 +27,13 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 _SCENE = """#usda 1.0
 (
-    defaultPrim = "{name}"
+    defaultPrim = "model"
     doc = "{generator}"
     metersPerUnit = 1
     upAxis = "Y"
 )
 
-def Xform "{name}" (
+def Xform "model" (
     kind = "component"
 )
 {{
@@ -45,19 +45,19 @@ def Xform "{name}" (
         float3[] extent = [{low}, {high}]
         int[] faceVertexCounts = [{counts}]
         int[] faceVertexIndices = [{faces}]
-        rel material:binding = </{name}/material>
+        rel material:binding = </model/material>
         point3f[] points = [{points}]
 {columns}        uniform token subdivisionScheme = "none"
     }}
 
     def Material "material"
     {{
-        token outputs:surface.connect = </{name}/material/shader.outputs:surface>
+        token outputs:surface.connect = </model/material/shader.outputs:surface>
 
         def Shader "shader"
         {{
             uniform token info:id = "UsdPreviewSurface"
-            color3f inputs:diffuseColor.connect = </{name}/material/{reader}>
+            color3f inputs:diffuseColor.connect = </model/material/{reader}>
             float inputs:metallic = 0
             float inputs:roughness = 1
             token outputs:surface
@@ -78,7 +78,7 @@ _TEXTURED = """        def Shader "place"
             uniform token info:id = "UsdUVTexture"
             asset inputs:file = @{image}@
             token inputs:sourceColorSpace = "sRGB"
-            float2 inputs:st.connect = </{name}/material/place.outputs:result>
+            float2 inputs:st.connect = </model/material/place.outputs:result>
             token inputs:wrapS = "clamp"
             token inputs:wrapT = "clamp"
             float3 outputs:rgb
@@ -93,9 +93,7 @@ _COLORED = """        def Shader "color"
 """
 
 
-def write_usdz(
-    path: str | Path, mesh: GeometryRecord, *, name: str = "model", generator: str = "tofuse"
-) -> None:
+def write_usdz(path: str | Path, mesh: GeometryRecord, *, generator: str = "tofuse") -> None:
     """Write a mesh; see `write_glb` for the parameters, errors and axes.
 
     Vertex colours, in linear light as USD requires, are shown by few programs; prefer a texture.
@@ -119,7 +117,6 @@ def write_usdz(
         shaders, reader = _TEXTURED, "picture.outputs:rgb"
     low, high = (p.min(0), p.max(0)) if len(p) else (np.zeros(3), np.zeros(3))
     scene = _SCENE.format(
-        name=name,
         generator=generator,
         low=_tuples(low[None], "%.5f"),
         high=_tuples(high[None], "%.5f"),
@@ -131,9 +128,9 @@ def write_usdz(
             for primvar, text in texts
         ),
         reader=reader,
-        shaders=shaders.format(name=name, image=image),
+        shaders=shaders.format(image=image),
     )
-    files = [(f"{name}.usda", scene.encode())]
+    files = [("model.usda", scene.encode())]
     if texture is not None:
         files.append((image, texture))
     write_bytes(path, _package(files))

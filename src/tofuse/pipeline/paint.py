@@ -70,14 +70,14 @@ def paint(
         return textured(mesh.decimated(_FACES), views, np.array(poses), size)
 
 
-def steadiest_frames(result: Reconstruction, max_frames: int = _VIEWS) -> list[int]:
+def steadiest_frames(result: Reconstruction) -> list[int]:
     """Return positions of tracked frames: the one with the least motion blur of each segment.
 
-    The trajectory is divided into at most `max_frames` segments of equal numbers of frames.
+    The trajectory is divided into at most `_VIEWS` segments of equal numbers of frames.
     """
     tracked = [k for k, f in enumerate(result.diagnostics.frames) if f.status == "tracked"]
     posed = np.array([k for k in tracked if result.has_pose[k]], np.intp)
-    if len(posed) <= max_frames:
+    if len(posed) <= _VIEWS:
         return [int(k) for k in posed]
     motion = se3.log(se3.inverse(result.trajectory[posed[:-1]]) @ result.trajectory[posed[1:]])
     step = np.linalg.norm(motion[:, :3], axis=1)
@@ -85,5 +85,5 @@ def steadiest_frames(result: Reconstruction, max_frames: int = _VIEWS) -> list[i
     speed = np.maximum(np.r_[step[:1], step], np.r_[step, step[-1:]])
     return [
         int(part[np.argmin(speed[np.searchsorted(posed, part)])])
-        for part in np.array_split(posed, max_frames)
+        for part in np.array_split(posed, _VIEWS)
     ]

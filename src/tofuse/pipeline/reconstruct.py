@@ -34,6 +34,7 @@ from tofuse.results.types import Reconstruction
 _TRACKING = "tracking"
 # Frames that are read and prepared in advance; each takes a multiple of its images' size.
 _AHEAD = 6
+_TRUTH_POINTS = 100_000
 
 
 def reconstruct(
@@ -304,7 +305,7 @@ def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 
     return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
 
 
-def truth_points(recording: Recording, count: int = 100_000) -> Float32 | None:
+def truth_points(recording: Recording) -> Float32 | None:
     """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
     path = Path(recording.path) / "truth" / "surface.ply"
     if not path.is_file():
@@ -317,8 +318,8 @@ def truth_points(recording: Recording, count: int = 100_000) -> Float32 | None:
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     rng = np.random.default_rng(0)
-    chosen = corners[rng.choice(len(corners), count, p=area / area.sum())]
-    u, v = rng.random((2, count, 1))
+    chosen = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
+    u, v = rng.random((2, _TRUTH_POINTS, 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])

@@ -63,6 +63,8 @@ _CUT, _MIN_DEVIATION_M = 4.0, 0.005
 _PLANE_M = 0.003
 # Neighbouring pixels share errors of the prediction: variance factor of that of a single pixel.
 _SHARED = 10.0
+# Standard deviation of a correction, as a fraction of it.
+_RELATIVE_SIGMA = 0.2
 _ITERATIONS = 3
 _ALIGNMENT = ProjectiveOptions(
     levels=(Level(4, 20, 0.15, 0.3), Level(4, 15, 0.03, 0.1), Level(2, 10, 0.005, 0.02)),
@@ -135,9 +137,7 @@ class Trial:
         return f"overlapping views do not clearly disagree as it predicts ({found})"
 
 
-def trial(
-    recording: Recording, without: Prepare, corrected: Prepare, relative_sigma: float = 0.2
-) -> Trial:
+def trial(recording: Recording, without: Prepare, corrected: Prepare) -> Trial:
     """Estimate the strength of the error that a correction removes.
 
     Parameters
@@ -147,8 +147,6 @@ def trial(
     without, corrected
         Prepare a frame for tracking without and with the correction. Called with the same frames,
         run by run.
-    relative_sigma
-        Standard deviation of the correction, as a fraction of it.
     """
     if len(recording) < _VIEWS + _MIN_RUNS - 1:
         return Trial((), ())
@@ -161,7 +159,7 @@ def trial(
         if (start, stride) in done:
             continue
         done.add((start, stride))
-        result = _regressed(*views.run(start, stride), relative_sigma)
+        result = _regressed(*views.run(start, stride))
         if result is not None:
             results.append(result)
     explained, predicted = np.array(results).reshape(-1, 2).T.tolist()
@@ -261,9 +259,7 @@ class _AlignedViews:
         return views, np.array(poses)
 
 
-def _regressed(
-    views: Sequence[_View], poses: Float64, relative_sigma: float
-) -> tuple[float, float] | None:
+def _regressed(views: Sequence[_View], poses: Float64) -> tuple[float, float] | None:
     """Regress the disagreement of a run jointly with its poses: see `Trial`."""
     n = len(views)
     if n < 3:  # the pose of a pair absorbs nearly all of it
@@ -273,7 +269,7 @@ def _regressed(
     for _ in range(_ITERATIONS):
         A, g = np.zeros((6 * n + 1, 6 * n + 1)), np.zeros(6 * n + 1)
         for i, j in pairs:
-            rows = _compared(views[i], views[j], se3.inverse(poses[i]) @ poses[j], relative_sigma)
+            rows = _compared(views[i], views[j], se3.inverse(poses[i]) @ poses[j])
             if rows is None:
                 continue
             J, residual, weight = rows
@@ -291,17 +287,13 @@ def _regressed(
     return (float(explained), float(predicted)) if predicted > 0 else None
 
 
-def _compared(
-    target: _View, source: _View, T: Float64, relative_sigma: float
-) -> tuple[Float64, Float64, Float64] | None:
+def _compared(target: _View, source: _View, T: Float64) -> tuple[Float64, Float64, Float64] | None:
     """Return the distances of a view's points from another's planes, with derivatives.
 
     Parameters
     ----------
     T
         (4, 4) T_target_source.
-    relative_sigma
-        Standard deviation of the correction, as a fraction of it.
 
     Returns
     -------
@@ -356,7 +348,7 @@ def _compared(
         axis=1,
     )
     noise = variance * z**4 + t.plane_variance[v, u] * target_z**4
-    prediction_variance = _SHARED * relative_sigma**2 * (by_source**2 + by_target**2)
+    prediction_variance = _SHARED * _RELATIVE_SIGMA**2 * (by_source**2 + by_target**2)
     # Errors of neighbours are correlated: a pair has the same weight for any number of points.
     weight = 1 / (2 * noise + _PLANE_M**2 + prediction_variance) / len(distance)
     return J, distance, weight

@@ -40,6 +40,7 @@ _WEAK_PRIOR, _ERROR_UNIT = 1e-3, 0.01
 _DAMPING = 1e-6
 # Overlaps are computed anew after a larger motion, in these units.
 _MAX_MOTION = 2.0
+_PAIR_ITERATIONS = 8  # of Gauss-Newton
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,6 @@ def refine(
     options: RefineOptions,
     *,
     calibrate: Sequence[int] = (),
-    errors: Float64 | None = None,
     priors: Priors | None = None,
     pairs: Intp | None = None,
     bodies: Bodies | None = None,
@@ -245,8 +245,6 @@ def refine(
         See `RefineOptions`.
     calibrate
         Errors of the camera to estimate as well, by their number in `kernels.refinement`.
-    errors
-        (ERRORS,) their initial values; by default zero.
     priors
         Measurements by other sensors.
     pairs
@@ -263,7 +261,6 @@ def refine(
         poses,
         options,
         calibrate=calibrate,
-        errors=errors,
         priors=priors,
         pairs=pairs,
         bodies=bodies,
@@ -473,8 +470,6 @@ def align_pairs(
     T_i_j: Float64,
     options: RefineOptions,
     errors: Float64,
-    *,
-    iterations: int = 8,
 ) -> Float64:
     """(M, 4, 4) relative poses T_i_j of pairs, each aligned by itself.
 
@@ -488,8 +483,6 @@ def align_pairs(
         (M, 4, 4) initial guesses.
     errors
         (ERRORS,) assumed errors of the camera.
-    iterations
-        Of Gauss-Newton.
     """
     count = len(pairs)
     both = [views[int(k)] for k in pairs.ravel()]
@@ -499,7 +492,7 @@ def align_pairs(
         both, np.arange(2 * count).reshape(-1, 2), options, _no_pairs(), Priors.none()
     )
     known, stage = (errors == 0).astype(np.int64), options.rounds[-1]
-    for _ in range(iterations):
+    for _ in range(_PAIR_ITERATIONS):
         _evaluate(both, poses, errors, known, state, stage, options)
         step, _ = _solve(poses, state, np.ones_like(known), Priors.none())
         poses = se3.orthonormalise(poses @ se3.exp(step))

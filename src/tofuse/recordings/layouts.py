@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -31,7 +30,6 @@ def convert_to(
     recording: Recording,
     folder: str | Path,
     layout: Layout,
-    progress: Callable[[int], None] | None = None,
 ) -> Conversion:
     """Write a recording's images in another layout.
 
@@ -47,8 +45,6 @@ def convert_to(
         Must not exist, or be empty. It appears when all is written.
     layout
         The layout.
-    progress
-        Called with the number of frames written so far.
 
     Raises
     ------
@@ -58,13 +54,11 @@ def convert_to(
         If the folder isn't empty, or can't be written.
     """
     with new_folder(folder) as temporary:
-        count, warnings = _write(recording, temporary, layout, progress)
+        count, warnings = _write(recording, temporary, layout)
     return Conversion(Path(folder), count, tuple(warnings))
 
 
-def _write(
-    recording: Recording, folder: Path, layout: Layout, progress: Callable[[int], None] | None
-) -> tuple[int, list[str]]:
+def _write(recording: Recording, folder: Path, layout: Layout) -> tuple[int, list[str]]:
     warnings: list[str] = []
     colors = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None
@@ -97,8 +91,6 @@ def _write(
         write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
         write_png(make_folder(folder / colors) / name, _color(frame, white))
         written.append(k)
-        if progress is not None:
-            progress(len(written))
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     if beyond:

@@ -150,9 +150,7 @@ def _cells(points: Float64, ranges: Float64, cell: float, shape: tuple[int, ...]
     return np.asarray(row * shape[1] + column, np.intp)
 
 
-def as_image(
-    view: Frame, viewpoint: Viewpoint, camera: Pinhole | None = None
-) -> tuple[RangeFrame, Float64] | None:
+def as_image(view: Frame, viewpoint: Viewpoint) -> tuple[RangeFrame, Float64] | None:
     """Render a view from its viewpoint; return the image and its pose T_view_camera (4, 4).
 
     None if the field of view is too wide for an image. The camera has the axes of the view if that
@@ -162,8 +160,6 @@ def as_image(
     ----------
     view, viewpoint
         View and its viewpoint; range images are returned unchanged.
-    camera
-        Adapted to the view unless given; points outside its image are left out.
     """
     if isinstance(view, RangeFrame):
         return view, np.eye(4)
@@ -171,8 +167,7 @@ def as_image(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = _axes(points), viewpoint.origin
     seen = points @ T[:3, :3]
-    if camera is None:
-        camera = _camera_of(seen, viewpoint.spacing)
+    camera = _camera_of(seen, viewpoint.spacing)
     if camera is None:
         return None
     return rendered(replace(view, points=seen.astype(np.float32)), camera), T

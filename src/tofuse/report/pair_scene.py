@@ -28,6 +28,7 @@ _NONE_CAPS = 4.0  # a point beyond this multiple of the colour bar's end has no 
 _FAR = 2.5  # the initial pose is framed separately if it enlarges the scene by more
 _Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
 _BEHIND = 0.1  # minimum fraction of points behind the origin that excludes a camera
+_SIZE = (720, 480)  # of a rendered view, in pixels
 _LEAST_PIXELS = 2  # side of a point
 
 
@@ -229,7 +230,7 @@ def framing(scene: PairScene) -> dict[str, Float64]:
     return {"before": before, "after": after, "distance": after}
 
 
-def render_modes(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UInt8]:
+def render_modes(scene: PairScene) -> dict[str, UInt8]:
     """Render the initial view of each mode."""
     seen = framing(scene)
     out = {}
@@ -242,10 +243,10 @@ def render_modes(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[s
             normals=np.concatenate([source.normals, target.normals]) if have else None,
             spacing=max(source.spacing, target.spacing),
         )
-        eye = _fit_eye(seen[mode], images.view_rotation(scene.yaw, scene.pitch), size)
+        eye = _fit_eye(seen[mode], images.view_rotation(scene.yaw, scene.pitch), _SIZE)
         out[mode] = render(
             both,
-            size,
+            _SIZE,
             yaw=scene.yaw,
             pitch=scene.pitch,
             eye_at=eye,

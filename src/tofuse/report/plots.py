@@ -35,6 +35,7 @@ _VARIABLES = {
 }
 _MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
 _SMALL_M = 0.6
+_WIDTH = 440  # of a plan, in pixels
 _STYLE: Any = {
     "svg.fonttype": "none",
     "image.composite_image": False,
@@ -219,7 +220,7 @@ def limits(
     return np.stack([low - border, high + border])
 
 
-def _plan(box: Float64, view: str, width: int) -> Any:
+def _plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
     """Make axes with equal scales for a (2, 2) box."""
     left, bottom, right, top = 46, 36, 12, 8
     extent = box[1] - box[0]
@@ -260,7 +261,6 @@ def model(
     *,
     measured: Float64 | None,
     label: str,
-    width: int = 440,
 ) -> str:
     """Draw the model from above or the side, as density of points.
 
@@ -275,9 +275,9 @@ def model(
     true = None if truth is None else project(truth, view)
     box = limits(flat, outer=0.25)
     box = limits(box, path, *([] if true is None else [true]))
-    figure, axes = _plan(box, view, width)
+    figure, axes = _plan(box, view)
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    columns = int(0.8 * (width - 58))
+    columns = int(0.8 * (_WIDTH - 58))
     rows = max(2, int(columns * (y1 - y0) / (x1 - x0)))
     j, i = np.floor((columns, rows) * (flat - (x0, y0)) / (x1 - x0, y1 - y0)).T
     inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
@@ -342,7 +342,7 @@ def cameras(
     label: str,
     loops: Float64 | None = None,
     reference: Float64 | None = None,
-    width: int = 440,
+    width: int = _WIDTH,
 ) -> str:
     """Draw camera positions and viewing directions (figures 5.4 and 5.5).
 
@@ -389,7 +389,6 @@ def rig(
     *,
     label: str,
     pairs: Sequence[tuple[int, int, str]] = (),
-    width: int = 440,
 ) -> str:
     """Draw the cameras of a rig as labelled frusta.
 
@@ -405,8 +404,6 @@ def rig(
         Text for screen readers.
     pairs
         Cameras a and b that are joined by a line, and its label.
-    width
-        Pixels.
     """
     middles = poses[:, :3, 3]
     apart = float(np.linalg.norm(middles - middles.mean(0), axis=1).max())
@@ -414,9 +411,9 @@ def rig(
     corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
     seen = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + middles[:, None]
     box = limits(project(middles, view), project(seen.reshape(-1, 3), view), room=0.16)
-    figure, axes = _plan(box, view, width)
+    figure, axes = _plan(box, view)
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    per_pixel = float(high[0] - low[0]) / (width - 58)
+    per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
     for a, b, said in pairs:
         ends = project(middles[[a, b]], view)
         axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)

@@ -302,7 +302,7 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     )
 
 
-def finish_interrupted(folder: Path, contract: Contract | None = None) -> None:
+def finish_interrupted(folder: Path) -> None:
     """Finish moves that were interrupted, so that a result can be read.
 
     Raises
@@ -313,12 +313,11 @@ def finish_interrupted(folder: Path, contract: Contract | None = None) -> None:
     staging = folder / STAGING
     if not is_interrupted(staging):
         return
-    contract = contract or RESULT
     try:
         claim = Claim(folder / LOCK, what=folder)
         try:
-            _recover(folder, contract)
-            clear(staging, contract.names)
+            _recover(folder, RESULT)
+            clear(staging, RESULT.names)
         finally:
             claim.release()
     except OutputError as error:

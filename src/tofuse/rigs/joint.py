@@ -138,12 +138,10 @@ def refine_together(
 
 
 def disagreements(
-    views: Sequence[View], poses: Float64, offsets: Float64 | None = None
+    views: Sequence[View], poses: Float64
 ) -> dict[tuple[int, int], tuple[float, int]]:
     """Return, by pair of cameras, the median distance of surfaces in m, and compared pixels."""
     system = _System(views, poses, JointOptions())
-    if offsets is not None:
-        system.offsets = np.asarray(offsets, float)
     return system.disagreement(system.compare())
 
 

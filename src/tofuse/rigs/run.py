@@ -76,7 +76,6 @@ def run_rig(
     inputs: Sequence[str | Path],
     options: Options,
     *,
-    motion: Motion = "auto",
     progress: Progress | None = None,
 ) -> RigResult:
     """Reconstruct the recordings of a rig's cameras, and write the output folder.
@@ -101,9 +100,8 @@ def run_rig(
         config = resolve(options)
         with OutputFolder(options.out, overwrite=options.overwrite) as folder:
             found = reconstruct_rig(
-                rig, cameras, recording, config, motion=motion, seed=options.seed or 0,
-                progress=progress,
-            )  # fmt: skip
+                rig, cameras, recording, config, seed=options.seed or 0, progress=progress
+            )
             progress.stage("writing")
             _write(found, recording, folder)
     return found

@@ -12,13 +12,11 @@ from tofuse.arrays import Float32, Float64
 DISAGREEMENT = 0.1
 
 
-def combined(
-    ranges: Sequence[Float32],
-    periods_m: Sequence[float],
-    weights: Sequence[float] | None = None,
-    longest_m: float | None = None,
-) -> tuple[Float32, Float32]:
+def combined(ranges: Sequence[Float32], periods_m: Sequence[float]) -> tuple[Float32, Float32]:
     """Return the range on which measurements at several frequencies agree, and the disagreement.
+
+    It is at most the joint ambiguity range, and 40 m. The weights in means are those of equal
+    phase noise, 1 / period^2.
 
     Parameters
     ----------
@@ -26,11 +24,6 @@ def combined(
         Radial ranges (H, W) in m, each in [0, its period), 0 where invalid.
     periods_m
         Ambiguity range of each frequency.
-    weights
-        Of each frequency in the mean, such as 1 / sigma^2; by default those of equal phase noise,
-        1 / period^2.
-    longest_m
-        Largest range; by default the joint ambiguity range, at most 40 m.
 
     Returns
     -------
@@ -40,12 +33,12 @@ def combined(
         (H, W) weighted rms of the measurements about it, m.
     """  # fmt: skip
     P = np.asarray(periods_m, float)
-    w = 1 / P**2 if weights is None else np.asarray(weights, float)
+    w = 1 / P**2
     w = w / w.sum()
     stack = np.stack([np.asarray(r, float) for r in ranges])
     valid = (stack > 0).all(0)
     first = int(np.argmin(P))  # the candidates are the wraps of the highest frequency
-    limit = min(longest_m or _beat(P), 40.0)
+    limit = min(_beat(P), 40.0)
     best = np.full(stack.shape[1:], np.inf)
     out = np.zeros(stack.shape[1:])
     for k in range(int(np.ceil(limit / P[first]))):

@@ -151,7 +151,7 @@ class MultipathModel:
         fit_planes(nodes)
         return Surfaces.of(nodes, np.ones(nodes.shape[:2])).bright()
 
-    def flatness(self, image: ToFImage, gain: float, window: int = 4) -> float:
+    def flatness(self, image: ToFImage, gain: float) -> float:
         """Return how flat surfaces are after correction with a gain: the number of coplanar nodes.
 
         Parameters
@@ -160,8 +160,6 @@ class MultipathModel:
             Depth and raw amplitude.
         gain
             See `solve`.
-        window
-            Radius in nodes within which planes are fitted, see `kernels.multipath.flat_nodes`.
         """
         nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         measured = ray_ranges(nodes)
@@ -171,7 +169,7 @@ class MultipathModel:
             return 0.0
         _correct(nodes, measured, found[0])
         fit_planes(nodes)
-        return kernels.flat_nodes(nodes, window, 0.1, 0.003)
+        return kernels.flat_nodes(nodes, 4, 0.1, 0.003)
 
     def _step(self, image: ToFImage) -> int:
         return max(1, round(image.z.shape[1] / self.columns))

@@ -298,19 +298,13 @@ def _check_finite(model: Any, where: str) -> None:
             raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="use a number")
 
 
-def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
+def of_camera(model: CameraModel) -> NoiseModel:
     """Derive the noise model of a modulated camera from its electronics.
 
     From the phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` of bucket differences D, each with the
     variance of its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
     S, contrast m, ambient electrons E and read noise R; ``sigma_r = sigma_phase period / (2 pi)``.
-
-    Parameters
-    ----------
-    model
-        The camera.
-    far
-        Law over the range alone; by default that of a grey wall (albedo 0.4).
+    The law over the range alone is that of a grey wall (albedo 0.4).
     """
     per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
     ambient = _USUAL_AMBIENT * model.ambient_electrons
@@ -321,7 +315,7 @@ def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
     wall = 0.4 * model.signal_electrons * model.modulation_contrast * gain
     return NoiseModel(
         model.name,
-        far or RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
+        RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
         AmplitudeLaw(shot, dark, model.depth_unit_m / math.sqrt(12), falloff),
         ceiling_m=SPEED_OF_LIGHT / (2 * (model.unwrap_hz or model.modulation_hz)) / math.sqrt(12),
     )

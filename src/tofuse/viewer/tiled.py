@@ -40,8 +40,6 @@ class TiledSurface:
         The surface.
     paint
         Returns the colours (N, 3) of a tile.
-    max_faces
-        Maximum number of triangles that a client shows.
     """
 
     def __init__(
@@ -49,10 +47,8 @@ class TiledSurface:
         server: ViserServer,
         layer: TiledLayer,
         paint: Callable[[Layer], UInt8],
-        max_faces: int = MAX_SHOWN_FACES,
     ) -> None:
         self._server, self._layer, self._paint = server, layer, paint
-        self._max_faces = max_faces
         self._visible = True
         self._removed = False
         self._clients: dict[int, _Client] = {}
@@ -104,7 +100,7 @@ class TiledSurface:
             if self._removed or client.client_id in self._clients:
                 return
             self._clients[client.client_id] = _Client(
-                client, self._layer, self._paint, self._max_faces, self._visible
+                client, self._layer, self._paint, self._visible
             )
 
     def _leave(self, client: ClientHandle) -> None:
@@ -122,10 +118,9 @@ class _Client:
         client: ClientHandle,
         layer: TiledLayer,
         paint: Callable[[Layer], UInt8],
-        max_faces: int,
         visible: bool,
     ) -> None:
-        self._client, self._layer, self._paint, self._max_faces = client, layer, paint, max_faces
+        self._client, self._layer, self._paint = client, layer, paint
         self._visible = visible
         self._nodes: dict[str, tuple[Tile, Any]] = {}
         self._lock = threading.Lock()
@@ -165,7 +160,7 @@ class _Client:
                 if self._stopped:
                     return
                 wanted = select_tiles(
-                    self._layer.root, self._eye(), int(fraction * self._max_faces)
+                    self._layer.root, self._eye(), int(fraction * MAX_SHOWN_FACES)
                 )
                 try:
                     self._exchange(wanted)
