@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.files.atomic import replacing
 from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.reading import required_package
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
 _OWN = "https://tofuse.org/e57"
@@ -37,12 +38,7 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
         If the shapes disagree, the library is not installed, or there are no points.
     """
     cloud.check(path)
-    try:
-        from pye57 import E57, libe57
-    except ImportError as error:
-        raise InputError(
-            "needs the package pye57", where=path, remedy="pip install 'tofuse[scan]'"
-        ) from error
+    pye57 = required_package("pye57", "scan", path)
     if not len(cloud):
         raise InputError("there are no points", where=path, remedy="E57 can't store an empty cloud")
     xyz = np.asarray(cloud.points, np.float32)
@@ -55,9 +51,9 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
         columns |= {f"color{c}": rgb[:, k] for k, c in enumerate(("Red", "Green", "Blue"))}
     columns |= {f"tofuse:{key}": np.asarray(values) for key, values in cloud.scalars.items()}
     with replacing(path) as temporary:
-        file = E57(str(temporary), mode="w")
+        file = pye57.E57(str(temporary), mode="w")
         try:
-            _write(file, libe57, columns, with_normals=cloud.normals is not None)
+            _write(file, pye57.libe57, columns, with_normals=cloud.normals is not None)
         finally:
             file.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import re
 import tomllib
 from collections.abc import Callable
@@ -41,6 +42,22 @@ def input_error(error: OSError, path: str | Path) -> InputError:
         error.errno or 0, (f"can't be read ({error.strerror or error})", "check the file")
     )
     return InputError(problem, where=path, remedy=remedy)
+
+
+def required_package(name: str, extra: str, where: str | Path) -> Any:
+    """Import a package that only some files need, and that the named extra of tofuse installs.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"needs the package {name}", where=where, remedy=f"pip install 'tofuse[{extra}]'"
+        ) from error
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:

@@ -435,6 +435,13 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
     return checked_lens(cls, size, values, get.where), size
 
 
+def image_size(width: float, height: float, where: str | Path) -> tuple[int, int]:
+    """Return (width, height) from a file in whole pixels; InputError if no image has this size."""
+    if not (2 <= width <= 16384 and 2 <= height <= 16384):
+        raise InputError(f"is {width:g} x {height:g}", where=where, remedy="give pixels")
+    return int(width), int(height)
+
+
 def checked_lens(
     cls: type[Pinhole], size: tuple[int, int], values: dict[str, float], where: str | Path
 ) -> Pinhole:

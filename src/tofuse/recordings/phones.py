@@ -14,7 +14,6 @@ from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
-from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.sources import FileSource, read_matrix_pose
 
 # ARKit's camera looks along -z with y up.
@@ -42,16 +41,6 @@ def lens(
         return scaled(full, *size)
     except InputError as error:
         raise InputError(error.problem, where=where, remedy=error.remedy) from error
-
-
-def refuse_replacement(options: ReaderOptions, name: str) -> None:
-    """Raise InputError if a camera was given for the format `name`, which stores one per frame."""
-    if options.camera is not None:
-        raise InputError(
-            f"does not apply to the format {name!r}, which stores a camera per frame",
-            where="--camera",
-            remedy="leave it out",
-        )
 
 
 class PhoneSource(FileSource):

@@ -11,6 +11,7 @@ from tofuse.recordings.recording import Source
 
 SURE = 0.9
 UNSURE = 0.5
+PER_FRAME = "a camera per frame"
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,11 @@ class Reader(Protocol):
         ...
 
 
-def refuse_camera(options: ReaderOptions, name: str) -> None:
-    """Raise InputError if a camera was given for the format `name`, which stores points."""
+def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> None:
+    """Raise InputError if a camera was given for the format `name`, because of what it stores."""
     if options.camera is not None:
         raise InputError(
-            f"does not apply to the format {name!r}, which stores points",
+            f"does not apply to the format {name!r}, which stores {stores}",
             where="--camera",
             remedy="leave it out",
         )

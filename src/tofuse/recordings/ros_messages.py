@@ -61,14 +61,18 @@ def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> ND
         raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
     order = ">" if message.is_bigendian else "<"
     kind = np.dtype(order + encodings[message.encoding])
+    return np.ascontiguousarray(_rows(message, kind.itemsize, where)).view(kind)
+
+
+def _rows(message: Any, pixel_bytes: int, where: str) -> UInt8:
+    """(H, W * pixel_bytes) content of a message, without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
-    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * kind.itemsize:
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * pixel_bytes:
         raise InputError(f"declares {width} x {height} pixels of {step} bytes per row", where=where)
     if len(data) < step * height:
         raise InputError("is cut off", where=where, remedy="check the bag")
-    rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
-    return np.ascontiguousarray(rows).view(kind)
+    return data[: step * height].reshape(height, step)[:, : width * pixel_bytes]
 
 
 def color_image(message: Any, where: str) -> UInt8:
@@ -87,13 +91,7 @@ def color_image(message: Any, where: str) -> UInt8:
     if encoding not in _ALL_COLORS:
         raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
     channels, order = _ALL_COLORS[encoding]
-    step = int(message.step)
-    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * channels:
-        raise InputError(f"declares {width} x {height} pixels of {step} bytes per row", where=where)
-    if len(data) < step * height:
-        raise InputError("is cut off", where=where, remedy="check the bag")
-    rows = np.frombuffer(data, np.uint8)[: step * height].reshape(height, step)
-    pixels = rows[:, : width * channels].reshape(height, width, channels)
+    pixels = _rows(message, channels, where).reshape(height, width, channels)
     if isinstance(order, str):
         if width % 2:
             raise InputError(f"is {width} pixels wide and {encoding}", where=where)

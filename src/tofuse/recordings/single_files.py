@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import files_with, is_file, is_folder, read_head
 
 
 def file_of(path: Path, *suffixes: str) -> Path | None:
@@ -19,6 +19,14 @@ def file_of(path: Path, *suffixes: str) -> Path | None:
     except InputError:
         return None
     return files[0] if len(files) == 1 else None
+
+
+def begins_with(file: Path | None, head: bytes) -> bool:
+    """Return whether there is a file, can be read, and begins with these bytes."""
+    try:
+        return file is not None and read_head(file, len(head)) == head
+    except InputError:
+        return False
 
 
 def required_file(path: Path, *suffixes: str) -> Path:

@@ -17,7 +17,6 @@ from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.matroska import MAGIC, Block, Matroska, Track
-from tofuse.files.reading import read_head
 from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import Camera, Rational, RayTable
 from tofuse.geometry.se3 import check_pose, orthonormalise
@@ -26,7 +25,7 @@ from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, required_file
+from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource
 
 DEPTH_UNIT_M = 0.001
@@ -116,13 +115,8 @@ class AzureKinect:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".mkv")
-        try:
-            if file is not None and read_head(file, 4) == MAGIC:
-                return Sniff(1.0, "a Matroska file")
-        except InputError:
-            pass
-        return None
+        found = begins_with(file_of(path, ".mkv"), MAGIC)
+        return Sniff(1.0, "a Matroska file") if found else None
 
     def open(self, path: Path, options: ReaderOptions) -> AzureKinectSource:
         """See `Reader.open`."""

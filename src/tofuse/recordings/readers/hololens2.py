@@ -21,8 +21,8 @@ from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
-from tofuse.recordings.phones import POSES_BY, refuse_replacement
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.phones import POSES_BY
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource, read_matrix_pose
 
 # The streams by preference, with their ambiguity range in m.
@@ -47,7 +47,7 @@ class HoloLens2:
 
     def open(self, path: Path, options: ReaderOptions) -> HoloLens2Source:
         """See `Reader.open`."""
-        refuse_replacement(options, "hololens2")
+        refuse_camera(options, "hololens2", PER_FRAME)
         found = _streams(path)
         if not found:
             raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 import weakref
 from dataclasses import dataclass
@@ -14,13 +13,13 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import read_head
+from tofuse.files.reading import required_package
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_camera
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.readers.ifm_o3r import INVALID
-from tofuse.recordings.single_files import file_of, required_file
+from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -44,13 +43,8 @@ class IfmH5:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".h5", ".hdf5")
-        try:
-            if file is not None and read_head(file, 8) == _MAGIC:
-                return Sniff(0.95, "an HDF5 file")
-        except InputError:
-            pass
-        return None
+        found = begins_with(file_of(path, ".h5", ".hdf5"), _MAGIC)
+        return Sniff(0.95, "an HDF5 file") if found else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmH5Source:
         """See `Reader.open`."""
@@ -63,14 +57,7 @@ class IfmH5Source(FileSource):
 
     def __init__(self, path: Path, stream: str | None) -> None:
         self.path = path
-        try:
-            h5py = importlib.import_module("h5py")
-        except ImportError as error:
-            raise InputError(
-                "is an HDF5 file, which needs the package h5py",
-                where=path,
-                remedy="pip install 'tofuse[hdf5]'",
-            ) from error
+        h5py = required_package("h5py", "hdf5", path)
         self._one_at_a_time = threading.Lock()
         try:
             file = h5py.File(path, "r")

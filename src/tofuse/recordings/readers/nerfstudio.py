@@ -16,11 +16,11 @@ from tofuse.files.reading import is_file, name_order, read_head
 from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens, number_in, read_json
+from tofuse.recordings.camera_file import checked_lens, image_size, number_in, read_json
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
-from tofuse.recordings.phones import refuse_replacement, resized
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.phones import resized
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose
 
 NAME = "transforms.json"
@@ -57,7 +57,7 @@ class Nerfstudio:
 
     def open(self, path: Path, options: ReaderOptions) -> NerfstudioSource:
         """See `Reader.open`."""
-        refuse_replacement(options, "nerfstudio")
+        refuse_camera(options, "nerfstudio", PER_FRAME)
         return NerfstudioSource(_file(path))
 
 
@@ -208,8 +208,7 @@ class _Frame:
                 remedy=f"use one of {', '.join(_MODELS)}",
             )
         width, height = self.number_of("w", size[0]), self.number_of("h", size[1])
-        if not (2 <= width <= 16384 and 2 <= height <= 16384):
-            raise InputError(f"is {width:g}, h {height:g}", where=f"{self.where}: w")
+        pixels = image_size(width, height, f"{self.where}: w")
         fx = self.number_of("fl_x", self._by_angle("camera_angle_x", width))
         # Pixel coordinates here start at the corner of the first pixel, in `Pinhole` at its centre.
         values = {
@@ -224,7 +223,7 @@ class _Frame:
             if not any(values[name] for name in DISTORTION_ORDER[model]):
                 model = "pinhole"
                 values = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-        camera = checked_lens(MODELS[model], (int(width), int(height)), values, self.where)
+        camera = checked_lens(MODELS[model], pixels, values, self.where)
         if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
             raise InputError(
                 f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: "

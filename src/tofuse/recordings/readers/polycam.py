@@ -14,16 +14,15 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import image_size, read_json
 from tofuse.recordings.phones import (
     CONFIDENCE_MAX,
     POSES_BY,
     PhoneSource,
     arkit_pose,
     lens,
-    refuse_replacement,
 )
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
@@ -46,7 +45,7 @@ class Polycam:
 
     def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
         """See `Reader.open`."""
-        refuse_replacement(options, "polycam")
+        refuse_camera(options, "polycam", PER_FRAME)
         return PolycamSource(_keyframes(path))
 
 
@@ -106,10 +105,8 @@ def _lens(facts: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhole:
     fx, fy, cx, cy, width, height = _numbers(
         facts, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
-    if not (np.isfinite([width, height]).all() and 2 <= width <= 16384 and 2 <= height <= 16384):
-        raise InputError(f"is {width:g}, height {height:g}", where=f"{path}: width")
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return lens(K, (int(width), int(height)), size, path)
+    return lens(K, image_size(width, height, f"{path}: width"), size, path)
 
 
 def _pose(facts: dict[str, Any], path: Path) -> Float64:

@@ -17,11 +17,11 @@ from tofuse.errors import InputError
 from tofuse.files.exr import parse_exr
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.lzfse import lzfse_decompress
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes, read_head
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
 from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import image_size, read_json
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
@@ -29,10 +29,10 @@ from tofuse.recordings.phones import (
     POSES_BY,
     SENSOR,
     lens,
-    refuse_replacement,
     resized,
 )
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.single_files import begins_with, file_of
 from tofuse.recordings.sources import FARTHEST_M, FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
@@ -53,16 +53,12 @@ class Record3D:
             if is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
                 return Sniff(1.0, "metadata.json and depth/*.exr")
             return None
-        try:
-            if path.suffix.lower() == ".r3d" and read_head(path, 4) == b"PK\x03\x04":
-                return Sniff(1.0, "a .r3d archive")
-        except InputError:
-            pass
-        return None
+        found = begins_with(file_of(path, ".r3d"), b"PK\x03\x04")
+        return Sniff(1.0, "a .r3d archive") if found else None
 
     def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
         """See `Reader.open`."""
-        refuse_replacement(options, "record3d")
+        refuse_camera(options, "record3d", PER_FRAME)
         return Record3DSource(_Folder(path) if is_folder(path) else _Archive(path))
 
 
@@ -247,16 +243,12 @@ class _Metadata:
         if default is not None and not ("dw" in self.data and "dh" in self.data):
             return default
         width, height = (self._numbers(name, 1)[0] for name in ("dw", "dh"))
-        if not (2 <= width <= 16384 and 2 <= height <= 16384):
-            raise self._error("dw", f"is {width:g}, dh {height:g}")
-        return int(width), int(height)
+        return image_size(width, height, f"{self.where}: dw")
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         K = self._numbers("K", 9).reshape(3, 3).T
         width, height = (self._numbers(name, 1)[0] for name in ("w", "h"))
-        if not (2 <= width <= 16384 and 2 <= height <= 16384):
-            raise self._error("w", f"is {width:g}, h {height:g}")
-        return lens(K, (int(width), int(height)), size, f"{self.where}: K")
+        return lens(K, image_size(width, height, f"{self.where}: w"), size, f"{self.where}: K")
 
     def frame_rate(self) -> float:
         rate = self._numbers("fps", 1)[0] if "fps" in self.data else 60.0

@@ -21,9 +21,8 @@ from tofuse.recordings.phones import (
     PhoneSource,
     arkit_pose,
     lens,
-    refuse_replacement,
 )
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 
@@ -44,7 +43,7 @@ class ScannerApp:
 
     def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
         """See `Reader.open`."""
-        refuse_replacement(options, "3dscannerapp")
+        refuse_camera(options, "3dscannerapp", PER_FRAME)
         files = files_named(path, _DEPTH.fullmatch)
         if not files:
             raise InputError("has no depth_*.png", where=path, remedy="export with all data")

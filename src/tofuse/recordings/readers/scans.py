@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import struct
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import read_head
+from tofuse.files.reading import read_head, required_package
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import (
@@ -27,12 +26,12 @@ from tofuse.recordings.cloud_files import (
 )
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import file_of, required_file
+from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
+_E57 = b"ASTM-E57"
 _MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
-_MISSING = "run `pip install 'tofuse[scan]'`"
 _COPY = "copy the file again, or export it again"
 
 
@@ -57,15 +56,8 @@ class LasScans:
         return source
 
 
-def _laspy(path: Path) -> Any:
-    try:
-        return importlib.import_module("laspy")
-    except ImportError as error:
-        raise InputError("needs the package laspy", where=path, remedy=_MISSING) from error
-
-
 def _las_header(path: Path) -> Any:
-    laspy = _laspy(path)
+    laspy = required_package("laspy", "scan", path)
     head = read_head(path, 375)
     if head[:4] != b"LASF":
         raise InputError("isn't a LAS file", where=path, remedy="check the file")
@@ -111,7 +103,7 @@ def _check_chunks(path: Path, header: Any) -> None:
     consists of its version, the number of chunks and their compressed sizes. Its offset precedes
     the chunks or, if unknown at that time, is in the last 8 bytes (specification of LASzip 2.2).
     """
-    lazrs = importlib.import_module("lazrs")
+    lazrs = required_package("lazrs", "scan", path)
     size, start = path.stat().st_size, int(header.offset_to_point_data)
     layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if layout.item_size() != header.point_format.size:
@@ -164,7 +156,7 @@ def _shift(path: Path) -> Float64:
 def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
     _las_header(path)
     try:
-        points = _laspy(path).read(path)
+        points = required_package("laspy", "scan", path).read(path)
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
         amplitude = np.asarray(points["intensity"], np.float32)
@@ -196,13 +188,7 @@ class E57Scans:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".e57")
-        try:
-            if file is not None and read_head(file, 8) == b"ASTM-E57":
-                return Sniff(1.0, "an E57 file")
-        except InputError:
-            pass
-        return None
+        return Sniff(1.0, "an E57 file") if begins_with(file_of(path, ".e57"), _E57) else None
 
     def open(self, path: Path, options: ReaderOptions) -> E57Source:
         """See `Reader.open`."""
@@ -215,12 +201,9 @@ class E57Source(FileSource):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if read_head(path, 8) != b"ASTM-E57":
+        if read_head(path, 8) != _E57:
             raise InputError("isn't an E57 file", where=path, remedy="check the file")
-        try:
-            self._pye57 = importlib.import_module("pye57")
-        except ImportError as error:
-            raise InputError("needs the package pye57", where=path, remedy=_MISSING) from error
+        self._pye57 = required_package("pye57", "scan", path)
         try:
             file = self._pye57.E57(str(path))
             try:

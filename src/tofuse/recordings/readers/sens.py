@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
-from tofuse.files.reading import input_error, read_head
+from tofuse.files.reading import input_error
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
@@ -23,7 +23,7 @@ from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, required_file
+from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
 
 VERSION = 4
@@ -46,13 +46,8 @@ class Sens:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".sens")
-        try:
-            if file is not None and read_head(file, 4) == struct.pack("<I", VERSION):
-                return Sniff(1.0, "a .sens file")
-        except InputError:
-            pass
-        return None
+        found = begins_with(file_of(path, ".sens"), struct.pack("<I", VERSION))
+        return Sniff(1.0, "a .sens file") if found else None
 
     def open(self, path: Path, options: ReaderOptions) -> SensSource:
         """See `Reader.open`."""

@@ -21,9 +21,8 @@ from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
     lens,
-    refuse_replacement,
 )
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -55,7 +54,7 @@ class Stray:
 
     def open(self, path: Path, options: ReaderOptions) -> StraySource:
         """See `Reader.open`."""
-        refuse_replacement(options, "stray")
+        refuse_camera(options, "stray", PER_FRAME)
         return StraySource(path)
 
 

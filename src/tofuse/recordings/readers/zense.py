@@ -13,7 +13,7 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens, number_in
+from tofuse.recordings.camera_file import checked_lens, image_size, number_in
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import ReaderOptions, Sniff
 
@@ -93,7 +93,5 @@ def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, i
     """(width, height) as given in the file, else of the images."""
     if "image_width" not in values or "image_height" not in values:
         return first_size(files)
-    size = tuple(number_in(values, key, path) for key in ("image_width", "image_height"))
-    if not all(2 <= side <= 16384 for side in size):
-        raise InputError(f"is {size[0]:g} x {size[1]:g}", where=f"{path}: image_width")
-    return int(size[0]), int(size[1])
+    width, height = (number_in(values, key, path) for key in ("image_width", "image_height"))
+    return image_size(width, height, f"{path}: image_width")
