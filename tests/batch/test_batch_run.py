@@ -362,7 +362,7 @@ def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--workers", "0"], "0 is less than 1"),
+        (["--workers", "0"], "'0' is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
         (["--memory", "much"], "not an amount of memory"),
         (["--only", "b"], "has no job b"),

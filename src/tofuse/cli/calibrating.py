@@ -12,13 +12,13 @@ from tofuse.calibration.depth import calibrate_depth, compose
 from tofuse.calibration.lens import calibrate_lens
 from tofuse.calibration.lens_files import read_lens_file
 from tofuse.calibration.plane_views import board_planes, scene_planes
-from tofuse.cli.open_input import open_selection
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.recordings.camera_file import camera_fields
 from tofuse.recordings.native import read_correction
 from tofuse.recordings.open import open_recording
+from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 
@@ -31,7 +31,7 @@ _MAX_PLANES = 20
 def lens(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
-    recording = open_selection(arguments)
+    recording = Opening.of(arguments.inputs, arguments).open()
     fit = calibrate_lens(recording, board, arguments.model, arguments.image)
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
@@ -50,7 +50,7 @@ def lens(arguments: argparse.Namespace) -> Summary:
 
 def depth(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate depth``."""
-    recording = open_selection(arguments)
+    recording = Opening.of(arguments.inputs, arguments).open()
     earlier = _earlier_correction(arguments, recording)
     if arguments.board is not None:
         board = Board.parse(arguments.board)

@@ -471,10 +471,10 @@ def simulate(arguments: argparse.Namespace) -> int:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
-    from tofuse.cli.open_input import open_input
     from tofuse.inspection.inspect import inspect_recording
+    from tofuse.recordings.opening import Opening
 
-    recording = open_input(arguments)
+    recording = Opening.of(arguments.inputs, arguments).open()
     found = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
     if arguments.sheet is not None:
         found.save_sheet(arguments.sheet)
@@ -499,11 +499,11 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
-    from tofuse.cli.open_input import open_selection
     from tofuse.recordings.convert import convert as convert_recording
     from tofuse.recordings.layouts import convert_to
+    from tofuse.recordings.opening import Opening
 
-    recording = open_selection(arguments)
+    recording = Opening.of(arguments.inputs, arguments).open()
     if arguments.to == "native":
         done = convert_recording(recording, arguments.out)
     else:
@@ -596,15 +596,13 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
+    from tofuse.calibration.camera_json import check_new
     from tofuse.calibration.noise_estimation import estimate_noise
-    from tofuse.cli.open_input import open_input
-    from tofuse.errors import OutputError
+    from tofuse.recordings.opening import Opening
 
-    if arguments.out is not None and arguments.out.exists() and not arguments.overwrite:
-        raise OutputError(
-            "already exists", where=arguments.out, remedy="pass --overwrite to replace it"
-        )
-    recording = open_input(arguments)
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    recording = Opening.of(arguments.inputs, arguments).open()
     fit = estimate_noise(recording, arguments.name)
     if arguments.out is not None:
         fit.model.save(arguments.out)
@@ -667,14 +665,11 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 def optimize(arguments: argparse.Namespace) -> int:
     """``tofuse optimize``."""
-    from tofuse.errors import OutputError
+    from tofuse.calibration.camera_json import check_new
     from tofuse.pipeline.config import changed, from_method
     from tofuse.posegraph.g2o import read_g2o, write_g2o
 
-    if arguments.out.exists() and not arguments.overwrite:
-        raise OutputError(
-            "already exists", where=arguments.out, remedy="pass --overwrite to replace it"
-        )
+    check_new(arguments.out, overwrite=arguments.overwrite)
     config = from_method("default", "range")
     if arguments.optimiser is not None:
         part = {"part": arguments.optimiser}

@@ -9,9 +9,12 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from tofuse._version import __version__
+from tofuse.bounds import Bounds
+
+_Number = TypeVar("_Number", int, float)
 
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
 EXPORTS = (
@@ -755,13 +758,6 @@ def _page(p: Any) -> None:
     p.add_argument("--no-open", action="store_true", help="do not open the browser")
 
 
-def _port(text: str) -> int:
-    value = _whole(text)
-    if not 1 <= value <= 65535:
-        raise argparse.ArgumentTypeError(f"{text} is not a port from 1 to 65535")
-    return value
-
-
 def _bytes(text: str) -> int:
     from tofuse.batch.jobs import parse_bytes
 
@@ -778,20 +774,6 @@ def _whole(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
 
 
-def _count(text: str) -> int:
-    value = _whole(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
-    return value
-
-
-def _non_negative(text: str) -> int:
-    value = _whole(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
-
-
 def _number(text: str) -> float:
     """NaN if it is none."""
     try:
@@ -800,20 +782,24 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _ratio(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
-    return value
+def _within(bounds: Bounds, kind: Callable[[str], _Number]) -> Callable[[str], _Number]:
+    """Return a function that reads a number and refuses one outside the bounds."""
+
+    def read(text: str) -> _Number:
+        value = kind(text)
+        if value not in bounds:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {bounds}")
+        return value
+
+    return read
 
 
-def _seconds(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive time in seconds")
-    return value
-
-
+_port = _within(Bounds(1, 65535), _whole)
+_count = _within(Bounds(1), _whole)
+_non_negative = _within(Bounds(0), _whole)
+_ratio = _within(Bounds(0, 1, exclusive=True), _number)
+_seconds = _within(Bounds(0, exclusive=True), _number)
+_metres = _within(Bounds(0), _number)
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
@@ -823,11 +809,4 @@ def _length(text: str) -> float:
     value = _number(match[1]) * _UNITS_M[match[2] or "m"] if match else math.nan
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
-    return value
-
-
-def _metres(text: str) -> float:
-    value = _number(text)
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a distance in metres")
     return value

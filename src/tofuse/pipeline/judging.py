@@ -278,15 +278,7 @@ def judge_files(
         If the result can't be written; an existing folder is then unchanged.
     """
     options, progress = options or JudgeOptions(), progress or Silent()
-    opening = Opening(
-        tuple(Path(path) for path in inputs),
-        options.format,
-        options.camera,
-        options.topic,
-        options.start,
-        options.end,
-        options.every,
-    )
+    opening = Opening.of(inputs, options)
     recording = opening.open()
     out = options.out
     with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:

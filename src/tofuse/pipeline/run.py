@@ -171,7 +171,7 @@ class _Job:
 def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) -> _Job:
     """Open and inspect the recording, and resolve its configuration."""
     seed = _seed(options)
-    opening = _opening(inputs, options)
+    opening = Opening.of(inputs, options)
     recording = opening.open()
     _preview(recording, progress)
     config = resolve(options, view_kind(recording))
@@ -216,20 +216,6 @@ def _with_job(
         result,
         recording={**result.recording, "opening": job.opening.to_dict()},
         diagnostics=replace(result.diagnostics, seconds=seconds),
-    )
-
-
-def _opening(inputs: Sequence[str | Path], options: Options) -> Opening:
-    """Return how the recording is opened, which the result states."""
-    return Opening(
-        tuple(Path(path) for path in inputs),
-        options.format,
-        options.camera,
-        options.topic,
-        options.start,
-        options.end,
-        options.every,
-        options.average_still,
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,15 @@ class Opening:
     end: int | None = None
     every: int = 1
     average_still: bool = False
+
+    @classmethod
+    def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
+        """Return how files or folders are opened by options that have the names of the fields.
+
+        Fields without an option keep their defaults.
+        """
+        names = [f.name for f in fields(cls) if hasattr(options, f.name)]
+        return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
 
     def open(self) -> Recording:
         """Open the recording; InputError if that fails."""
