@@ -162,10 +162,10 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
         transform_block(block, T)
         out[PROJECTED] += project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, inflation, robust, min_cosine)
-        _add_products(sums, block)
+        add_products(sums, block, 14)
         if scale_p > 0:
             compare_albedos(block, T, exposure, scale_p, robust)
-            _add_products(sums, block)
+            add_products(sums, block, 14)
         for c in range(_STATS):
             total, row = sums[PROJECTED + c], block[(STAT + c) * LANES : (STAT + c + 1) * LANES]
             for k in range(LANES):
@@ -373,12 +373,12 @@ def _put(
 
 
 @kernel
-def _add_products(sums: Float64, block: Float32) -> None:
-    """Add the products of the rows of J and r, and of those of D, column by column."""
+def add_products(sums: Float64, block: Float32, rows: int) -> None:
+    """Add the products of the rows of J and r, and with 14 `rows` of those of D, by column."""
     q = 0
-    for p in range(14):
+    for p in range(rows):
         a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
-        for o in range(p, 8 if p < 8 else 14):
+        for o in range(p, 8 if p < 8 else rows):
             b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
             total = sums[q]
             for k in range(LANES):

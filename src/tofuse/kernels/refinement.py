@@ -20,7 +20,6 @@ from tofuse.kernels.alignment import (
     COUNT_P,
     DISTANCE,
     INLIERS,
-    JACOBIAN,
     LANES,
     NORMAL,
     PLANE,
@@ -37,6 +36,7 @@ from tofuse.kernels.alignment import (
     WEIGHT_G,
     Residuals,
     TargetImage,
+    add_products,
     compare_albedos,
     compare_planes,
     histogram_bin,
@@ -299,11 +299,11 @@ def _pose_equations(
             if block[SEEN * LANES + k] > 0:
                 out[COMPARED] += 1
                 out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
-        _add_block(sums, block)
+        add_products(sums, block, 8)
         _add_cubes(sums[support], block, WEIGHT_G)
         if scale_p > 0:
             compare_albedos(block, T, exposure, scale_p, robust)
-            _add_block(sums, block)
+            add_products(sums, block, 8)
             _add_cubes(sums[support], block, ALBEDO_WEIGHT)
         for which in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
             place = which - INLIERS
@@ -333,20 +333,6 @@ def _pose_equations(
     out[SQUARES_P] = sums[products + ALBEDO_SQUARES - INLIERS, 0]
     out[TERMS] = out[COMPARED] + sums[products + COUNT_P - INLIERS, 0]
     out[SUPPORT] = sums[support, 0]
-
-
-@kernel
-def _add_block(sums: Float64, block: Float32) -> None:
-    """Add the products of the rows of J and r, column by column."""
-    q = 0
-    for p in range(8):
-        a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
-        for o in range(p, 8):
-            b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
-            total = sums[q]
-            for k in range(LANES):
-                total[k] += a[k] * b[k]
-            q += 1
 
 
 @kernel
