@@ -21,6 +21,7 @@ from tofuse.arrays import Float64, Intp
 from tofuse.calibration.plane_views import PlaneView
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.sensor.depth_correction import DepthCorrection
 
 _KNOT_M = 0.04
@@ -398,7 +399,7 @@ def _blur_and_fill(sums: Float64, weights: Float64, width: float) -> Float64:
 
 def _robust_rms(values: Float64) -> float:
     """Return the rms of the normal distribution with the same median absolute value."""
-    return float(np.median(np.abs(values))) / 0.6745
+    return float(np.median(np.abs(values))) / MEDIAN_OF_NORMAL
 
 
 def _patches(

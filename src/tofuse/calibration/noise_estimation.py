@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import ray_lengths
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
@@ -322,7 +323,7 @@ def _nonnegative(columns: Float64, target: Float64, pixels: Float64) -> Float64:
         w = base * np.sqrt(weights) / target
         x = nnls(columns / scale * w[:, None], target * w)[0] / scale
         off = np.abs(np.log(np.maximum(columns @ x, 1e-30) / target))
-        limit = 1.5 * max(float(np.median(off)) / 0.6745, 1e-3)
+        limit = 1.5 * max(float(np.median(off)) / MEDIAN_OF_NORMAL, 1e-3)
         weights = limit / np.maximum(off, limit)
     return x
 

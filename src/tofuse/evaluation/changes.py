@@ -27,6 +27,7 @@ from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.search import ViewPoints
 from tofuse.kernels.threads import run_chunks
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.registration.agreement import nearest_depth
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import landing_pixels, sampled_points
@@ -35,9 +36,8 @@ Kind = Literal["appeared", "vanished"]
 
 # Points of each view, and pairs of views from which the disagreement within a session is estimated.
 _POINTS, _MAX_PAIRS = 2000, 60
-# Residuals of the same surface are below this fraction of the depth; the quantile of their absolute
-# values that the scale is estimated from, and its value for a normal distribution.
-_MAX_RESIDUAL, _QUANTILE, _NORMAL = 0.05, 0.5, 0.6745
+# Residuals of the same surface are below this fraction of the depth.
+_MAX_RESIDUAL = 0.05
 # A surface is the same within this many standard deviations, and free space beyond this many.
 _SAME_SIGMAS, _THROUGH_SIGMAS = 3.0, 5.0
 # Probability that a view is wrong about a point for other reasons than noise, prior probability of
@@ -210,7 +210,7 @@ def _noise_scale(views: Sequence[_SessionView]) -> float:
     r, sigma = _residuals([pairs[k] for k in np.unique(some)])
     if not len(r):
         return 1.0
-    return max(float(np.quantile(r / sigma, _QUANTILE)) / _NORMAL, 1.0)
+    return max(float(np.quantile(r / sigma, 0.5)) / MEDIAN_OF_NORMAL, 1.0)
 
 
 def _misalignment(
@@ -222,7 +222,7 @@ def _misalignment(
     r, sigma = _residuals([facing[k] for k in np.unique(some)])
     if not len(r):
         return 0.0
-    both = float(np.quantile(r, _QUANTILE)) / _NORMAL
+    both = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL
     noise = scale * float(np.sqrt((sigma**2).mean()))
     return float(np.sqrt(max(both**2 - noise**2, 0.0)))
 

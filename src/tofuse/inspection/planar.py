@@ -32,6 +32,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.arrays import Bool, Float64, Int64
+from tofuse.normal import robust_sigma
 from tofuse.registration.prepared_view import PreparedView
 
 Model = Literal["kind", "z", "range"]
@@ -291,4 +292,4 @@ def _residuals(
 
 
 def _spread(e: Float64) -> float:
-    return max(1.4826 * float(np.median(np.abs(e))), 1e-9)
+    return max(robust_sigma(e), 1e-9)

@@ -15,6 +15,7 @@ from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.fusion.pose_errors import with_pose_errors
+from tofuse.normal import OF_95_PERCENT
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, degenerate_runs, with_prediction
 from tofuse.parts import name_of
@@ -49,7 +50,6 @@ from tofuse.results.verdict import ranked
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
-_QUANTILE = 1.96  # of a normal distribution, 95 %
 
 T = TypeVar("T")
 
@@ -482,7 +482,7 @@ class BackEnd:
             if isinstance(part, CameraErrors):
                 sigmas = part.sigmas
                 errors += [
-                    _QUANTILE * sigmas[name] * np.array(motion)
+                    OF_95_PERCENT * sigmas[name] * np.array(motion)
                     for name, motion in check.motion.items()
                 ]
         m, rad = np.linalg.norm(errors, axis=0).tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.normal import robust_sigma
 
 # Degrees of freedom of Student's t (Lange, Little and Taylor 1989 suggest 4).
 _FREEDOM = 4.0
@@ -34,7 +35,7 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     Posterior mean and standard deviation.
     """
     centre = float(np.median(estimates))
-    spread = 1.4826 * float(np.median(np.abs(estimates - centre)))
+    spread = robust_sigma(estimates - centre)
     spread = spread or float(np.std(estimates))
     if not spread:
         return centre, 0.0

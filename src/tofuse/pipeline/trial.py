@@ -24,6 +24,7 @@ from scipy.special import stdtrit
 from tofuse.arrays import Float32, Float64, Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.geometry import se3
+from tofuse.normal import robust_sigma
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
@@ -324,7 +325,7 @@ def _compared(target: _View, source: _View, T: Float64) -> tuple[Float64, Float6
     known &= np.isfinite(distance)
     if np.count_nonzero(known) < _MIN_POINTS:
         return None
-    deviation = 1.4826 * float(np.median(np.abs(distance[known])))
+    deviation = robust_sigma(distance[known])
     known &= np.abs(distance) < _CUT * max(deviation, _MIN_DEVIATION_M)
     if np.count_nonzero(known) < _MIN_POINTS:
         return None

@@ -26,6 +26,7 @@ from tofuse.arrays import Float64, Intp
 from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.kernels.motion import retract, twist_between
+from tofuse.normal import SIGMA_OF_MEDIAN
 from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
@@ -849,7 +850,8 @@ def _by_odometry(before: Stretch, after: Stretch) -> Link | None:
     # Errors of odometry are in proportion to the motion.
     usual = np.median(np.concatenate(lengths)[known], axis=0) * steps
     more = np.maximum(_lengths(T[None])[0] / np.maximum(usual, 1e-9), 1.0)
-    sigma = 1.4826 * np.median(np.abs(misfit[known]), axis=0) * np.sqrt(steps) * np.repeat(more, 3)
+    one = SIGMA_OF_MEDIAN * np.median(np.abs(misfit[known]), axis=0)
+    sigma = one * np.sqrt(steps) * np.repeat(more, 3)
     limit = np.repeat([_MAX_ALIGNED * before.depth, _MAX_ALIGNED], 3)
     if (sigma > limit).any():
         return None

@@ -13,13 +13,13 @@ from scipy.sparse.csgraph import connected_components
 
 from tofuse.arrays import Bool, Float32, Float64, Int32
 from tofuse.errors import InputError
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import RangeFrame
 
 # A surface exists where this fraction of the frames, and this number, agree on its depth.
 _MIN_FRACTION, _MIN_AGREEING = 0.15, 3
 # Depths agree within this number of sigmas plus this fraction of the depth.
 _SIGMAS, _RELATIVE = 5.0, 0.01
-_NORMAL_MEDIAN = 0.6745
 
 _OPTION = "--object"
 _LEAVE = "leave it out if the camera moves; else "
@@ -94,7 +94,7 @@ def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
         found |= fits
     agree = valid & found & (np.abs(z - centre) <= tolerance)
     depth = _median(z, agree)
-    sigma = _median(np.abs(z - depth), agree) / np.float32(_NORMAL_MEDIAN)
+    sigma = _median(np.abs(z - depth), agree) / np.float32(MEDIAN_OF_NORMAL)
     missing = ~valid
     empty = 2 * np.count_nonzero(missing, axis=0) > count
     return FarSurface(
@@ -192,7 +192,7 @@ def _spatial_sigma(z: Float32) -> Float32:
         bend[..., 1:-1] = np.where(three, second, np.nan)
         by_axis.append(_median(np.moveaxis(bend, 2, axis), None))
     # The second difference of independent noise has six times its variance.
-    sigma = np.fmin(*by_axis) / np.float32(np.sqrt(6) * _NORMAL_MEDIAN)
+    sigma = np.fmin(*by_axis) / np.float32(np.sqrt(6) * MEDIAN_OF_NORMAL)
     known = sigma[np.isfinite(sigma)]
     typical = np.float32(np.median(known)) if len(known) else np.float32(0)
     return np.where(np.isfinite(sigma), sigma, typical)

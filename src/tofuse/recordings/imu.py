@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
+from tofuse.normal import robust_sigma
 
 ACCELERATION = ("ax", "ay", "az")
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
@@ -63,7 +64,7 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
         return out
     typical = float(np.median(length[known]))
     off = np.abs(length / typical - 1)
-    spread = 1.4826 * float(np.median(off[known]))
+    spread = robust_sigma(off[known])
     known &= off < _PLAUSIBLE
     out[known, :3] = mean[known] / length[known, None]
     out[known, 3] = _FUSED if fused else np.sqrt(spread**2 + off[known] ** 2 + _MIN_SIGMA**2)

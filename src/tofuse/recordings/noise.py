@@ -10,6 +10,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.files.reading import is_file, is_folder
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NOISE, AmplitudeLaw, NoiseModel
@@ -37,7 +38,6 @@ _SIZES = {
 }
 _SAMPLED_FRAMES = 3
 _MAX_RATIO = 3.0  # of observed to predicted noise
-_NORMAL_MEDIAN = 0.6745
 
 
 def noise_model_for(recording: Recording) -> NoiseModel:
@@ -129,4 +129,4 @@ def _log_excess(model: NoiseModel, frames: list[RangeFrame]) -> float:
     ratios: Float64 = np.concatenate(ratios_of) if ratios_of else np.empty(0)
     if len(ratios) < 200 or not (median := float(np.median(ratios))) > 0:
         return float("nan")
-    return float(np.log(median / _NORMAL_MEDIAN))
+    return float(np.log(median / MEDIAN_OF_NORMAL))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.geometry.cameras import Camera, RayTable
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
@@ -29,7 +30,6 @@ _MIN_PIXELS = 100
 _RATIO = 3  # of the side of a large block to that of a small one
 _OUTLIER_SIGMAS = 3.0
 _MAX_FRAMES = 48
-_NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _coherence(change: NDArray[Any], ok: Bool) -> ImageChange:
     values = np.abs(change[ok])
     if not values.any():
         return ImageChange(0.0, 0.0, identical=True)
-    typical = float(np.median(values)) / _NORMAL_MEDIAN
+    typical = float(np.median(values)) / MEDIAN_OF_NORMAL
     limit = 2.5 * typical if typical > 0 else float(values.max())
     clipped = np.where(ok, np.clip(change, -limit, limit), 0).astype(float)
     noise = float(np.sqrt((clipped[ok] ** 2).mean()))
@@ -252,7 +252,7 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     centre = _median(depth, valid, count)
     off = np.abs(depth - centre)
     # Scale of the actual noise relative to the model, so that inliers are not rejected.
-    scale = float(np.median(off[valid] / sigma[valid])) / _NORMAL_MEDIAN if valid.any() else 1.0
+    scale = float(np.median(off[valid] / sigma[valid])) / MEDIAN_OF_NORMAL if valid.any() else 1.0
     near = valid & (off <= _OUTLIER_SIGMAS * max(scale, 1.0) * sigma)
     kept = near.sum(0)
     enough = (2 * count >= len(frames)) & (kept > 0)

@@ -13,6 +13,7 @@ from tofuse.kernels import search as kernels
 from tofuse.kernels.median import median
 from tofuse.kernels.search import ViewPoints
 from tofuse.kernels.threads import run_chunks
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import sampled_points
 
@@ -24,7 +25,6 @@ _NEIGHBOURS = np.ones((5, 5), np.uint8)
 # Prior standard deviation of an unknown exponent of the falloff (natural vignetting is the fourth
 # power), number of points that share an albedo error, and trimmed least-squares iterations.
 _FALLOFF, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
-_MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
         exponent = -float(x @ (y - y.mean())) / (float(x @ x) + ridge)
         off = albedo_ratio + np.float32(exponent) * slants
         off = np.abs(off - np.float32(median(off[keep])))
-        keep = off <= 3 / _MEDIAN_OF_NORMAL * np.float32(median(off[keep]))
+        keep = off <= 3 / MEDIAN_OF_NORMAL * np.float32(median(off[keep]))
     return exponent
 
 

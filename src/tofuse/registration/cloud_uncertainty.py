@@ -21,6 +21,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.normal import robust_sigma
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap
 from tofuse.registration.pairs import (
     FEWEST_PAIRS,
@@ -149,7 +150,7 @@ class _Pairs:
     @property
     def noise(self) -> float:
         """Robust standard deviation of the residuals, m."""
-        return max(1.4826 * float(np.median(np.abs(self.residual))), _MIN_SIGMA * self.resolution)
+        return max(robust_sigma(self.residual), _MIN_SIGMA * self.resolution)
 
     def kept(self, unit: Float64) -> Float64:
         """Sum of w times the symmetrised product of both Jacobians (6, 6), where noise cancels."""

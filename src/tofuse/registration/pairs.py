@@ -16,6 +16,7 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.cloud_sums import direction_products, plane_sums
 from tofuse.kernels.icp import transform_points
+from tofuse.normal import robust_sigma
 from tofuse.registration.interfaces import Alignment, Matches
 
 Loss = Literal["square", "huber", "cauchy", "tukey"]
@@ -25,7 +26,6 @@ FEWEST_PAIRS = 6
 _SMALLEST_SIGMA = 1e-3
 # Tuning constants for 95 % efficiency on normal errors, in standard deviations.
 _HUBER, _CAUCHY, _TUKEY = 1.345, 2.385, 4.685
-_MAD = 1.4826
 # Relative eigenvalues below this are rounding errors.
 _RANK_TOLERANCE = 1e-10
 # Normals that differ by more than 60 degrees are of different surfaces.
@@ -161,7 +161,7 @@ def in_scales(residual: Float64, resolution: float) -> Float64:
     The scale is 1.4826 times their median, at least a thousandth of the resolution.
     """
     size = np.abs(residual)
-    return np.asarray(size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * resolution))
+    return np.asarray(size / max(robust_sigma(size), _SMALLEST_SIGMA * resolution))
 
 
 def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:

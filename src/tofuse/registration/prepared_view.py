@@ -21,6 +21,7 @@ from tofuse.kernels.surface import (
     smooth_and_slope,
 )
 from tofuse.kernels.threads import run_chunks
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
@@ -48,8 +49,6 @@ _CORRELATED_PIXELS = 100.0
 _NOISY_RATIO, _MIN_NOISY = 2.0, 0.02
 # Largest distance, in standard deviations, of a pixel that belongs to a plane.
 _MAX_PLANE_SIGMAS = 3.0
-# Median of the absolute values of a standard normal distribution.
-_MEDIAN_OF_NORMAL = 0.6745
 
 
 # Exponent of the range by which the amplitude of a time-of-flight camera falls off.
@@ -763,7 +762,7 @@ def _typical_noise(w: Float32, weight: Float32) -> float:
     before, here, after = (values[known] for values in some)
     bend = np.abs(before - 2 * here + after) / here
     # sqrt(6) in a second difference, sqrt(2) in a first one.
-    return median(bend) / _MEDIAN_OF_NORMAL / np.sqrt(3.0)
+    return median(bend) / MEDIAN_OF_NORMAL / np.sqrt(3.0)
 
 
 def _noise_law(

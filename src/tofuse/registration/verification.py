@@ -15,6 +15,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.registration.agreement import AgreementOptions
 from tofuse.registration.projective import Aligned, Level
 
@@ -37,7 +38,6 @@ _MIN_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
 # Once a camera is known, the distribution is updated every n-th alignment.
 _RELEARN_EVERY = 10
-_MEDIAN_OF_NORMAL = 0.6745
 # Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
 IN_SIGHT = 1.2
 # For six unknowns, with noise that is correlated between neighbouring pixels.
@@ -126,7 +126,7 @@ class UsualFit:
             n = len(known)
             if n:
                 middle = float(np.median(known))
-                spread = float(np.median(np.abs(known - middle))) / _MEDIAN_OF_NORMAL
+                spread = float(np.median(np.abs(known - middle))) / MEDIAN_OF_NORMAL
                 weight = n / (n + _PRIOR_COUNT)
                 mean[k] += weight * (middle - mean[k])
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])

@@ -8,7 +8,8 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
-from tofuse.report.fields import OF_95_PERCENT, normalized_accuracy
+from tofuse.normal import OF_95_PERCENT
+from tofuse.report.fields import normalized_accuracy
 from tofuse.report.packing import pack
 from tofuse.report.scene import RigCameras
 from tofuse.report.subject import Subject

@@ -9,12 +9,11 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
+from tofuse.normal import OF_95_PERCENT
 from tofuse.report import words
 from tofuse.report.packing import pack
 from tofuse.report.scene import Scene, height_range
 
-# One in twenty normally distributed errors exceeds this many standard deviations.
-OF_95_PERCENT = 1.96
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _FINEST_M = 1e-4
 

@@ -16,6 +16,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.rigs.clocks import Lag, lag_between
 
 # Units of the unknowns: 1 cm, 1 degree, and 1 ms.
@@ -28,7 +29,6 @@ _SPANS = (0.02, 0.05, 0.1, 0.2, 0.35)
 _ITERATIONS, _SETTLED = 30, 1e-4
 # Cut-off of Tukey's biweight in sigmas; minimum sigma of a pose.
 _ROBUST, _MIN_SIGMA = 4.7, 0.02
-_NORMAL_MEDIAN = 0.6745
 # Upper 95 % bound, in standard errors.
 _UPPER = 1.64
 # Sigma of an unconstrained direction, in units.
@@ -250,7 +250,7 @@ class _Fit:
 
 def _sigma(e: Float64) -> Float64:
     """Return the robust standard deviation (6,) of residuals, equal for the axes of each kind."""
-    each = np.median(np.abs(e), axis=0) / _NORMAL_MEDIAN
+    each = np.median(np.abs(e), axis=0) / MEDIAN_OF_NORMAL
     both = [np.sqrt((each[:3] ** 2).mean())] * 3 + [np.sqrt((each[3:] ** 2).mean())] * 3
     return np.maximum(both, _MIN_SIGMA)
 

@@ -15,6 +15,7 @@ from scipy.special import stdtr
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.background import FarSurface, far_surface
@@ -356,7 +357,7 @@ def _activity(camera: Camera) -> tuple[Float64, Float64]:
         if before is not None:
             both = before.valid & frame.valid
             change = np.abs(frame.z - before.z)[both]
-            noise = float(np.median(change)) / 0.6745 if len(change) else 0.0
+            noise = float(np.median(change)) / MEDIAN_OF_NORMAL if len(change) else 0.0
             limit = np.maximum(5 * noise, 0.01 * before.z[both])
             times.append(0.5 * (before.timestamp + frame.timestamp))
             fractions.append(float((change > limit).mean()) if len(change) else 0.0)

@@ -13,7 +13,7 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
-from tofuse.report.fields import OF_95_PERCENT
+from tofuse.normal import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import FATES, Pictures
 from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines

@@ -19,7 +19,7 @@ from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
-from tofuse.report.fields import OF_95_PERCENT
+from tofuse.normal import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.report.scene import RigCameras

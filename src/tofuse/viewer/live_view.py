@@ -10,8 +10,8 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.geometry import se3
+from tofuse.normal import OF_95_PERCENT
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import data_uri, depth_image, depth_limits, subsample, viridis
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
