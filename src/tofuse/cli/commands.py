@@ -20,6 +20,7 @@ from tofuse.cli.progress import (
     QuietProgress,
     TerminalProgress,
     emit,
+    escaped,
     progress_for,
 )
 from tofuse.results.types import Reason, Reconstruction
@@ -240,7 +241,7 @@ def register(arguments: argparse.Namespace) -> int:
     console = make_console()
     head, tail = decision(result)
     color = _STATUS_COLORS[result.found.believed]
-    console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
+    console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
     for line in registering.text(result):
         console.print(line, markup=False)
     _print_warnings(console, pair_json(result)["warnings"])
@@ -424,7 +425,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
 
 def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
     for warning in warnings:
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+        console.print(f"[yellow]warning:[/] {escaped(warning)}")
 
 
 def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
@@ -432,7 +433,7 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
 
     for reason in ranked(reasons):
         level = REASONS[reason.code][0]
-        console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
+        console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
         if reason.code in ADVICE:
             console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
 
@@ -484,16 +485,16 @@ def inspect(arguments: argparse.Namespace) -> int:
     console = make_console()
     width = max(map(len, found.facts))
     for name, value in found.facts.items():
-        console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
+        console.print(f"[bold]{name:<{width}}[/]  {escaped(value)}")
     _print_warnings(console, found.notes)
     for finding in found.findings:
         color = _SEVERITY_COLORS[finding.severity]
-        console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {_escape(finding.text)}")
-        console.print(f"  {_escape(finding.remedy)}")
+        console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
+        console.print(f"  {escaped(finding.remedy)}")
     if not found.findings:
         console.print("[green]No problems found.[/]")
     if arguments.sheet is not None:
-        console.print(f"see {_escape(str(arguments.sheet))}")
+        console.print(f"see {escaped(str(arguments.sheet))}")
     return 0
 
 
@@ -509,7 +510,7 @@ def convert(arguments: argparse.Namespace) -> int:
     else:
         done = convert_to(recording, arguments.out, arguments.to)
     console = make_console()
-    console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
+    console.print(f"{done.frames} frames in {escaped(str(done.folder))}")
     _print_warnings(console, (*recording.warnings, *done.warnings))
     return 0
 
@@ -545,11 +546,11 @@ def record(arguments: argparse.Namespace) -> int:
             stopped=stopped.is_set,
             progress=lambda _: progress.advance(),
         )
-    console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
+    console.print(f"{done.frames} frames in {escaped(str(done.folder))}")
     if done.dropped:
         console.print(f"[yellow]warning:[/] {done.dropped} frames dropped: the disk was too slow")
     if done.ended_by != "asked":
-        console.print(f"[yellow]warning:[/] {_escape(done.ended_by)}")
+        console.print(f"[yellow]warning:[/] {escaped(done.ended_by)}")
     return 0
 
 
@@ -589,7 +590,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
         emit(data)
         return 0
     for line in lines:
-        console.print(_escape(line))
+        console.print(escaped(line))
     _print_warnings(console, warnings)
     return 0
 
@@ -619,7 +620,7 @@ def noise(arguments: argparse.Namespace) -> int:
     console = make_console()
     console.print(table)
     console.print(
-        f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
+        f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
         f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
         f"{100 * fit.rms_log_error:.0f} % rms (built-in model: {100 * fit.before:.0f} %)"
     )
@@ -733,7 +734,3 @@ def experiments(arguments: argparse.Namespace) -> int:
         )
     print(f"see {page}")
     return 0
-
-
-def _escape(text: str) -> str:
-    return text.replace("[", r"\[")

@@ -156,7 +156,7 @@ class TerminalProgress(Silent):
 
     def note(self, text: str) -> None:
         """Print a line above the bar."""
-        self._console.print(f"[yellow]note:[/] {_escaped(text)}")
+        self._console.print(f"[yellow]note:[/] {escaped(text)}")
 
 
 class JsonProgress(Silent):
@@ -270,5 +270,6 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
+    """Return text for rich, whose markup begins with a bracket."""
     return text.replace("[", r"\[")

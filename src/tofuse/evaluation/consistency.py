@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float32, Float64
 from tofuse.corrections.base import Corrector
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.evaluation.trajectory import finite_or_none
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens
@@ -124,8 +125,8 @@ class Consistency:
     def to_dict(self) -> dict[str, float | int | None]:
         """Return the pooled figures as plain data; None instead of NaN."""
         return {
-            "rms_m": _known(self.rms_m),
-            "inlier_share": _known(self.inlier_ratio),
+            "rms_m": finite_or_none(self.rms_m),
+            "inlier_share": finite_or_none(self.inlier_ratio),
             "pairs": self.pairs,
             "frames": self.frames,
         }
@@ -384,7 +385,3 @@ def _normals(points: Float64) -> Float32:
     known &= length > 0
     out[k:-k, k:-k][known] = normal[known] / np.maximum(length[known], 1e-12)[:, None]
     return out
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

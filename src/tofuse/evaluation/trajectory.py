@@ -42,8 +42,8 @@ class RelativeError:
         return {
             "frames": self.frames,
             "pairs": self.pairs,
-            "translation_rms_m": _known(self.translation_rms_m),
-            "rotation_rms_deg": _known(np.degrees(self.rotation_rms_rad)),
+            "translation_rms_m": finite_or_none(self.translation_rms_m),
+            "rotation_rms_deg": finite_or_none(np.degrees(self.rotation_rms_rad)),
         }
 
 
@@ -295,5 +295,6 @@ def _rms(values: Float64) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
-def _known(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
+    """Return a number for JSON, which has no NaN."""
     return float(value) if np.isfinite(value) else None

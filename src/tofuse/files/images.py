@@ -116,6 +116,28 @@ def _check_whole(data: bytes, path: str | Path) -> None:
     raise InputError("is cut off before its end", where=path, remedy="copy the file again")
 
 
+def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, remedy: str) -> None:
+    """Compare the size of the first readable image with (width, height), stated by `where`.
+
+    Raises
+    ------
+    InputError
+        If they differ. Errors of a file are raised when it is read.
+    """
+    for path in files[:5]:
+        try:
+            header = read_header(path)
+        except InputError:
+            continue
+        if (header.width, header.height) != size:
+            raise InputError(
+                f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}",
+                where=path,
+                remedy=remedy,
+            )
+        return
+
+
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
     """Return (width, height) of the first image with a readable header."""
     error: InputError | None = None

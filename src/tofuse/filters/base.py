@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
-from tofuse.arrays import Bool
+from tofuse.arrays import Bool, Float32, Float64
+from tofuse.bounds import Bounded, Bounds
 from tofuse.parts import name_of
 from tofuse.recordings.frames import Frame
 
@@ -62,6 +63,24 @@ class Filter(Protocol):
         A mask of the shape of ``frame.valid``; its values at invalid points are ignored.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Interval(Bounded):
+    """Numbers from `minimum` to `maximum`; None for no upper limit."""
+
+    minimum: Annotated[float, Bounds(0)] = 0.0
+    maximum: Annotated[float | None, Bounds()] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.maximum is not None and not self.maximum > self.minimum:
+            raise ValueError(f"maximum must be above {self.minimum:g}, not {self.maximum!r}")
+
+    def contains(self, values: Float32 | Float64) -> Bool:
+        """Return which of the values lie in the interval."""
+        keep: Bool = values >= self.minimum
+        return keep if self.maximum is None else keep & (values <= self.maximum)
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from tofuse.arrays import Bool
 from tofuse.bounds import Bounded, Bounds
-from tofuse.filters.base import Filter
+from tofuse.filters.base import Filter, Interval
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
 
 @part("filter", "distance")
 @dataclass(frozen=True)
-class Distance(Bounded, Filter):
+class Distance(Interval, Filter):
     """Keep points at a distance from `minimum` to `maximum` (section 2.8).
 
     Attributes
@@ -29,16 +29,9 @@ class Distance(Bounded, Filter):
         its distance is always that to its origin.
     """
 
-    minimum: Annotated[float, Bounds(0)] = 0.0
-    maximum: Annotated[float | None, Bounds()] = None
     measure: Literal["z", "range"] = "z"
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.maximum is not None and not self.maximum > self.minimum:
-            raise ValueError(f"maximum must be above {self.minimum:g}, not {self.maximum!r}")
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
@@ -46,8 +39,7 @@ class Distance(Bounded, Filter):
             distance = frame.z if self.measure == "z" else frame.radial_range
         else:
             distance = np.linalg.norm(frame.points - frame.origin, axis=1)
-        keep = distance >= self.minimum
-        return keep if self.maximum is None else keep & (distance <= self.maximum)
+        return self.contains(distance)
 
 
 @part("filter", "box")

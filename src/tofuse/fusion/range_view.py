@@ -18,6 +18,7 @@ from tofuse.registration.prepared_view import (
     PreparedView,
     Projection,
     SurfaceOptions,
+    dilated,
     prepare_view,
     with_extended_planes,
 )
@@ -112,7 +113,7 @@ class RangeView:
         density = _reduced(frame.valid.astype(np.float32), shape)
         # Half of the pixels of a block; of a sparse image, half of what a block usually has.
         valid = density >= 0.5 * (median(density[density > 0]) if density.any() else 1.0)
-        valid |= measured & _dilated(valid.view(np.uint8), 1) & (jump == 0)
+        valid |= measured & dilated(valid.view(np.uint8), 1) & (jump == 0)
         z = np.where(valid, smoothed, np.float32(0))
         good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
         normals = np.empty((*shape, 3), np.int8)
@@ -127,7 +128,7 @@ class RangeView:
             normals,
             weight,
         )
-        weight[_dilated(jump, options.edge_margin)] *= _RIM
+        weight[dilated(jump, options.edge_margin)] *= _RIM
         good = weight > 0
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535
@@ -207,11 +208,6 @@ def _typical_sigma(variance: Float32, good: Bool) -> float:
         if len(some):
             return float(np.sqrt(median(some)))
     return 0.0
-
-
-def _dilated(mask: UInt8, margin: int) -> Bool:
-    size = 2 * margin + 1
-    return cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0
 
 
 def with_camera_correction(

@@ -131,7 +131,7 @@ def number_in(
     name: str,
     where: str | Path,
     default: float | None = None,
-    remedy: str = "correct it",
+    remedy: str = "use a number",
 ) -> float:
     """Return a number of JSON data.
 
@@ -146,7 +146,7 @@ def number_in(
     default
         The value if it is missing; required unless given.
     remedy
-        The remedy if it is too large.
+        The remedy.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def number_in(
     value = data.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         problem = "is missing" if value is None else f"is {value!r:.60}"
-        raise InputError(problem, where=f"{where}: {name}", remedy="use a number")
+        raise InputError(problem, where=f"{where}: {name}", remedy=remedy)
     try:
         return float(value)
     except OverflowError as error:

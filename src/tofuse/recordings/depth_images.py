@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.images import read_color, read_header, read_image
+from tofuse.files.images import check_first_size, read_color, read_image
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.frames import DepthKind, RangeFrame
@@ -76,22 +76,8 @@ class DepthImageSource(FileSource):
         colored = sum(path is not None for path in self.color or ())
         if 0 < colored < len(self.files):
             self.warnings.append(f"only {colored} of {len(self.files)} frames have colour")
-        self._check_size(where)
-
-    def _check_size(self, where: str) -> None:
-        for path in self.files[:5]:
-            try:
-                header = read_header(path)
-            except InputError:
-                continue  # an error of that frame alone, raised when it is read
-            if (header.width, header.height) != (self.camera.width, self.camera.height):
-                raise InputError(
-                    f"is {header.width} x {header.height} pixels, {where} "
-                    f"{self.camera.width} x {self.camera.height}",
-                    where=path,
-                    remedy="pass the camera of these images with --camera",
-                )
-            return
+        remedy = "pass the camera of these images with --camera"
+        check_first_size(self.files, (camera.width, camera.height), where, remedy)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

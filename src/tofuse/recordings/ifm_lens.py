@@ -5,10 +5,12 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tofuse.arrays import Float64
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.camera_file import MAX_SLOPE
@@ -26,6 +28,11 @@ class HeadInfo:
     distance_unit_m: float
     model: int
     numbers: tuple[float, ...]
+
+    def metres(self, image: NDArray[Any]) -> Float32:
+        """Convert distances or their noise to m: integers are counts, floats are in m already."""
+        out = image.astype(np.float32)
+        return out if image.dtype.kind == "f" else out * np.float32(self.distance_unit_m)
 
 
 def read_info(data: bytes, where: str) -> HeadInfo:

@@ -17,7 +17,7 @@ from tofuse.arrays import Float32, Float64, UInt16
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.images import read_color, read_header, read_image, write_png
+from tofuse.files.images import check_first_size, read_color, read_image, write_png
 from tofuse.files.ply import write_ply
 from tofuse.files.reading import files_with, is_file, is_folder, list_folder
 from tofuse.files.tables import exact, read_columns, read_numbers, write_columns
@@ -318,29 +318,16 @@ class NativeSource(FileSource):
         """Compare the size in camera.json with the first readable header of each channel."""
         if self.camera is None:
             return
+        size, where = (self.camera.width, self.camera.height), "camera.json states"
+        remedy = "use the camera.json of these images"
         for channel in (self.files, self.amplitude, self.confidence, self.sigma):
-            self._check_size(channel, (self.camera.width, self.camera.height), "")
+            check_first_size(channel, size, where, remedy)
         color = self.description.color
         if color is None:
-            hint = '; or describe its camera by "color" in camera.json'
-            self._check_size(self.color, (self.camera.width, self.camera.height), hint)
+            remedy += '; or describe its camera by "color" in camera.json'
         else:
-            self._check_size(self.color, (color.camera.width, color.camera.height), "")
-
-    def _check_size(self, files: list[Path], size: tuple[int, int], hint: str) -> None:
-        for path in files[:5]:
-            try:
-                header = read_header(path)
-            except InputError:
-                continue  # an error of that frame alone, raised when it is read
-            if (header.width, header.height) != size:
-                raise InputError(
-                    f"is {header.width} x {header.height} pixels, camera.json states "
-                    f"{size[0]} x {size[1]}",
-                    where=path,
-                    remedy=f"use the camera.json of these images{hint}",
-                )
-            return
+            size = (color.camera.width, color.camera.height)
+        check_first_size(self.color, size, where, remedy)
 
     def _fill_metadata(self) -> None:
         about = self.description

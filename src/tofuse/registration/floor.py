@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float32, Float64
+from tofuse.arrays import Bool, Float64
 from tofuse.kernels import search as kernels
+from tofuse.registration.plane_detection import fit_plane
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import sampled_points
 
@@ -75,6 +76,7 @@ def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -
     if len(facing) < _MIN_INLIERS * len(p):
         return None
     tried = facing[:: max(1, len(facing) // _TRIED)]
+    weight = 1 / np.maximum(seen.sigma.astype(float), 1e-4) ** 2
     band = _BAND_M + _BAND_FRACTION * p[:, 2]
     # A table may be larger than the visible floor, but has points below it.
     cosine, most = float(np.cos(_ANGLE)), _MAX_BELOW * len(p)
@@ -82,7 +84,7 @@ def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -
     normal, height = n[best], float(p[best] @ n[best])
     mine = _on(p, n, band, normal, height, cosine)
     for _ in range(3):  # least squares over the inliers
-        normal, height = _fit(p[mine], seen.sigma[mine])
+        normal, height = fit_plane(p[mine], weight[mine])
         mine = _on(p, n, band, normal, height, cosine)
         if mine.sum() < max(20, _MIN_INLIERS * len(p)):
             return None
@@ -97,13 +99,3 @@ def _on(
 ) -> Bool:
     """Whether points p (N, 3) with normals n (N, 3) lie on a plane, (N,)."""
     return np.asarray((np.abs(p @ normal - height) < band) & (n @ normal > cosine))
-
-
-def _fit(p: Float64, sigma: Float32) -> tuple[Float64, float]:
-    """Weighted least squares plane, its normal away from the camera."""
-    w = 1 / np.maximum(sigma.astype(float), 1e-4) ** 2
-    mean = w @ p / w.sum()
-    q = (p - mean) * np.sqrt(w)[:, None]
-    normal = np.linalg.eigh(q.T @ q)[1][:, 0]
-    height = float(mean @ normal)
-    return (normal, height) if height > 0 else (-normal, -height)

@@ -77,7 +77,7 @@ def detect_planes(
         on = _on(p, n, within, n[tried], offsets) & left
         mine = on[int(np.argmax(on.sum(1)))]
         for _ in range(3):
-            normal, offset = _fit(p[mine], weight[mine])
+            normal, offset = fit_plane(p[mine], weight[mine])
             mine = _on(p, n, within, normal[None], np.array([offset]))[0] & left
             if mine.sum() < 3:
                 break
@@ -95,8 +95,11 @@ def _on(p: Float64, n: Float64, within: Float64, normals: Float64, offsets: Floa
     return near & (normals @ n.T > np.cos(_MAX_ANGLE))
 
 
-def _fit(p: Float64, weight: Float64) -> tuple[Float64, float]:
-    """Weighted least squares plane, its normal away from the camera."""
+def fit_plane(p: Float64, weight: Float64) -> tuple[Float64, float]:
+    """Return the weighted least squares plane of points (N, 3): normal and offset along it.
+
+    The normal (3,) points away from the camera.
+    """
     mean = weight @ p / weight.sum()
     q = (p - mean) * np.sqrt(weight)[:, None]
     normal = np.linalg.eigh(q.T @ q)[1][:, 0]

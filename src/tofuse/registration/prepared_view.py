@@ -570,12 +570,13 @@ def _edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -
         across = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
-    return _dilate(edge, options.edge_margin)
+    return dilated(edge, options.edge_margin)
 
 
-def _dilate(edge: UInt8, margin: int) -> Bool:
+def dilated(mask: UInt8, margin: int) -> Bool:
+    """Return the pixels within `margin`, in rows and columns, of one that is not 0."""
     size = 2 * margin + 1
-    return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+    return cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0
 
 
 def _add_shared_error(
@@ -729,7 +730,7 @@ def _filled(z: Float32, options: SurfaceOptions) -> tuple[int, int]:
     if options.edge_margin:
         cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
         beside = np.asarray(cv2.dilate(missing, cross), np.uint8)
-        usable = ~_dilate(beside, options.edge_margin)
+        usable = ~dilated(beside, options.edge_margin)
     size = 2 * options.radii[0] + 1
     density = cv2.blur(usable.astype(np.float32), (size, size))
     filled = (density >= options.fill) & (z > 0)
@@ -746,7 +747,7 @@ def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
         across = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
-    return _dilate(edge, margin)
+    return dilated(edge, margin)
 
 
 def _typical_noise(w: Float32, weight: Float32) -> float:

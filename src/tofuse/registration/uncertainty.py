@@ -295,12 +295,20 @@ def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
     For normal errors the ratio is two thirds. With many residuals near the limit of the loss, X is
     a difference of large numbers and may even be negative.
     """
-    values, vectors = np.linalg.eigh(found.weighed)
-    root = vectors / np.sqrt(np.maximum(values, _NO_INFORMATION * options.loosest**-2))
-    values, turned = np.linalg.eigh(root.T @ found.cross @ root)
+    least = _NO_INFORMATION * options.loosest**-2
+    return bounded_below(found.cross, found.weighed, options.steepness, least)
+
+
+def bounded_below(X: Float64, plain: Float64, fraction: float, least: float) -> Float64:
+    """Return the symmetric matrix `X` with no direction below a fraction of `plain`.
+
+    Eigenvalues of `plain` below `least` count as this.
+    """
+    values, vectors = np.linalg.eigh(plain)
+    root = vectors / np.sqrt(np.maximum(values, least))
+    values, turned = np.linalg.eigh(root.T @ X @ root)
     back = np.linalg.inv(root).T @ turned
-    X: Float64 = (back * np.maximum(values, options.steepness)) @ back.T
-    return X
+    return np.asarray((back * np.maximum(values, fraction)) @ back.T, np.float64)
 
 
 def _with_weak_prior(X: Float64, loosest: float) -> tuple[Float64, Float64]:

@@ -236,7 +236,7 @@ def _plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
     # In metres, the ticks of a camera that hardly moves would need three digits.
     unit, per_m = ("mm", 1000) if max(extent) < _SMALL_M else ("m", 1)
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
-        axis.set_major_locator(_locator(inner / 60 if axis is axes.xaxis else height / 40))
+        axis.set_major_locator(locator(inner / 60 if axis is axes.xaxis else height / 40))
         axis.set_major_formatter(partial(_tick, by=sign * per_m))
     axes.set_xlabel(f"{_NAMES[a]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
     axes.set_ylabel(f"{_NAMES[b]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
@@ -247,7 +247,8 @@ def _tick(value: float, _: int, *, by: float) -> str:
     return f"{by * value + 0.0:.6g}".replace("-", "−")
 
 
-def _locator(most: float) -> Any:
+def locator(most: float) -> Any:
+    """Return a locator of at most about `most` ticks, 2 to 6, at round numbers."""
     from matplotlib.ticker import MaxNLocator
 
     return MaxNLocator(nbins=int(np.clip(most, 2, 6)), steps=[1, 2, 5, 10])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.registration.uncertainty import bounded_below
 
 # Size of regions of space with equal errors, as a fraction of the depth.
 _REGION = 0.1
@@ -62,18 +63,9 @@ def inverse_slope(plain: Float64, cross: Float64, steepness: float) -> tuple[Flo
     steepness
         As in `registration.uncertainty`.
     """
-    X = _slope(plain, cross, steepness)
-    values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
+    plain, cross = 0.5 * (plain + plain.T), 0.5 * (cross + cross.T)
+    X = bounded_below(cross, plain, steepness, _MAX_SIGMA**-2)
+    values, vectors = np.linalg.eigh(plain)
     weak, strong = vectors[:, values < _MAX_SIGMA**-2], vectors[:, values >= _MAX_SIGMA**-2]
     inverse = strong @ np.linalg.inv(strong.T @ X @ strong) @ strong.T
     return inverse, _LOOSEST**2 * weak @ weak.T
-
-
-def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
-    """Return the Hessian, bounded below by a fraction of that without robust weights."""
-    values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
-    root = vectors / np.sqrt(np.maximum(values, _MAX_SIGMA**-2))
-    values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)
-    back = np.linalg.inv(root).T @ turned
-    X: Float64 = (back * np.maximum(values, steepness)) @ back.T
-    return X

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -79,15 +79,9 @@ def plan(
     axes.set_xlim(x0, x1)
     axes.set_ylim(y0, y1)
     for axis, size in ((axes.xaxis, inner), (axes.yaxis, height)):
-        axis.set_major_locator(_locator(size / 45))
+        axis.set_major_locator(plots.locator(size / 45))
     _label(axes, names[0], f"{title} — {names[1]}")
     return svg(figure, label)
-
-
-def _locator(most: float) -> Any:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(nbins=int(np.clip(most, 2, 6)), steps=[1, 2, 5, 10])
 
 
 def _label(axes: Axes, x: str, title: str) -> None:

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32
 from tofuse.live.device import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
@@ -84,7 +83,7 @@ class IfmO3rStream(Stream):
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
         frame = self._wait()
-        distance = self._metres(self._buffer(frame, "RADIAL_DISTANCE_IMAGE"))
+        distance = self._info.metres(self._buffer(frame, "RADIAL_DISTANCE_IMAGE"))
         flags = self._buffer(frame, "CONFIDENCE_IMAGE")
         return RangeFrame(
             index,
@@ -93,7 +92,7 @@ class IfmO3rStream(Stream):
             np.where(flags & INVALID, np.float32(0), distance),
             "range",
             self._buffer(frame, "NORM_AMPLITUDE_IMAGE").astype(np.float32),
-            sigma_image=self._metres(self._buffer(frame, "RADIAL_DISTANCE_NOISE")),
+            sigma_image=self._info.metres(self._buffer(frame, "RADIAL_DISTANCE_NOISE")),
         )
 
     def close(self) -> None:
@@ -108,8 +107,3 @@ class IfmO3rStream(Stream):
 
     def _buffer(self, frame: Any, name: str) -> NDArray[Any]:
         return np.asarray(frame.get_buffer(getattr(self._id, name)))
-
-    def _metres(self, image: NDArray[Any]) -> Float32:
-        """Convert counts to m; some versions of the package return metres already."""
-        out = image.astype(np.float32)
-        return out if image.dtype.kind == "f" else out * np.float32(self._info.distance_unit_m)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32, Float64
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import required_package
 from tofuse.parts import part
@@ -128,7 +128,7 @@ class IfmH5Source(FileSource):
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
         found = tuple(numbers[:_LENS_NUMBERS].tolist())
         info: HeadInfo = checked_info(unit, model, found, where)
-        distance = self._metres(counts, unit)
+        distance = info.metres(counts)
         if "confidence" in self.fields:
             flags = self._image(row, "confidence", where, counts.shape)
             if flags.dtype.kind not in "ui":
@@ -137,7 +137,7 @@ class IfmH5Source(FileSource):
         noise = amplitude = None
         if "distanceNoise" in self.fields:
             own = self._image(row, "distanceNoise", where, counts.shape)
-            noise = np.nan_to_num(self._metres(own, unit), posinf=0, neginf=0)
+            noise = np.nan_to_num(info.metres(own), posinf=0, neginf=0)
         if "amplitude" in self.fields:
             amplitude = self._image(row, "amplitude", where, counts.shape).astype(np.float32)
             amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
@@ -160,12 +160,6 @@ class IfmH5Source(FileSource):
         if shape is not None and image.shape != shape:
             raise InputError(f"{name} is of shape {image.shape}, distance {shape}", where=where)
         return image
-
-    @staticmethod
-    def _metres(counts: NDArray[Any], unit: float) -> Float32:
-        """Convert to metres: integers are counts of `unit` (m); floats are in metres."""
-        scale = unit if counts.dtype.kind in "ui" else 1.0
-        return counts.astype(np.float32) * np.float32(scale)
 
     def _damaged(self, error: Exception, where: str | None = None) -> InputError:
         line = " ".join(str(error).split())[:200]

@@ -90,9 +90,7 @@ class IfmO3rSource(FileSource):
                 )
         info = _info(self.data, chunks[INFO], where)
         counts = chunk_image(self.data, chunks[DISTANCE], where)
-        distance = counts.astype(np.float32)
-        if counts.dtype.kind == "u":
-            distance *= np.float32(info.distance_unit_m)
+        distance = info.metres(counts)
         if CONFIDENCE in chunks:
             flags = self._same_size(chunks[CONFIDENCE], counts.shape, where)
             if flags.dtype.kind not in "ui":
@@ -101,9 +99,7 @@ class IfmO3rSource(FileSource):
         noise = amplitude = None
         if NOISE in chunks:
             own = self._same_size(chunks[NOISE], counts.shape, where)
-            noise = own.astype(np.float32)
-            if own.dtype.kind == "u":
-                noise *= np.float32(info.distance_unit_m)
+            noise = np.nan_to_num(info.metres(own), posinf=0, neginf=0)
         if AMPLITUDE in chunks:
             amplitude = self._same_size(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
             amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
@@ -114,7 +110,7 @@ class IfmO3rSource(FileSource):
             distance,
             "range",
             amplitude,
-            sigma_image=None if noise is None else np.nan_to_num(noise, posinf=0, neginf=0),
+            sigma_image=noise,
         )
 
     def _same_size(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:

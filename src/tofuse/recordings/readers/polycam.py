@@ -14,7 +14,7 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import image_size, read_json
+from tofuse.recordings.camera_file import image_size, number_in, read_json
 from tofuse.recordings.phones import (
     CONFIDENCE_MAX,
     POSES_BY,
@@ -116,12 +116,4 @@ def _pose(facts: dict[str, Any], path: Path) -> Float64:
 
 
 def _numbers(facts: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
-    for name in names:
-        value = facts.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            problem = "is missing" if value is None else f"is {value!r:.60}"
-            raise InputError(problem, where=f"{path}: {name}", remedy="export 'raw data' again")
-    try:
-        return np.array([facts[name] for name in names], float)
-    except OverflowError as error:
-        raise InputError("contains a number that is too large", where=path) from error
+    return np.array([number_in(facts, n, path, remedy="export 'raw data' again") for n in names])
