@@ -279,8 +279,13 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "evaluate no reference": (("evaluate", "REC", "REC"), ("trajectory.txt",), "tofuse: "),
     "optimize nothing": (("optimize", "none.g2o", "--out", "OUT"), ("none.g2o",), "tofuse: "),
     "optimize onto something": (
+        ("optimize", "none.g2o", "--out", "REC/camera.json"),
+        ("REC/camera.json", "--overwrite"),
+        "tofuse: ",
+    ),
+    "optimize onto a folder": (
         ("optimize", "none.g2o", "--out", "REC"),
-        ("REC", "--overwrite"),
+        ("--out", "is a folder"),
         "tofuse: ",
     ),
 }
