@@ -176,7 +176,7 @@ def test_a_mask_is_an_image(tmp_path) -> None:
     assert (Mask(str(tmp_path / "color.png")).mask(frame, ()) == (image > 0)).all()
     cv2.imwrite(str(tmp_path / "small.png"), image[:10])
     (tmp_path / "text.png").write_text("no image")
-    for name, why in (("small", "176 x 10"), ("text", "no image"), ("none", "can't be read")):
+    for name, why in (("small", "176 x 10"), ("text", "not an image"), ("none", "can't be read")):
         with pytest.raises(InputError, match=why):
             Mask(str(tmp_path / f"{name}.png")).mask(frame, ())
     with pytest.raises(ValueError, match="empty"):

@@ -33,8 +33,6 @@ _MIN_SCALE, _MAX_SCALE = 0.7, 30.0
 _MIN_COMPARED = 50
 # Points further from a surface than this fraction of the depth are on another one.
 _OTHER_SURFACE = 0.1
-# Factor on the standard deviation of the prior during the iterations.
-_WEAKER = 10.0
 # Windows of plane fits overlap: number of pixels per independent value of noise (half the smallest
 # window; covariances of simulated boards are then consistent, see tests).
 _SHARED_NOISE = 12.0
@@ -53,8 +51,7 @@ class JointOptions:
     overlap
         Minimum fraction of a view's points that project onto surfaces of another one.
     offset_sigma_m
-        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre; up
-        to 3 cm were seen between real cameras.
+        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre.
     reach
         Correlation length of errors (to 1/e), as a fraction of the depth.
     steepness
@@ -70,10 +67,10 @@ class JointOptions:
     robust: float = 3.5
     max_angle: float = 0.7
     overlap: float = 0.04
-    offset_sigma_m: float = 0.05
+    offset_sigma_m: float = 0.01
     reach: float = 0.31
     steepness: float = 0.3
-    systematic: float = 0.004
+    systematic: float = 0.003
     convergence: float = 0.002
 
 
@@ -281,7 +278,7 @@ class _System:
             at = self.unknowns(k)
             H[np.ix_(at, at)] += (J * w[:, None]).T @ J
             g[at] += J.T @ (w * row[:, kernels.RESIDUAL])
-        prior = np.tile(self._weak_prior(), len(self.poses))
+        prior = np.tile(self._prior(), len(self.poses))
         H[np.diag_indices(size)] += prior
         g[6::_SIZE] += prior[6::_SIZE] * self.offsets / 0.01
         free = np.arange(_SIZE, size)
@@ -306,11 +303,9 @@ class _System:
         f = np.maximum(1 - e2, 0)
         return f * f / variance, f * (1 - 5 * e2) / variance
 
-    def _weak_prior(self) -> Float64:
-        """Return the (7,) information of a camera's prior during the iterations, in units."""
-        prior = np.zeros(_SIZE)
-        prior[6] = (0.01 / (_WEAKER * self.options.offset_sigma_m)) ** 2
-        return prior
+    def _prior(self) -> Float64:
+        """Return the (7,) information of a camera's prior, in units."""
+        return np.array([0.0] * 6 + [(0.01 / self.options.offset_sigma_m) ** 2])
 
     def placed(self) -> Placed:
         """Return the poses and offsets of the cameras, with covariances."""
@@ -346,18 +341,17 @@ class _System:
         random = systematic = np.full((size - _SIZE, size - _SIZE), np.nan)
         if places:
             free = slice(_SIZE, None)
-            B = noise[free, free] + np.diag(np.tile(self._weak_prior(), count - 1))
+            B = noise[free, free] + np.diag(np.tile(self._prior(), count - 1))
             B += correlated(
                 np.concatenate(places), np.concatenate(gradients)[:, free], self.options.reach
             )
             for matrix in (plain, cross):
-                matrix[np.diag_indices(size)] += np.tile(self._weak_prior(), count)
+                matrix[np.diag_indices(size)] += np.tile(self._prior(), count)
             bread, unconstrained = inverse_slope(
                 plain[free, free], cross[free, free], self.options.steepness
             )
             random = bread @ B @ bread + unconstrained
             systematic = bread @ self._systematic(responses[:, :, free]) @ bread
-            random, systematic = self._use_prior(random, systematic)
         rms = float(np.sqrt(squares / weight)) if weight else float("nan")
         return Placed(
             self.poses,
@@ -365,26 +359,8 @@ class _System:
             self._marginals(random + systematic),
             self._marginals(random),
             rms,
-            self.disagreement(self.compare()),
+            self.disagreement(rows),
         )
-
-    def _use_prior(self, random: Float64, systematic: Float64) -> tuple[Float64, Float64]:
-        """Update the estimate by the prior of the depth offsets; returns both covariances.
-
-        During the iterations all residuals count as independent, so the prior has no weight beside
-        them; the covariance of the estimate includes their correlation.
-        """
-        C = random + systematic
-        count = len(C) // _SIZE
-        offset = _SIZE * np.arange(count) + 6
-        sigma = self.options.offset_sigma_m / 0.01
-        gain = np.linalg.solve(C[np.ix_(offset, offset)] + sigma**2 * np.eye(count), C[offset]).T
-        self._move(-gain @ (self.offsets[1:] / 0.01))
-        kept = np.eye(len(C))
-        kept[:, offset] -= gain
-        # Offsets are the same in each calibration: the uncertainty of the prior is systematic.
-        random = kept @ random @ kept.T
-        return random, kept @ C - random
 
     def _marginals(self, C: Float64) -> Float64:
         """Return the (K, 7, 7) blocks of the cameras, m and rad; the first camera is fixed."""
