@@ -218,7 +218,7 @@ def test_cameras_and_the_time_line_choose_frames(browser, report):
         page.mouse.click(line["x"] + line["width"] * 5.5 / 24, line["y"] + 10)
         assert page.locator("#viewer .timeline span").inner_text() == "Frame 5: predicted"
         assert page.locator("#viewer .inset").is_visible()
-        assert page.locator("#frame-said").inner_text().startswith("Frame 4")  # the nearest kept
+        assert page.locator("#frame-description").inner_text().startswith("Frame 4")
         outside = rested(seen)
         page.get_by_role("button", name="Look through this camera").click()
         page.locator("#viewer [data-close]").click()
@@ -265,14 +265,14 @@ def test_slider_shows_frames_and_why_one_is_lost(browser, report):
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowRight")
         seen.rest()
-        assert page.locator("#frame-said").inner_text().startswith("Frame 4: tracked")
+        assert page.locator("#frame-description").inner_text().startswith("Frame 4: tracked")
         assert changed(first, seen.pixels(shot)) > 0.1
         assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is chosen
         page.get_by_role("button", name="Next with a problem").click()
-        said = page.locator("#frame-said").inner_text()
+        said = page.locator("#frame-description").inner_text()
         assert said.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
         page.locator("#strip rect[data-frame='0']").click(force=True)
-        assert page.locator("#frame-said").inner_text().startswith("Frame 0:")
+        assert page.locator("#frame-description").inner_text().startswith("Frame 0:")
         seen.check()
 
 

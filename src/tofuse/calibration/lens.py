@@ -380,8 +380,8 @@ def _opencv(
     camera = classes[model](
         size[0], size[1], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), **values
     )
-    told = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
-    sigma = {name: told[name] for name in (*_INTRINSIC, *names)}
+    deviation = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
+    sigma = {name: deviation[name] for name in (*_INTRINSIC, *names)}
     poses = [pose_of(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
     return _evaluate(camera, sigma, poses, views, board)
 

@@ -42,7 +42,7 @@ def render(result: Reconstruction, extras: ReportExtras) -> str:
         style=asset("style.css"),
         script=script(),
         first_images={} if player is None else {k: v[0] for k, v in player["images"].items()},
-        first_told="" if player is None else player["told"][0],
+        first_description="" if player is None else player["descriptions"][0],
         last_picture=0 if player is None else len(player["index"]) - 1,
         player_json=None if player is None else htmlsafe_json_dumps(player),
         scene_json=None if scene is None else htmlsafe_json_dumps(scene),

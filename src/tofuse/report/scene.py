@@ -21,7 +21,7 @@ MAX_POINTS = 150_000
 MAX_FACES = 300_000
 MAX_CAMERAS = 72
 _FAR = 1.8  # times the size of the model: then it is framed without the cameras
-_SAMPLED, _CLEARLY = 5000, 1.05  # normals that tell what is seen, and how much more is clear
+_SAMPLED, _CLEARLY = 5000, 1.05  # sampled normals, and the ratio that decides
 _DIRECTIONS = 100  # in which the outermost points are framed
 # Of the cameras of a rig, in their order; the first is that of any camera.
 CAMERA_COLORS = (

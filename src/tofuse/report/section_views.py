@@ -108,7 +108,7 @@ def player(s: Subject) -> Values:
     return {
         "player": {
             "index": [p.index for p in shown],
-            "told": [
+            "descriptions": [
                 frame_text(records[p.index], s.result.components) if p.index in records else ""
                 for p in shown
             ],

@@ -26,7 +26,7 @@ _TIME_UNIT = 1e-3
 _GAP, _MIN_COMMON = 3.5, 12
 # Durations of motions A and B, as fractions of the common time.
 _SPANS = (0.02, 0.05, 0.1, 0.2, 0.35)
-_ITERATIONS, _SETTLED = 30, 1e-4
+_ITERATIONS, _CONVERGED = 30, 1e-4
 # Cut-off of Tukey's biweight in sigmas; minimum sigma of a pose.
 _ROBUST, _MIN_SIGMA = 4.7, 0.02
 # Upper 95 % bound, in standard errors.
@@ -74,7 +74,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """How a second camera b is fixed to a first one, a.
+    """Extrinsic calibration of a second camera b relative to a first one, a.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class HandEye:
     time_offset_s, time_sigma_s
         To be added to b's timestamps.
     poses
-        How many common poses there were.
+        Number of common poses.
     sigma
         (6,) robust standard deviation of the residuals, m and rad.
     """
@@ -100,7 +100,7 @@ class HandEye:
 
 
 def clock_of(a: Track, b: Track) -> Lag | None:
-    """What to add to b's timestamps, by when the rig turns; see `lag_between`."""
+    """Offset to be added to b's timestamps, by the angular speeds; see `lag_between`."""
     return lag_between(*a.turning(), *b.turning())
 
 
@@ -110,7 +110,7 @@ def hand_eye(a: Track, b: Track, time_offset_s: float, *, one_world: bool = Fals
     Parameters
     ----------
     time_offset_s
-        To start from.
+        Initial value.
     one_world
         Whether both trajectories are in one world frame already.
 
@@ -174,7 +174,7 @@ def _start(a: Track, b: Track, offset: float, *, one_world: bool) -> tuple[Float
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     M = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     d = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
-    # Along a direction that no motion tells, cameras are taken to be near each other.
+    # The prior along directions that the motion does not constrain: cameras near each other.
     t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = R, t
@@ -204,7 +204,7 @@ class _Fit:
         return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b), np.float64)
 
     def solve(self, X: Float64, Y: Float64, offset: float) -> HandEye:
-        """Iterate until nothing moves."""
+        """Iterate to convergence."""
         for _ in range(_ITERATIONS):
             J, e, _ = self.linear(X, Y, offset)
             sigma = _sigma(e)
@@ -217,7 +217,7 @@ class _Fit:
             if not self.one_world:
                 Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * _UNITS))
             offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half, self.half))
-            if np.abs(step).max() < _SETTLED:
+            if np.abs(step).max() < _CONVERGED:
                 break
         J, e, times = self.linear(X, Y, offset)
         sigma = _sigma(e)
@@ -238,7 +238,7 @@ class _Fit:
         columns = [by_x * _UNITS]
         if not self.one_world:
             columns.append(right @ se3.adjoint(se3.inverse(T_b)) * _UNITS)
-        # b's motion by time: the later its clock is put, the earlier the pose.
+        # The motion of b over time: a larger offset takes an earlier pose.
         ahead, known_ahead = self.b.at(times - offset + self.half)
         behind, known_behind = self.b.at(times - offset - self.half)
         speed = se3.log(se3.inverse(behind) @ ahead) / (2 * self.half)

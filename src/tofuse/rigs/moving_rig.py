@@ -100,7 +100,7 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
         fits[k] = hand_eye(moved[0], moved[k], offset)
         if together.kept:
             fits[k] = combined(fits[k], hand_eye(moved[0], moved[k], offset, one_world=True))
-        why = _too_loose(fits[k], together.depth)
+        why = _too_uncertain(fits[k], together.depth)
         if why:
             reasons[k] = why
             del fits[k]
@@ -116,12 +116,12 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
 
 
 def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: list[str]) -> float:
-    """What to add to the timestamps of camera k, to start from.
+    """Return the initial offset to add to the timestamps of camera k.
 
     Raises
     ------
     RegistrationError
-        If neither its turning nor its timestamps tell.
+        If neither rotations nor timestamps determine it.
     """
     lag = clock_of(tracks[0], tracks[k]) if len(tracks[k].times) > 1 else None
     if lag is not None and lag.certain:
@@ -152,8 +152,8 @@ def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: li
     return 0.0
 
 
-def _too_loose(fit: HandEye, depth: float) -> str:
-    """Why a place is not known well enough; empty if it is."""
+def _too_uncertain(fit: HandEye, depth: float) -> str:
+    """Return why a pose is too uncertain; empty if it is not."""
     position, rotation = (
         float(np.sqrt(max(np.linalg.eigvalsh(fit.covariance[part, part])[-1], 0)))
         for part in (slice(3), slice(3, 6))
@@ -168,7 +168,7 @@ def _too_loose(fit: HandEye, depth: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """Views of one camera: which poses of its track they are of."""
+    """Views of one camera, and the positions of their poses in its track."""
 
     at: Intp
     views: tuple[KeptView, ...]
@@ -192,7 +192,7 @@ class _Together:
     def of(
         cls, cameras: Sequence[Camera], tracks: Sequence[Track], fits: dict[int, HandEye]
     ) -> _Together:
-        """Prepare views of the cameras that fit."""
+        """Prepare views of the calibrated cameras."""
         world = {0: tracks[0]}
         for k, fit in fits.items():
             world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
@@ -209,7 +209,7 @@ class _Together:
         return cls(world, kept, fits)
 
     def refined(self) -> dict[int, Track]:
-        """Tracks in one world after all views were refined together, unless that did not help."""
+        """Return the tracks in one world, after a joint refinement if that improved them."""
         order = sorted(self._kept)
         views = [v for k in order for v in self._kept[k].views]
         poses = np.concatenate([self.tracks[k].poses[self._kept[k].at] for k in order])

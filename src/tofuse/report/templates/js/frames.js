@@ -11,11 +11,11 @@ function startFrames(bus) {
   };
 
   if (player && pictures) {
-    const slider = document.getElementById("frame"), words = document.getElementById("frame-said");
+    const slider = document.getElementById("frame"), words = document.getElementById("frame-description");
     const last = pictures.index.length - 1, here = () => Number(slider.value);
     const show = (row) => {
       slider.value = String(row);
-      words.textContent = pictures.told[row];
+      words.textContent = pictures.descriptions[row];
       words.className = pictures.status[row];
       for (const image of player.querySelectorAll("img")) image.src = pictures.images[image.dataset.kind][row];
     };
@@ -87,7 +87,7 @@ function startFrames(bus) {
         image.src = (kinds.color || kinds.range)[row];
       }
       inset.querySelector("figcaption").textContent = same
-        ? pictures.told[row]
+        ? pictures.descriptions[row]
         : `Frame ${index}${row >= 0 ? ` (image: frame ${pictures.index[row]})` : ""}`;
     });
     inset.addEventListener("click", (e) => {
