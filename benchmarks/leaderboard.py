@@ -69,6 +69,8 @@ def run_missing(
         for method in BOARDS[board].methods()
         if (not methods or method in methods) and not kept(board, method, case).exists()
     ]
+    for board in names if todo else ():
+        BOARDS[board].prepare(data)
     futures = {executor.submit(done, *task, data): task for task in todo}
     for count, future in enumerate(as_completed(futures), 1):
         board, method, case = futures[future]

@@ -36,6 +36,9 @@ class Board(Protocol):
         """Names of all cases, ``group/scene/...``."""
         ...
 
+    def prepare(self, data: Path) -> None:
+        """Simulate recordings that are missing, before several processes read them."""
+
     def run(self, method: str, case: str, data: Path) -> Score | None:
         """Return scores; None if the method does not support the case, or data is missing."""
         ...

@@ -81,6 +81,11 @@ class TwoViews(Board):
             for seed in range(seeds)
         ]
 
+    def prepare(self, data: Path) -> None:
+        """See `Board.prepare`."""
+        for scene in SCENES:
+            _recording(scene, data)
+
     def run(self, method: str, case: str, data: Path) -> Score | None:
         """See `Board`."""
         group, scene, seed = case.split("/")

@@ -13,13 +13,15 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig_source import RigSource
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
+from tofuse.rigs.hand_eye import HandEye, Track
 from tofuse.rigs.inputs import Camera
+from tofuse.rigs.moving_rig import _Together
 from tofuse.rigs.rig_trajectory import refined
 from tofuse.rigs.run import reconstruct_rig
 
 CLOCK = 0.012
 COUNT = 50
-# Boards on all sides, so that each camera has something that holds it.
+# Boards on all sides, which constrain each camera.
 BOARDS = (
     *ROOM,
     ((-1.0, 0.0, 0.0), 1.8, 9.0),
@@ -137,3 +139,21 @@ def test_views_of_all_cameras_refine_the_path_of_the_rig() -> None:
     assert found.disagreement[ends][0] < 0.004
     assert found.disagreement[ends][1] > 1000
     assert len(found.measured) > 100
+
+
+def test_halves_of_the_images_show_systematic_errors() -> None:
+    times = np.arange(40) / 20.0
+    world = np.stack([path(t) for t in times])
+    fit = HandEye(mounted(), np.eye(6), np.eye(4), 0.0, 0.0, len(times), np.ones(6))
+    error = np.array([0.004, -0.001, 0.002, 0.001, 0.0, -0.002])
+
+    def tracks(by: np.ndarray) -> dict[int, Track]:
+        return {0: Track(times, world), 1: Track(times, world @ mounted() @ se3.exp(by))}
+
+    together = _Together({}, {}, {})
+    together._halves = [(tracks(error), tracks(-error))]
+    found = together.systematic(1, fit)
+    np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)
+    # One half alone that moves does not constrain the camera.
+    together._halves = [(tracks(error), tracks(0 * error))]
+    np.testing.assert_allclose(together.systematic(1, fit), 0, atol=1e-7)

@@ -14,7 +14,7 @@ other half do not, and the product is small.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,14 +45,37 @@ def split_half_errors(
     views, options, priors, calibrate
         As for `refine`, which returned `refined`.
     """
+    variances = np.zeros(2)
+    for poses in refined_by_halves(views, refined, options, priors, calibrate):
+        one, other = (aligned_motion(refined.poses, alone) for alone in poses)
+        product = [-(a * b).sum(1).mean() for a, b in zip(one, other, strict=True)]
+        variances += np.maximum(product, 0.0)
+    position, rotation = np.sqrt(variances).tolist()
+    return position, rotation
+
+
+def refined_by_halves(
+    views: Sequence[KeptView],
+    refined: Refined,
+    options: RefineOptions,
+    priors: Priors,
+    calibrate: Sequence[int] = (),
+) -> Iterator[tuple[Float64, Float64]]:
+    """Yield the poses (N, 4, 4) by the left and the right half of all images, and upper and lower.
+
+    Parameters
+    ----------
+    views, options, priors, calibrate
+        As for `refine`, which returned `refined`.
+    """
     quick = replace(options, rounds=_ROUNDS)
 
-    def displaced(first: bool, halves: Sequence[Bool]) -> tuple[Float64, Float64]:
+    def by_half(first: bool, halves: Sequence[Bool]) -> Float64:
         part = [
             KeptView(v.surface, np.ascontiguousarray(v.points[half == first][::_EVERY]))
             for v, half in zip(views, halves, strict=True)
         ]
-        alone = align_views(
+        return align_views(
             part,
             refined.poses,
             quick,
@@ -60,18 +83,12 @@ def split_half_errors(
             errors=refined.errors,
             priors=priors,
             pairs=refined.pairs,
-        )
-        return aligned_motion(refined.poses, alone.poses)
+        ).poses
 
-    variances = np.zeros(2)
     left = [v.patches % ACROSS < ACROSS // 2 for v in views]
     upper = [v.patches // ACROSS < DOWN // 2 for v in views]
     for halves in (left, upper):
-        one, other = displaced(True, halves), displaced(False, halves)
-        product = [-(a * b).sum(1).mean() for a, b in zip(one, other, strict=True)]
-        variances += np.maximum(product, 0.0)
-    position, rotation = np.sqrt(variances).tolist()
-    return position, rotation
+        yield by_half(True, halves), by_half(False, halves)
 
 
 def aligned_motion(before: Float64, after: Float64) -> tuple[Float64, Float64]:

@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.arrays import Intp
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.joint_alignment import RefineOptions, refine
+from tofuse.posegraph.joint_alignment import Priors, RefineOptions, refine
 from tofuse.posegraph.refinement import followed
+from tofuse.posegraph.split_half import refined_by_halves
 from tofuse.posegraph.view_store import KeptView
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
@@ -99,7 +100,9 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
         offset = fits[k].time_offset_s
         fits[k] = hand_eye(moved[0], moved[k], offset)
         if together.kept:
-            fits[k] = combined(fits[k], hand_eye(moved[0], moved[k], offset, one_world=True))
+            common = hand_eye(moved[0], moved[k], offset, one_world=True)
+            more = together.systematic(k, common)
+            fits[k] = combined(fits[k], replace(common, covariance=common.covariance + more))
         why = _too_uncertain(fits[k], together.depth)
         if why:
             reasons[k] = why
@@ -185,6 +188,7 @@ class _Together:
         self._fits = fits
         views = [v for k in sorted(kept) for v in kept[k].views]
         self.depth = float(np.median([v.surface.depth for v in views])) if views else 1.0
+        self._halves: list[tuple[dict[int, Track], ...]] = []
         self._pairs = np.zeros((0, 2), np.intp)
         self._poses = np.zeros((0, 4, 4))
 
@@ -227,13 +231,39 @@ class _Together:
             self._poses = poses
             return dict(self.tracks)
         self.kept = True
+        self._halves = [
+            tuple(self._moved(first @ poses) for poses in pair)
+            for pair in refined_by_halves(views, done, _OPTIONS, Priors.none())
+        ]
+        return self._moved(self._poses)
+
+    def _moved(self, poses: Float64) -> dict[int, Track]:
+        """Return the tracks that follow the refined poses of all views."""
         start, moved = 0, {}
-        for k in order:
+        for k in sorted(self._kept):
             own = self._kept[k]
-            new = self._poses[start : start + len(own.views)]
+            new = poses[start : start + len(own.views)]
             start += len(own.views)
             moved[k] = replace(self.tracks[k], poses=followed(self.tracks[k].poses, own.at, new))
         return moved
+
+    def systematic(self, k: int, fit: HandEye) -> Float64:
+        """Return the covariance (6, 6) of camera k shown by halves of the images (`split_half`).
+
+        Distortions that all views share bend the common world, and leave no residuals.
+        """
+        C = np.zeros((6, 6))
+        for halves in self._halves:
+            one, other = (
+                se3.log(
+                    se3.inverse(fit.T_a_b)
+                    @ hand_eye(tracks[0], tracks[k], fit.time_offset_s, one_world=True).T_a_b
+                )
+                for tracks in halves
+            )
+            C -= 0.5 * (np.outer(one, other) + np.outer(other, one))
+        values, vectors = np.linalg.eigh(C)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, np.float64)
 
     def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
         """See `MovingRig`."""
