@@ -43,11 +43,11 @@ def sessions(s: Subject) -> Values:
     else:
         text += "All of them are in this map, in the world frame of the first."
     names = [session.name for session in records]
-    rows = [_pair(pair, names) for pair in pairs]
+    overlaps = [_pair(pair, names) for pair in pairs]
     changes = [_change(change, names) for change in s.result.changes[:ROWS]]
     return {
         "sessions": rows[:ROWS],
-        "session_pairs": rows[:ROWS],
+        "session_pairs": overlaps[:ROWS],
         "sessions_text": text,
         "changes": changes,
         "met": any(pair.joined and pair.overlap > 0 for pair in pairs),
