@@ -222,6 +222,18 @@ def test_candidates_left_and_came_back(once_round):
     assert refused == [(0, 18)]
 
 
+def test_candidates_of_many_views_are_found_by_an_index() -> None:
+    """A walk past 300 places and back: too many views to compare all pairs."""
+    rng = np.random.default_rng(4)
+    places = rng.uniform(0.3, 1.0, (300, 2, 9, 12))
+    views = np.concatenate([places, places[::-1]]) + rng.normal(0, 0.005, (600, 2, 9, 12))
+    descriptors = list(views.astype(np.float32))
+    pairs, refused = Appearance(pairs=40).candidates(descriptors, lambda i, j: True)
+    assert len(pairs) == 40
+    assert all(i + j == 599 for i, j in pairs)
+    assert refused == []
+
+
 def test_drift_grows_with_the_path():
     options = Appearance(drift=0.1)
     path = 4.0, 0.0  # m straight on

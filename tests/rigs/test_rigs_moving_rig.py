@@ -3,9 +3,11 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
+from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.pipeline.config import from_method
@@ -13,9 +15,9 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig_source import RigSource
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
-from tofuse.rigs.hand_eye import HandEye, Track
+from tofuse.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.moving_rig import _Together
+from tofuse.rigs.moving_rig import _clock, _Together, _too_uncertain
 from tofuse.rigs.rig_trajectory import refined
 from tofuse.rigs.run import reconstruct_rig
 
@@ -157,3 +159,87 @@ def test_halves_of_the_images_show_systematic_errors() -> None:
     # One half alone that moves does not constrain the camera.
     together._halves = [(tracks(error), tracks(0 * error))]
     np.testing.assert_allclose(together.systematic(1, fit), 0, atol=1e-7)
+
+
+def walked(clock: float = 0.0, T: np.ndarray | None = None, seconds: float = 6.0) -> Track:
+    """The trajectory of a camera on the rig by its own clock, without errors."""
+    times = np.arange(round(30 * seconds)) / 30.0
+    poses = np.stack([path(t) @ (np.eye(4) if T is None else T) for t in times])
+    return Track(times - clock, se3.inverse(poses[0]) @ poses)
+
+
+def clock_between(first: Track, second: Track) -> tuple[float, list[str]]:
+    notes: list[str] = []
+    return _clock(cameras(), [first, second], 1, notes), notes
+
+
+def test_clocks_that_differ_by_an_hour_are_aligned_by_the_rotations() -> None:
+    offset, notes = clock_between(walked(), walked(3600.0, mounted()))
+    assert abs(offset - 3600.0) < 0.01
+    assert "cam1 differs by 3600" in notes[0]
+
+
+def test_cameras_that_rotated_differently_are_refused() -> None:
+    first = walked()
+    rng = np.random.default_rng(2)
+    turns = np.cumsum(rng.normal(size=(len(first.times), 3)) * 0.05, axis=0)
+    other = np.tile(np.eye(4), (len(first.times), 1, 1))
+    other[:, :3, :3] = se3.so3_exp(turns)
+    with pytest.raises(RegistrationError, match="rotation differs from that of cam0"):
+        clock_between(first, Track(first.times, other))
+    with pytest.raises(RegistrationError, match="after those of cam0"):
+        clock_between(first, Track(first.times + 3600.0, other))
+
+
+def test_without_rotation_the_clocks_are_assumed_to_agree() -> None:
+    first = walked()
+    still = np.tile(np.eye(4), (len(first.times), 1, 1))
+    still[:, 0, 3] = 0.1 * first.times
+    track = Track(first.times, still)
+    offset, (note,) = clock_between(track, track)
+    assert offset == 0.0
+    assert "does not determine its clock" in note
+
+
+def test_a_single_pose_is_no_trajectory() -> None:
+    with pytest.raises(RegistrationError, match="has no trajectory"):
+        clock_between(walked(), Track(np.zeros(1), np.eye(4)[None]))
+
+
+def on_a_cart(distance: float, noise: float = 1e-3) -> HandEye:
+    """Two cameras on a cart that drives `distance` m on a flat floor and turns."""
+    times = np.arange(180) / 30.0
+    world = np.tile(np.eye(4), (len(times), 1, 1))
+    world[:, :3, :3] = se3.so3_exp(np.outer(0.8 * np.sin(1.3 * times), [0.0, 1.0, 0.0]))
+    world[:, 0, 3] = distance * np.sin(0.7 * times)
+    world[:, 2, 3] = distance * np.cos(0.9 * times)
+    rng = np.random.default_rng(3)
+
+    def track(T: np.ndarray) -> Track:
+        poses = world @ T @ se3.exp(noise * rng.normal(size=(len(times), 6)))
+        return Track(times, se3.inverse(poses[0]) @ poses)
+
+    return hand_eye(track(np.eye(4)), track(mounted()), 0.0)
+
+
+def test_rotation_about_one_axis_leaves_the_spacing_along_it_unconstrained() -> None:
+    fit = on_a_cart(1.0)
+    assert "rotate the rig about two axes" in _too_uncertain(fit, 2.0)
+    off = fit.T_a_b[:3, 3] - mounted()[:3, 3]
+    R = fit.T_a_b[:3, :3]
+    sigma = np.sqrt(np.diag(R @ fit.covariance[:3, :3] @ R.T))
+    assert sigma[1] > 0.5  # along the axis, whatever noise seems to say
+    assert sigma[[0, 2]].max() < 0.01
+    assert (np.abs(off) < 3 * sigma + 1e-4).all()
+
+
+def test_rotation_in_place_leaves_the_heading_unconstrained_too() -> None:
+    fit = on_a_cart(0.0)
+    e = se3.log(se3.inverse(fit.T_a_b) @ mounted())
+    assert "rotate the rig about two axes" in _too_uncertain(fit, 2.0)
+    assert e @ np.linalg.solve(fit.covariance, e) < 16.8  # 99 % of chi-square, 6 degrees
+
+
+def test_motion_in_all_directions_constrains_the_camera() -> None:
+    fit = hand_eye(walked(), walked(0.0, mounted()), 0.0)
+    assert _too_uncertain(fit, 2.0) == ""

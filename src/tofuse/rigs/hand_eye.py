@@ -275,11 +275,32 @@ def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float
     weighed = J * (w * sigma)[..., None]
     spread = np.tensordot(alike, weighed, 1)
     B = more * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
+    if H.shape[0] > 7:  # between two worlds
+        H[:6, :6] -= _spurious(w, sigma)
     values, vectors = np.linalg.eigh(H)
     bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
     weak = vectors[:, values < _LOOSEST**-2]
     C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
     return np.asarray(0.5 * (C + C.T), np.float64)
+
+
+def _spurious(w: Float64, sigma: Float64) -> Float64:
+    """Return the information (6, 6) on X that noise of the poses alone would provide.
+
+    Noise (tau, omega) of T_b changes the derivative of a residual by (rho, phi) of X relative to
+    that by Y, by omega x rho + tau x phi in position and omega x phi in rotation. So a rig that
+    rotates about one axis, for instance, seems to rotate about the others as well.
+
+    Parameters
+    ----------
+    w
+        (N, 6) weights of the residuals.
+    sigma
+        (6,) standard deviation of the residuals, in units.
+    """
+    position, rotation = w[:, :3].sum() / 3, w[:, 3:].sum() / 3
+    tau, omega = 2 * (np.radians(sigma[[0, 3]]) ** 2)
+    return np.diag([omega * position] * 3 + [tau * position + omega * rotation] * 3)
 
 
 def _product(J: Float64, w: Float64, K: Float64) -> Float64:
