@@ -7,19 +7,24 @@ coverage of the 95 % ellipsoids, of all errors and of random errors alone. `movi
 cameras back to back that are carried through a furnished room, and prints the calibration from the
 trajectories alone, and from all views. Clocks run at 30.03 and 30.14 Hz. `coverage` prints the
 coverage of the 95 % ellipsoids of hand-eye calibrations, from trajectories with errors correlated
-over half a second. `check` displaces one camera of a rig by 5 mm or 0.3 degrees, or none.
+over half a second. `check` displaces one camera of a rig by 5 mm or 0.3 degrees, or none. `real`
+calibrates five Azure Kinects from one image each, and compares them with poses by COLMAP, whose
+scale is aligned.
 
     python benchmarks/rigs.py still [--instants 1 60] [--seeds 1] [--all-effects]
     python benchmarks/rigs.py systematic [--seeds 3]
     python benchmarks/rigs.py moving [--frames 150] [--seeds 1]
     python benchmarks/rigs.py coverage [--seeds 100]
     python benchmarks/rigs.py check [--seeds 100]
+    python benchmarks/rigs.py real
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
@@ -33,13 +38,14 @@ from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wan
 from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
-from tofuse.rigs.calibrate import calibrate_cameras
+from tofuse.rigs.calibrate import calibrate, calibrate_cameras, loosest
 from tofuse.rigs.check import compare
 from tofuse.rigs.hand_eye import Track, hand_eye
-from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import View, refine_together
+from tofuse.rigs.inputs import Camera, open_cameras
+from tofuse.rigs.joint import View, disagreements, refine_together
 from tofuse.sensor.models import CameraModel, camera_model
 
+REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "azure_kinect_rig"
 STILL = Effects(multipath=False, scatter=0.0, smear=False)
 MOVING = Effects(multipath=False, smear=False)
 RATES = (30.03, 30.14, 30.0, 30.08)
@@ -263,9 +269,40 @@ def check(seeds: int) -> None:
         print(f"displaced by {name:<8} detected rightly in {right} of {seeds}")
 
 
+def real() -> None:
+    """Compare the calibration of real cameras with reference poses, good to about 1 degree."""
+    if not REAL.is_dir():
+        print(f"{REAL} not found")
+        return
+    folders = sorted(path for path in REAL.iterdir() if path.is_dir())
+    poses = json.loads((REAL / "reference_T_world_camera.json").read_text())
+    rig = calibrate(folders).rig
+    reference = np.stack([np.array(poses[camera.name], float) for camera in rig.cameras])
+    reference = se3.inverse(reference[0]) @ reference
+    views = [
+        View(k, 0, KeptView.of(camera.surface(camera.images(1)[0]), 6000))
+        for k, camera in enumerate(open_cameras([REAL / c.name for c in rig.cameras]))
+    ]
+    apart = np.median([pair.median_m for pair in rig.disagreement])
+    stated = np.median([distance for distance, _ in disagreements(views, reference).values()])
+    print(f"median distance of surfaces: {1e3 * apart:.1f} mm, at the reference {1e3 * stated:.1f}")
+    print(f"{'camera':<16}{'mm':>7}{'deg':>7}{'±mm':>7}{'±deg':>7}{'chi2':>7}{'random only':>13}")
+    for camera, T in zip(rig.cameras[1:], reference[1:], strict=True):
+        e = se3.log(se3.inverse(camera.T_rig_camera) @ T)
+        C, R = camera.covariance, camera.random_covariance
+        metres, radians = loosest(camera)
+        print(
+            f"{camera.name:<16}{1e3 * np.linalg.norm(e[:3]):7.1f}"
+            f"{np.degrees(np.linalg.norm(e[3:])):7.2f}{1e3 * metres:7.1f}{np.degrees(radians):7.2f}"
+            f"{e @ np.linalg.solve(C, e):7.1f}{e @ np.linalg.solve(R, e):13.0f}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("still", "systematic", "moving", "coverage", "check"))
+    parser.add_argument(
+        "what", choices=("still", "systematic", "moving", "coverage", "check", "real")
+    )
     parser.add_argument("--instants", type=int, nargs="+", default=[1, 60])
     parser.add_argument("--frames", type=int, default=150)
     parser.add_argument("--seeds", type=int)
@@ -277,6 +314,8 @@ def main() -> None:
         systematic(arguments.seeds or 3)
     elif arguments.what == "moving":
         moving(arguments.frames, arguments.seeds or 1)
+    elif arguments.what == "real":
+        real()
     else:
         {"coverage": coverage, "check": check}[arguments.what](arguments.seeds or 100)
 

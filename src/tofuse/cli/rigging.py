@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
 from tofuse.results.output import plain
 from tofuse.rigs.calibrate import Calibration, loosest
-from tofuse.rigs.check import LEVEL, Moved
+from tofuse.rigs.check import Moved
 
 
 def tables(rig: Rig) -> list[Table]:
@@ -67,10 +67,10 @@ def _outcome(camera: Moved) -> str:
     by = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
     sigma = f"1 sigma: {1000 * camera.sigma_m:.1f} mm, {np.degrees(camera.sigma_rad):.2f} deg"
     if camera.moved:
-        text = f"moved by {by} ({sigma}; p = {camera.chance:.1g})"
-        if camera.chance_elsewhere > LEVEL:
-            text += ", unless the scene is not the one of the calibration"
-        return text
+        p, elsewhere = f"{camera.chance:.1g}", f"{camera.chance_elsewhere:.1g}"
+        if elsewhere != p:
+            p += f", or {elsewhere} if the scene is not that of the calibration"
+        return f"moved by {by} ({sigma}; p = {p})"
     if camera.sigma_m == 0:
         return "unchanged: reference for the others"
     return f"unchanged, within {by} ({sigma})"

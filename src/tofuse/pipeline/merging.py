@@ -192,7 +192,6 @@ def _earlier_links(sessions: Sequence[Session], firsts: Sequence[int]) -> list[G
     return [
         GivenLoop(i + first, j + first, by_user=False)
         for session, first in zip(sessions, firsts, strict=True)
-        if session.first == 0
         for i, j in session.links
     ]
 

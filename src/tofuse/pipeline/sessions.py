@@ -47,10 +47,9 @@ class Session:
     stated
         By the index of a frame in the recording. Components are numbered over all sessions: joined
         components of one result have the same number and coordinate frame.
-    first
-        Index of its first frame in the result.
     links
-        (i, j) frames in the result, of the loop closures between its sessions.
+        (i, j) frames in the result, of the loop closures between its sessions; empty for all but
+        the first session of a result.
     """
 
     name: str
@@ -59,7 +58,6 @@ class Session:
     recording: Recording
     config: Config
     stated: Mapping[int, StatedPose]
-    first: int = 0
     links: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -112,10 +110,8 @@ def sessions_of(
         If the result can't be merged with any other; see `read_sessions`.
     """
     parts, links = _read_parts(folder, components)
-    return [
-        replace(_session(part, stated, folder, threads, progress), links=links)
-        for part, stated in parts
-    ]
+    found = [_session(part, stated, folder, threads, progress) for part, stated in parts]
+    return [replace(found[0], links=links), *found[1:]]
 
 
 def _read_parts(
@@ -168,7 +164,7 @@ def _session(
         )
     config = _config(part.config, recording, folder, threads, progress)
     opening = locate_recording(part.opening, folder)
-    return Session(part.name, folder, opening, recording, config, stated, part.first)
+    return Session(part.name, folder, opening, recording, config, stated)
 
 
 def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:

@@ -40,7 +40,7 @@ _UPPER = np.triu_indices(kernels.UNKNOWNS)
 def patches_of(points: Float32 | Float64, surface: PreparedView) -> Int64:
     """Return the (N,) patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
-    low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))
+    low, high = surface.projection.ray_bounds
     relative = (rays - low) / np.maximum(high - low, 1e-9)
     shape = np.array([ACROSS, DOWN])
     u, v = np.clip((relative * shape).astype(np.int64), 0, shape - 1).T

@@ -179,6 +179,11 @@ class Projection:
         return np.float32(1) + (self.rays * self.rays).sum(-1)
 
     @cached_property
+    def ray_bounds(self) -> tuple[Float32, Float32]:
+        """Smallest and largest (2,) x/z, y/z of the pixels."""
+        return np.nanmin(self.rays, (0, 1)), np.nanmax(self.rays, (0, 1))
+
+    @cached_property
     def pitch(self) -> float:
         """Typical difference of x/z between neighbouring pixels."""
         return float(np.nanmedian(np.abs(np.diff(self.rays[..., 0], axis=1))))

@@ -126,12 +126,14 @@ def refine_together(
     options
         Options of the refinement.
     """
-    system = _System(views, poses, options or JointOptions())
-    for stage in system.options.rounds:
-        for _ in range(stage.iterations):
-            if system.step(stage.inflation_m) < system.options.convergence:
-                break
-    return system.placed()
+    return _optimised(views, poses, options or JointOptions()).placed()
+
+
+def refined_poses(
+    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+) -> Float64:
+    """Return the poses (K, 4, 4) of `refine_together` alone, without covariances."""
+    return _optimised(views, poses, options or JointOptions()).poses
 
 
 def disagreements(
@@ -172,6 +174,15 @@ def distances_between(target: KeptView, source: KeptView, T_target_source: Float
     far = np.abs(rows[:, kernels.RESIDUAL])
     near = (rows[:, kernels.OWN] > 0) & (far < _OTHER_SURFACE * surface.depth)
     return np.asarray(far[near], np.float64)
+
+
+def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> _System:
+    system = _System(views, poses, options)
+    for stage in options.rounds:
+        for _ in range(stage.iterations):
+            if system.step(stage.inflation_m) < options.convergence:
+                break
+    return system
 
 
 class _System:

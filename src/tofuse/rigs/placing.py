@@ -29,7 +29,7 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, differ
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
-from tofuse.rigs.joint import JointOptions, View, refine_together
+from tofuse.rigs.joint import JointOptions, View, refined_poses
 
 V = TypeVar("V")
 
@@ -230,7 +230,7 @@ class _Placer:
         order = sorted(poses)
         row = {c: k for k, c in enumerate(order)}
         views = [replace(v, camera=row[v.camera]) for v in self._kept if v.camera in row]
-        moved = refine_together(views, np.stack([poses[c] for c in order]), _REFINING).poses
+        moved = refined_poses(views, np.stack([poses[c] for c in order]), _REFINING)
         return dict(zip(order, moved, strict=True))
 
     def _score(self, poses: Mapping[int, Float64]) -> float:

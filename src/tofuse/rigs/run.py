@@ -20,7 +20,7 @@ from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
-from tofuse.posegraph.accuracy import HIDDEN, Accuracy
+from tofuse.posegraph.accuracy import HIDDEN
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import Known, NoRefinement
@@ -228,18 +228,18 @@ def _as_rig(result: Reconstruction, *, moves: bool) -> Reconstruction:
     d = result.diagnostics
     reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
     if not moves:
-        reasons = ranked([_of_calibration(r, d.accuracy) for r in reasons])
+        reasons = ranked([_of_calibration(r) for r in reasons])
     d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
     return replace(result, diagnostics=d)
 
 
-def _of_calibration(reason: Reason, accuracy: Accuracy) -> Reason:
+def _of_calibration(reason: Reason) -> Reason:
     """Return the reason; if poses of static cameras are uncertain, the calibration is."""
     if reason.code != "uncertain_poses":
         return reason
     text = (
-        f"The cameras' poses may be off by {1000 * accuracy.position_m:.0f} mm rms (95 % bound), "
-        "by the covariances in rig.json. They include systematic errors, such as multipath."
+        f"{reason.text} The bound follows from the covariances in rig.json, which include "
+        "systematic errors such as multipath."
     )
     return replace(reason, code="uncertain_rig", text=text)
 

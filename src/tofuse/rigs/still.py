@@ -25,7 +25,7 @@ from tofuse.recordings.still import average_of, change_between
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import Placed, View, distances_between, refine_together
+from tofuse.rigs.joint import Placed, View, distances_between, refine_together, refined_poses
 from tofuse.rigs.placing import Placement, place
 
 # A camera is static if this fraction of its pixels see the same surface in this fraction of the
@@ -130,7 +130,7 @@ def _with_clock_errors(
         interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
         late = list(instants)
         late[c] = _at_times(cameras[c], offsets[c] + interval, at)
-        shifted = refine_together(_views(late, order), placed.poses).poses
+        shifted = refined_poses(_views(late, order), placed.poses)
         for k in range(1, len(order)):
             xi = _CLOCK * se3.log(se3.inverse(placed.poses[k]) @ shifted[k])
             by_clock[k, :6, :6] += np.outer(xi, xi)
