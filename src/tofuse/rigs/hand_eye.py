@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
@@ -270,8 +271,8 @@ def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float
     # Degrees of freedom: independent errors minus unknowns.
     independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
     left = max(independent - H.shape[0], 6.0)
-    # With few degrees of freedom the ellipsoids are those of Student's t.
-    more = independent / left * left / (left - 2)
+    # With few degrees of freedom the 95 % ellipsoid is that of Hotelling's T^2.
+    more = independent / left * 6 * float(stats.f.ppf(0.95, 6, left) / stats.chi2.ppf(0.95, 6))
     weighed = J * (w * sigma)[..., None]
     spread = np.tensordot(alike, weighed, 1)
     B = more * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
