@@ -14,6 +14,7 @@ from tofuse.pipeline.checks import Evidence, judge, stretches
 from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.calibration_check import CalibrationCheck, Gap
+from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
 from tofuse.posegraph.refinement import Refinement
@@ -95,7 +96,7 @@ def evidence(
         poses,
         Optimisation(graph, (1.0, 0.5), settled, parts=parts),
         seen() if images is None else images,
-        Accuracy() if sigma is None else accuracy_of(graph, Shown(), 1.0),
+        Accuracy() if sigma is None else accuracy_of(GraphCovariances(graph), Shown(), 1.0),
         diagonal_m=1.0,
         knows_errors=sigma is not None,
         given=frozenset(given),

@@ -23,6 +23,7 @@ from tofuse.posegraph.accuracy import (
     without_degenerate,
 )
 from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.view_store import PosedView
@@ -54,7 +55,7 @@ def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -
     found = np.array(
         [displacement(TRUE, solve(walk(rng, loops=loops)).graph.poses) for _ in range(300)]
     )
-    bound = accuracy_of(walk(loops=loops), Shown(), 2.0)
+    bound = accuracy_of(GraphCovariances(walk(loops=loops)), Shown(), 2.0)
     for column, limit in zip(found.T, (bound.position_m, bound.rotation_rad), strict=True):
         assert 0.91 < np.mean(column < limit) < 0.985
         assert limit < 2.5 * np.median(column)
@@ -66,48 +67,50 @@ def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -
 
 
 def test_without_loops_the_ends_are_known_least() -> None:
-    a = accuracy_of(walk(loops=()), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(walk(loops=())), Shown(), 1.0)
     assert a.worst is not None
     assert a.worst.frame in (0, N - 1)
-    assert a.position_m > 1.5 * accuracy_of(walk(), Shown(), 1.0).position_m
+    assert a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), Shown(), 1.0).position_m
 
 
 def test_what_the_recording_shows_is_added() -> None:
-    plain = accuracy_of(walk(), Shown(), 1.0)
-    more = accuracy_of(walk(), Shown(0.03, 0.02, 0.04), 1.0)
+    plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
+    more = accuracy_of(GraphCovariances(walk()), Shown(0.03, 0.02, 0.04), 1.0)
     assert more.position_m > 0.05
     assert more.position_m == pytest.approx(
         np.hypot(plain.position_m, accuracy.HIDDEN * 0.05), rel=1e-6
     )
     assert more.rotation_rad > plain.rotation_rad
-    bent = accuracy_of(walk(), Shown(calibration_m=0.2, calibration_rad=0.1), 1.0)
+    bent = accuracy_of(GraphCovariances(walk()), Shown(calibration_m=0.2, calibration_rad=0.1), 1.0)
     assert bent.position_m > 0.2
     assert bent.rotation_rad > 0.1
-    C = covariances_of(walk(), Shown(0.03, 0.02, 0.04))
+    C = covariances_of(GraphCovariances(walk()), Shown(0.03, 0.02, 0.04))
     np.testing.assert_array_equal(C[0], 0)
     assert np.trace(C[5, :3, :3]) > 0.05**2
 
 
 def test_halves_of_the_images_replace_a_covariance_that_is_too_small() -> None:
-    plain = accuracy_of(walk(), Shown(), 1.0)
+    plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
     stated = plain.position_m / accuracy.HIDDEN
-    assert accuracy_of(walk(), Shown(split_m=0.3 * stated), 1.0) == plain
-    one, more = (accuracy_of(walk(), Shown(split_m=k * stated), 1.0) for k in (2, 4))
+    assert accuracy_of(GraphCovariances(walk()), Shown(split_m=0.3 * stated), 1.0) == plain
+    one, more = (
+        accuracy_of(GraphCovariances(walk()), Shown(split_m=k * stated), 1.0) for k in (2, 4)
+    )
     # They are rms errors, and a bound on them is larger.
     assert one.position_m > 2 * plain.position_m
     assert more.position_m == pytest.approx(2 * one.position_m)
     assert more.rotation_rad == plain.rotation_rad
-    C = [covariances_of(walk(), Shown(split_m=m))[5] for m in (0.0, 3 * stated)]
+    C = [covariances_of(GraphCovariances(walk()), Shown(split_m=m))[5] for m in (0.0, 3 * stated)]
     assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
     np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
 
 
 def test_the_refinement_and_halves_of_the_images_show_the_same_errors() -> None:
     """The larger one counts, as both stand for errors that pairs of views share."""
-    moved = accuracy_of(walk(), Shown(moved_m=0.5), 1.0)
-    assert accuracy_of(walk(), Shown(moved_m=0.5, split_m=0.1), 1.0) == moved
-    split = accuracy_of(walk(), Shown(split_m=0.5), 1.0)
-    assert accuracy_of(walk(), Shown(moved_m=0.1, split_m=0.5), 1.0) == split
+    moved = accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5), 1.0)
+    assert accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5, split_m=0.1), 1.0) == moved
+    split = accuracy_of(GraphCovariances(walk()), Shown(split_m=0.5), 1.0)
+    assert accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.1, split_m=0.5), 1.0) == split
 
 
 @pytest.mark.parametrize("direction", [X, TURN])
@@ -115,7 +118,7 @@ def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
     """However much information noise has made of it; frames on both sides stay bounded."""
     graph = walk()
     slide = dict.fromkeys((4, 5, 6), direction)
-    a = accuracy_of(bounded(graph, slide), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(bounded(graph, slide)), Shown(), 1.0)
     assert a.unbounded == (4, 5, 6)
     assert a.worst is not None
     assert a.worst.frame in (4, 5, 6)
@@ -143,7 +146,7 @@ def test_directions_that_differ_slightly_do_not_bound_each_other() -> None:
         slides = {i, j} & set(range(5, 10))
         x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, 1, 2))]
         directions.append(np.array([[*x, 0, 0, 0]]) if slides else np.zeros((0, 6)))
-    a = accuracy_of(without_degenerate(graph, directions), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(without_degenerate(graph, directions)), Shown(), 1.0)
     assert set(range(5, 10)) <= set(a.unbounded)
     assert not set(range(5)) & set(a.unbounded)
 
@@ -207,7 +210,7 @@ def as_frame(z, index) -> RangeFrame:
 
 def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:
     graph = bounded(walk(), {5: X})
-    C = covariances_of(graph, Shown())[5]
+    C = covariances_of(GraphCovariances(graph), Shown())[5]
     sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
     assert sigma[1] < 0.05
     assert sigma[2] > 1
@@ -215,13 +218,15 @@ def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:
 
 def test_a_degenerate_start_leaves_the_rest_bounded() -> None:
     """What is relative to the first frame would all be unbounded."""
-    a = accuracy_of(bounded(walk(loops=((2, N - 1),)), {0: X, 1: X}), Shown(), 1.0)
+    a = accuracy_of(
+        GraphCovariances(bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})), Shown(), 1.0
+    )
     assert a.unbounded == (0, 1)
 
 
 def test_extrapolated_motion_bounds_nothing() -> None:
     graph = walk(loops=())
-    a = accuracy_of(bounded(graph, {}, [(9, 8)]), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(bounded(graph, {}, [(9, 8)])), Shown(), 1.0)
     assert set(a.unbounded) in ({*range(9)}, {*range(9, N)})
     assert np.isinf(a.position_m)
 
@@ -230,7 +235,7 @@ def test_parts_that_nothing_connects_are_not_bounded() -> None:
     graph = walk(loops=())
     keep = np.arange(N - 1) != 8
     columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
-    a = accuracy_of(replace(graph, **columns), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(replace(graph, **columns)), Shown(), 1.0)
     assert a.assessed
     assert np.isinf(a.position_m)
     assert len(a.unbounded) in (5, 9)
@@ -259,7 +264,7 @@ def test_a_slide_along_bare_walls_is_not_bounded_in_any_frame_concerned(scene) -
 
 def test_one_pose_is_not_assessed() -> None:
     one = build_graph([7], TRUE[:1], [])
-    assert accuracy_of(one, Shown(), 1.0) == Accuracy()
+    assert accuracy_of(GraphCovariances(one), Shown(), 1.0) == Accuracy()
 
 
 def test_displacement_ignores_a_motion_of_all() -> None:

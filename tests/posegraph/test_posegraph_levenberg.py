@@ -16,7 +16,7 @@ from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import Anchors, Gravity, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
 from tofuse.posegraph.solve import Settings, solve
-from tofuse.posegraph.sparse import PairSystem
+from tofuse.posegraph.sparse import Blocks, PairSystem
 from walked_graph import SIGMA, walk
 
 
@@ -52,6 +52,16 @@ def test_the_minimum_is_a_minimum_in_every_direction(rotation):
             assert abs(slope / curvature) < 1e-6
 
 
+def dense(system: PairSystem, matrix: Blocks) -> Float64:
+    """The whole matrix, in the order of the free poses."""
+    n, k = len(system.free), system.size
+    out = np.zeros((n, k, n, k))
+    out[np.arange(n), :, np.arange(n)] = matrix.diagonal
+    out[system.rows, :, system.columns] = matrix.below
+    out[system.columns, :, system.rows] = np.swapaxes(matrix.below, 1, 2)
+    return out.reshape(n * k, n * k)
+
+
 def test_gradient_and_curvature_are_those_of_the_objective():
     """The assembled system against numerical derivatives, far from the minimum."""
     graph, _, _ = walk(8, 5)
@@ -76,7 +86,7 @@ def test_gradient_and_curvature_are_those_of_the_objective():
     h = 1e-6
     numeric = np.stack([(whitened(h * u) - whitened(-h * u)) / (2 * h) for u in np.eye(42)], axis=1)
     scale = np.abs(numeric.T @ numeric).max()
-    np.testing.assert_allclose(matrix.toarray(), numeric.T @ numeric, atol=1e-7 * scale)
+    np.testing.assert_allclose(dense(system, matrix), numeric.T @ numeric, atol=1e-7 * scale)
     expected = numeric.T @ whitened(np.zeros(42))
     np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-7 * np.abs(expected).max())
 
@@ -89,10 +99,11 @@ def test_one_step_solves_the_damped_system():
     H, g = root @ np.swapaxes(root, 1, 2), rng.normal(size=(m, 6))
     system = PairSystem(12, graph.edges)
     matrix, gradient = system.relative(H, g, graph.measurements)
-    dense = matrix.toarray()
+    whole = dense(system, matrix)
     for damping in (0.0, 0.5):
         step = system.solve(H, g, graph.measurements, damping)
-        expected = np.linalg.solve(dense + damping * np.diag(np.diag(dense)), -gradient.ravel())
+        damped = whole + damping * np.diag(np.diag(whole))
+        expected = np.linalg.solve(damped, -gradient.ravel())
         np.testing.assert_allclose(step[system.free].ravel(), expected, rtol=1e-8, atol=1e-12)
         assert (step[0] == 0).all()
     # What single poses add, here enough to hold a pose that no pair reaches.

@@ -34,7 +34,12 @@ from tofuse.posegraph.accuracy import (
 )
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.calibration_check import CalibrationCheck
-from tofuse.posegraph.covariances import MIN_WEIGHT, accepted_only, pose_covariances
+from tofuse.posegraph.covariances import (
+    MIN_WEIGHT,
+    GraphCovariances,
+    accepted_only,
+    pose_covariances,
+)
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
@@ -444,12 +449,12 @@ class BackEnd:
         if not self._kept.knows_errors:
             return Accuracy(), pose_covariances(closed.optimisation.graph)
         refinement = refined.refinement
-        graph = images_only = self._measured(refined.graph, refinement.stated)
+        known = images_only = GraphCovariances(self._measured(refined.graph, refinement.stated))
         if closed.sensors:  # the accuracy rests on the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
                 without_sensors = self.graph(closed.loops, refinement, confirmed=closed.confirmed)
-            images_only = self._measured(without_sensors, refinement.stated)
+            images_only = GraphCovariances(self._measured(without_sensors, refinement.stated))
         moved = 0.0, 0.0
         if self._tracks:  # the initial error of given poses says nothing of the final one
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
@@ -459,11 +464,11 @@ class BackEnd:
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
         if accuracy.unbounded and closed.sensors.verified:
             free = set(accuracy.unbounded)
-            bounded = with_sensors(images_only, self._where_degenerate(closed.sensors))
-            accuracy = accuracy_of(bounded, shown, model.cloud.diagonal_m)
+            bounded = with_sensors(images_only.graph, self._where_degenerate(closed.sensors))
+            accuracy = accuracy_of(GraphCovariances(bounded), shown, model.cloud.diagonal_m)
             by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
             accuracy = replace(accuracy, by_odometry=by_odometry)
-        return accuracy, covariances_of(graph, shown)
+        return accuracy, covariances_of(known, shown)
 
     def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
         """Return how far (m, rad) the poses may be off by the calibration (95 %).

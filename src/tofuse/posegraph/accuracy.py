@@ -20,7 +20,7 @@ from scipy.special import gammaincinv
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
-from tofuse.posegraph.covariances import joint_covariance, pose_covariances
+from tofuse.posegraph.covariances import GraphCovariances, pose_covariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.prepared_view import PreparedView
@@ -153,15 +153,16 @@ class _Stated:
     single: Float64
 
     @classmethod
-    def by(cls, graph: PoseGraph, more: Intp | None = None) -> _Stated | None:
+    def by(cls, covariances: GraphCovariances, more: Intp | None = None) -> _Stated | None:
         """Look at evenly spaced poses and `more`; None if the graph does not constrain all poses.
 
         The rms is that of the evenly spaced ones.
         """
+        graph = covariances.graph
         n = len(graph.ids)
         even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
         positions = even if more is None else np.union1d(even, more)
-        C = joint_covariance(graph, positions) if n > 1 else None
+        C = covariances.joint(positions) if n > 1 else None
         if C is None:
             return None
         chosen = np.isin(positions, even)
@@ -272,34 +273,35 @@ def without_degenerate(
     return replace(graph, information=information)
 
 
-def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
+def accuracy_of(covariances: GraphCovariances, shown: Shown, diagonal_m: float) -> Accuracy:
     """Return the bounds on the errors of the poses of a graph.
 
     Parameters
     ----------
-    graph
-        After refinement; its information is that of measurements alone, see `without_degenerate`.
+    covariances
+        Of a graph after refinement; its information is that of measurements alone, see
+        `without_degenerate`.
     shown
         Further errors that the recording shows.
     diagonal_m
         Of the model, m.
     """
-    n = len(graph.ids)
-    if n < 2:
+    graph = covariances.graph
+    if len(graph.ids) < 2:
         return Accuracy()
     least_m, least_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
     limits = np.array([max(least_m, _UNMEASURED_FRACTION * diagonal_m), least_rad])
-    covariances, unbounded = _single(graph, limits)
+    single, unbounded = _single(covariances, limits)
     free = tuple(graph.ids[unbounded.any(1)].tolist())
-    size = np.nan_to_num(np.trace(covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
-    stated = _Stated.by(graph, np.argsort(-size, kind="stable")[:_WORST])
+    size = np.nan_to_num(np.trace(single[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
+    stated = _Stated.by(covariances, np.argsort(-size, kind="stable")[:_WORST])
     if stated is None:
         first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
         return Accuracy(assessed=True, worst=first, unbounded=free)
     extra = shown.beyond(stated)
     of_all = HIDDEN * np.hypot(stated.bounds, extra)
-    single = HIDDEN * np.hypot(stated.single, extra)
-    of_each = np.where(unbounded[stated.positions], np.inf, single)
+    of_each = HIDDEN * np.hypot(stated.single, extra)
+    of_each = np.where(unbounded[stated.positions], np.inf, of_each)
     worst = int(np.argmax((of_each / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
     return Accuracy(
@@ -312,32 +314,32 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
     )
 
 
-def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
+def covariances_of(covariances: GraphCovariances, shown: Shown) -> Float64:
     """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
 
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
     metres.
     """
-    more = np.repeat(shown.beyond(_Stated.by(graph)) ** 2 / 3, 3)
-    C = pose_covariances(graph)
+    more = np.repeat(shown.beyond(_Stated.by(covariances)) ** 2 / 3, 3)
+    C = covariances.of_poses.copy()
     C[1:] += np.diag(more)
     return HIDDEN**2 * C
 
 
-def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, Bool]:
+def _single(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:
     """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
     Relative to the first one, or to another if the first is one of few unbounded ones.
     """
-    covariances = pose_covariances(graph)
-    unbounded = _is_unbounded(covariances, limits)
+    first = covariances.of_poses
+    unbounded = _is_unbounded(first, limits)
     if 2 * unbounded.any(1).sum() > len(unbounded):
         many = np.flatnonzero(unbounded.any(1))
-        other = pose_covariances(graph, int(many[len(many) // 2]))
+        other = pose_covariances(covariances.graph, int(many[len(many) // 2]))
         others = _is_unbounded(other, limits)
         if others.any(1).sum() < unbounded.any(1).sum():
             return other, others
-    return covariances, unbounded
+    return first, unbounded
 
 
 def _is_unbounded(covariances: Float64, limits: Float64) -> Bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
-from tofuse.posegraph.sparse import first_of_parts, parts_of
+from tofuse.posegraph.sparse import Factor, first_of_parts, parts_of
 
 # A loop with a smaller weight is rejected.
 MIN_WEIGHT = 0.05
@@ -47,16 +48,22 @@ def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
     origin
         Position of the pose that is fixed.
     """
+    if not len(graph.ids):
+        return np.empty((0, 6, 6))
+    part = parts_of(len(graph.ids), graph.edges)
+    fixed = first_of_parts(len(graph.ids), graph.edges) & (part != part[origin])
+    fixed[origin] = True
+    factor = _problem(graph, fixed).factor(graph.poses, np.ones(len(graph.edges)))
+    return _connected(graph, origin, factor)
+
+
+def _connected(graph: PoseGraph, origin: int, factor: Factor | None) -> Float64:
+    """Return the (N, 6, 6) covariances by a factor; NaN where not connected to the origin."""
     out = np.full((len(graph.ids), 6, 6), np.nan)
-    if not len(out):
+    if factor is None or not len(out):
         return out
     part = parts_of(len(out), graph.edges)
     joined = part == part[origin]
-    fixed = first_of_parts(len(out), graph.edges) & ~joined
-    fixed[origin] = True
-    factor = _problem(graph, fixed).factor(graph.poses, np.ones(len(graph.edges)))
-    if factor is None:
-        return out
     try:
         out[joined] = factor.covariances()[: len(out)][joined]
     except RuntimeError:
@@ -86,23 +93,35 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     return np.asarray((axes * np.maximum(variances, 0)) @ axes.T, np.float64)
 
 
-def joint_covariance(graph: PoseGraph, some: Intp) -> Float64 | None:
-    """(6v, 6v) joint covariance of v poses, relative to the first one of the graph.
+class GraphCovariances:
+    """Covariances of the poses of an optimised graph relative to its first pose.
 
-    None where the measurements do not constrain all poses of the graph.
-
-    Parameters
-    ----------
-    graph
-        The optimised graph.
-    some
-        (v,) positions of the poses.
+    The system is factorised once for all of them.
     """
-    problem = _problem(graph, first_of_parts(len(graph.ids), graph.edges))
-    factor = problem.factor(graph.poses, np.ones(len(graph.edges)))
-    if factor is None or problem.fixed.sum() > 1:
-        return None
-    return factor.joint_covariance(some)
+
+    def __init__(self, graph: PoseGraph) -> None:
+        self.graph = graph
+
+    @cached_property
+    def _factor(self) -> Factor | None:
+        graph = self.graph
+        problem = _problem(graph, first_of_parts(len(graph.ids), graph.edges))
+        return problem.factor(graph.poses, np.ones(len(graph.edges)))
+
+    @cached_property
+    def of_poses(self) -> Float64:
+        """(N, 6, 6) as right perturbations, see `pose_covariances`."""
+        return _connected(self.graph, 0, self._factor)
+
+    def joint(self, some: Intp) -> Float64 | None:
+        """Return the (6v, 6v) joint covariance of v poses, given their positions.
+
+        None where the measurements do not constrain all poses of the graph.
+        """
+        n, edges = len(self.graph.ids), self.graph.edges
+        if self._factor is None or first_of_parts(n, edges).sum() > 1:
+            return None
+        return self._factor.joint_covariance(some)
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:

@@ -11,7 +11,8 @@ so H, g and T_i_j determine four blocks and two gradients of the whole system.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -20,10 +21,26 @@ from scipy.sparse.linalg import splu
 
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
+from tofuse.kernels import supernodes as kernels
 
 # Maximum size of a dense right-hand side, in numbers.
 _AT_ONCE = 4_000_000
 _FLAT = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
+
+
+class Blocks(NamedTuple):
+    """A symmetric matrix of k x k blocks, in the order of a system's free poses.
+
+    Attributes
+    ----------
+    diagonal
+        (n, k, k) blocks on the diagonal.
+    below
+        (b, k, k) blocks below it, at the `rows` and `columns` of the system.
+    """
+
+    diagonal: Float64
+    below: Float64
 
 
 class PairSystem:
@@ -56,7 +73,6 @@ class PairSystem:
         number[self.free] = np.arange(len(self.free))
         self.number = number
         self._sums(i, j, both)
-        self._layout()
 
     def _sums(self, i: Intp, j: Intp, both: Intp) -> None:
         """Make the matrices that sum the contributions of pairs to each block."""
@@ -71,27 +87,16 @@ class PairSystem:
         self.block_of_both = where
         self._sum_off = _indicator(where, len(keys), len(both))
 
-    def _layout(self) -> None:
-        """Compute the position of each entry of each block in the data of the CSC matrix."""
-        n, k, off = len(self.free), self.size, len(self.rows)
-        rows = np.concatenate([np.arange(n), self.rows, self.columns])
-        columns = np.concatenate([np.arange(n), self.columns, self.rows])
+    @cached_property
+    def panels(self) -> tuple[kernels.Panels, Intp, Intp]:
+        """Layout of the factor, and where the blocks of the matrix are in it, with strides."""
+        n = len(self.free)
+        rows = np.concatenate([np.arange(n), self.rows])
+        columns = np.concatenate([np.arange(n), self.columns])
         order = np.lexsort((rows, columns))
-        height = np.bincount(columns, minlength=n)
-        start = np.concatenate([[0], np.cumsum(height)])
-        rank = np.empty(len(rows), np.intp)
-        rank[order] = np.arange(len(rows))
-        within = rank - start[columns]
-        first = k * k * start[columns] + k * within
-        # Entry (a, b) of a block lies b columns on, each k * height long, and a rows down.
-        place = first[:, None, None] + (
-            np.arange(k)[:, None] + (k * height[columns])[:, None, None] * np.arange(k)
-        )
-        self._place = place[:n], place[n : n + off], place[n + off :]
-        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(k * height, k))]).astype(np.int32)
-        indices = np.empty(k * k * len(rows), np.int32)
-        indices[place] = (k * rows[:, None, None] + np.arange(k)[:, None]).astype(np.int32)
-        self._indices = indices
+        start = np.searchsorted(columns[order], np.arange(n + 1))
+        panels = kernels.layout(*kernels.fill_in(start, rows[order]), self.size)
+        return panels, *kernels.places(panels, rows, columns)
 
     def assemble(
         self,
@@ -101,8 +106,8 @@ class PairSystem:
         g_i: Float64,
         g_j: Float64,
         single: tuple[Float64, Float64] | None = None,
-    ) -> tuple[Any, Float64]:
-        """Return the matrix (CSC) and the gradient (free poses x size) of the whole system.
+    ) -> tuple[Blocks, Float64]:
+        """Return the matrix and the gradient (free poses x size) of the whole system.
 
         Parameters
         ----------
@@ -123,12 +128,8 @@ class PairSystem:
         # Blocks below the diagonal: rows belong to the pose that is eliminated later.
         blocks = ij[self.both]
         low = np.where(self.swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
-        low = (self._sum_off @ low.reshape(-1, k * k)).reshape(-1, k, k)
-        data = np.empty(len(self._indices))
-        for place, values in zip(self._place, (diagonal, low, np.swapaxes(low, 1, 2)), strict=True):
-            data[place] = values
-        shape = (k * n, k * n)
-        return sparse.csc_matrix((data, self._indices, self._indptr), shape=shape), gradient
+        below = (self._sum_off @ low.reshape(-1, k * k)).reshape(-1, k, k)
+        return Blocks(diagonal, below), gradient
 
     def relative(
         self,
@@ -136,7 +137,7 @@ class PairSystem:
         g: Float64,
         T_i_j: Float64,
         single: tuple[Float64, Float64] | None = None,
-    ) -> tuple[Any, Float64]:
+    ) -> tuple[Blocks, Float64]:
         """Assemble from (m, 6, 6) H and (m, 6) g of the right perturbations of (m, 4, 4) T_i_j."""
         A = se3.adjoint(se3.inverse(T_i_j))
         At = np.swapaxes(A, 1, 2)
@@ -148,11 +149,6 @@ class PairSystem:
         At = np.swapaxes(se3.adjoint(se3.inverse(T_i_j)), 1, 2)
         g_i = -(At @ g[..., None])[..., 0]
         return np.asarray(self._sum_i @ g_i + self._sum_j @ g, np.float64)
-
-    def blocks(self, matrix: Any) -> tuple[Float64, Float64]:
-        """Return the blocks of a matrix on the diagonal, and below it at `rows`, `columns`."""
-        data = matrix.data
-        return data[self._place[0]], data[self._place[1]]
 
     def solve(
         self,
@@ -184,14 +180,13 @@ class PairSystem:
         factor = self.factor(*self.relative(H, g, T_i_j, single), damping)
         return None if factor is None else factor.step()
 
-    def factor(self, matrix: Any, gradient: Float64, damping: float = 0.0) -> Factor | None:
+    def factor(self, matrix: Blocks, gradient: Float64, damping: float = 0.0) -> Factor | None:
         """Factorise an assembled system; None where it is singular."""
-        if matrix.shape[0] and damping:
-            diagonal = matrix.diagonal()
-            added = damping * np.maximum(diagonal, _FLAT * diagonal.max())
-            matrix = matrix.copy()
-            ends = self._place[0].diagonal(axis1=1, axis2=2).ravel()
-            matrix.data[ends] += added
+        if len(matrix.diagonal) and damping:
+            entries = np.diagonal(matrix.diagonal, axis1=1, axis2=2)
+            added = damping * np.maximum(entries, _FLAT * entries.max())
+            diagonal = matrix.diagonal + added[..., None] * np.eye(self.size)
+            matrix = matrix._replace(diagonal=diagonal)
         try:
             return Factor(self, matrix, gradient)
         except RuntimeError:
@@ -199,17 +194,24 @@ class PairSystem:
 
 
 class Factor:
-    """A factorised system. Raises RuntimeError where it is singular."""
+    """A factorised system. Raises RuntimeError where it is singular.
 
-    def __init__(self, system: PairSystem, matrix: Any, gradient: Float64) -> None:
+    Its values are kept until covariances overwrite them, and computed again if needed: those of a
+    long trajectory need much memory.
+    """
+
+    def __init__(self, system: PairSystem, matrix: Blocks, gradient: Float64) -> None:
         self.system, self.gradient, self._matrix = system, gradient, matrix
-        # The blocks are in elimination order; the matrix is symmetric, so no pivoting.
-        options = {"SymmetricMode": True}
-        self._lu = (
-            splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
-            if matrix.shape[0]
-            else None
-        )
+        self._signs = np.empty(system.size * len(system.free))
+        self._values: Float64 | None = self._factorised()
+
+    def _factorised(self) -> Float64:
+        panels, at, stride = self.system.panels
+        values = np.zeros(panels.values[-1])
+        kernels.scatter(values, at, stride, np.concatenate(self._matrix))
+        if not kernels.factorise(panels, values, self._signs):
+            raise RuntimeError("the system is singular")
+        return values
 
     def step(self) -> Float64 | None:
         """Return the (n, k) solution of ``matrix x = -gradient``; None if not finite."""
@@ -219,12 +221,19 @@ class Factor:
         """As `step`, with another gradient (free poses x k)."""
         system = self.system
         out = np.zeros((system.n, system.size))
-        if self._lu is not None:
-            x = self._lu.solve(-gradient.ravel())
-            if not np.isfinite(x).all():
-                return None
-            out[system.free] = x.reshape(-1, system.size)
+        x = self._solved(-gradient.reshape(-1, 1))
+        if not np.isfinite(x).all():
+            return None
+        out[system.free] = x.reshape(-1, system.size)
         return out
+
+    def _solved(self, right: Float64) -> Float64:
+        """Return the solutions of the system for right-hand sides (free poses * k, q)."""
+        if self._values is None:
+            self._values = self._factorised()
+        x = np.array(right, order="C")
+        kernels.solve(self.system.panels[0], self._values, self._signs, x)
+        return x
 
     def joint_covariance(self, vertices: Intp) -> Float64:
         """Return the (v k, v k) joint covariance of some poses; zero for fixed ones."""
@@ -232,7 +241,7 @@ class Factor:
         vertices = np.asarray(vertices, np.intp)
         out = np.zeros((len(vertices), k, len(vertices), k))
         moving = np.flatnonzero(~system.fixed[vertices])
-        if self._lu is None or not len(moving):
+        if not len(moving):
             return out.reshape(len(vertices) * k, -1)
         at = (k * system.number[vertices[moving]][:, None] + np.arange(k)).ravel()
         # In batches, so that memory does not grow with the graph.
@@ -242,7 +251,7 @@ class Factor:
             columns = at[k * start : k * (start + some)]
             unit = np.zeros((k * len(system.free), len(columns)))
             unit[columns, np.arange(len(columns))] = 1
-            found = self._lu.solve(unit)[at].reshape(len(moving), k, len(these), k)
+            found = self._solved(unit)[at].reshape(len(moving), k, len(these), k)
             out[moving[:, None], :, these, :] = np.swapaxes(found, 1, 2)
         C = out.reshape(len(vertices) * k, -1)
         return (C + C.T) / 2
@@ -280,28 +289,16 @@ class Factor:
 
     def _inverse(self) -> tuple[Float64, Float64]:
         """Return the blocks of the inverse: diagonal (free, 6, 6), and those of the pairs."""
-        # Imported here: importing Numba is slow, and few callers need covariances.
-        from tofuse.kernels.selected_inverse import factorise, fill_in, invert
-
-        system = self.system
-        n = len(system.free)
-        diagonal, low = system.blocks(self._matrix)
-        if n == 0:
-            return diagonal, low
-        rows = np.concatenate([np.arange(n), system.rows]).astype(np.int64)
-        columns = np.concatenate([np.arange(n), system.columns]).astype(np.int64)
-        order = np.lexsort((rows, columns))
-        start = np.searchsorted(columns[order], np.arange(n + 1)).astype(np.int64)
-        full_start, full_rows = fill_in(start, rows[order])
-        # Positions of the matrix's blocks in the pattern of its factor, which is denser.
-        of_full = np.repeat(np.arange(n), np.diff(full_start))
-        place = np.searchsorted(of_full * n + full_rows, columns * n + rows)
-        values = np.zeros((len(full_rows), 6, 6))
-        values[place] = np.concatenate([diagonal, low])
-        if not factorise(full_start, full_rows, values):
+        if (self._signs < 0).any():
             raise RuntimeError("the system is not positive definite")
-        invert(full_start, full_rows, values)
-        return values[place[:n]], values[place[n:]]
+        panels, at, stride = self.system.panels
+        values = self._factorised() if self._values is None else self._values
+        self._values = None
+        kernels.invert(panels, values)
+        blocks = np.empty((len(at), self.system.size, self.system.size))
+        kernels.gather(values, at, stride, blocks)
+        n = len(self.system.free)
+        return blocks[:n], blocks[n:]
 
 
 def parts_of(n: int, pairs: Intp) -> Intp:
@@ -321,7 +318,7 @@ def first_of_parts(n: int, pairs: Intp) -> Bool:
     return first
 
 
-def _indicator(rows: Intp, n: int, m: int) -> Any:
+def _indicator(rows: Intp, n: int, m: int) -> sparse.csr_matrix:
     """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are ignored."""
     used = np.flatnonzero(rows >= 0)
     ones = np.ones(len(used))
