@@ -31,12 +31,12 @@ def block(A: Float64, i: int, j: int) -> Float64:
 
 
 @pytest.mark.parametrize(("n", "links"), [(1, 0), (2, 1), (9, 12), (30, 45), (12, 60)])
-def test_entries_are_those_of_the_dense_inverse(n, links):
+def test_entries_match_dense_inverse(n, links):
     A, start, rows = some_matrix(n, links, seed=n)
     L, inverse = np.linalg.cholesky(A), np.linalg.inv(A)
     full_start, full_rows = fill_in(start, rows)
     places = [(i, k) for k in range(n) for i in full_rows[full_start[k] : full_start[k + 1]]]
-    # The pattern holds every block of the factor that is not zero, and none else.
+    # The pattern holds exactly the non-zero blocks of the factor.
     expected = {(i, k) for k in range(n) for i in range(k, n) if np.abs(block(L, i, k)).max() > 0}
     assert len(places) == len(set(places))
     assert set(places) == expected
@@ -48,7 +48,7 @@ def test_entries_are_those_of_the_dense_inverse(n, links):
     np.testing.assert_allclose(values, [block(inverse, i, k) for i, k in places], atol=1e-10)
 
 
-def test_a_matrix_that_is_not_positive_is_noticed():
+def test_indefinite_matrix_is_detected():
     A, start, rows = some_matrix(5, 6, seed=1)
     A[26, 26] = -1
     full_start, full_rows = fill_in(start, rows)
