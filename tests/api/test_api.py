@@ -58,7 +58,7 @@ def result(arrays):
     return tofuse.reconstruct(tofuse.from_arrays(depth, K, reference=poses), threads=1)
 
 
-def test_arrays_become_a_model_and_a_trajectory(result):
+def test_reconstruction_from_arrays_matches_reference(result):
     assert result.has_pose.all()
     found = result.evaluate()
     assert found.error.associated == 6
@@ -67,7 +67,7 @@ def test_arrays_become_a_model_and_a_trajectory(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
-def test_a_saved_result_is_loaded_as_it_was(result, tmp_path):
+def test_saved_result_round_trips(result, tmp_path):
     assert result.save(tmp_path / "out") == tmp_path / "out"
     again = tofuse.load(tmp_path / "out")
     np.testing.assert_allclose(again.trajectory, result.trajectory, atol=1e-7)
@@ -87,7 +87,7 @@ def test_a_saved_result_is_loaded_as_it_was(result, tmp_path):
             theirs.reason,
         )
         np.testing.assert_allclose(mine.covariance, theirs.covariance)
-    # What was loaded can be saved; but for the refinement, run.json says the same.
+    # A loaded result can be saved; run.json is the same except for the refinement.
     again.save(tmp_path / "copy")
     first, second = (
         json.loads((tmp_path / name / "run.json").read_text()) for name in ("out", "copy")
@@ -96,7 +96,7 @@ def test_a_saved_result_is_loaded_as_it_was(result, tmp_path):
     assert again.accuracy == result.accuracy
 
 
-def test_saving_refuses_what_is_not_ours(result, tmp_path):
+def test_save_rejects_foreign_folder(result, tmp_path):
     (tmp_path / "diary.txt").write_text("dear")
     with pytest.raises(tofuse.OutputError, match="contains no earlier result"):
         result.save(tmp_path)
@@ -104,7 +104,7 @@ def test_saving_refuses_what_is_not_ours(result, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["no frames", "other poses", "no run.json", "not a folder"])
-def test_what_is_no_result_is_refused_in_one_line(result, tmp_path, damage):
+def test_load_rejects_damaged_result(result, tmp_path, damage):
     folder = tmp_path / "out"
     result.save(folder)
     run = json.loads((folder / "run.json").read_text())
@@ -123,7 +123,7 @@ def test_what_is_no_result_is_refused_in_one_line(result, tmp_path, damage):
     assert error.value.remedy
 
 
-def test_evaluate_takes_files_and_arrays(result, arrays, tmp_path):
+def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     poses = arrays[2]
     by_array = tofuse.evaluate(result.trajectory, poses).error.ate_rms_m
     assert by_array == pytest.approx(result.evaluate().error.ate_rms_m)
@@ -151,12 +151,12 @@ def test_reprs_are_short(result, arrays):
     assert result.plot()._repr_html_().count("<svg") == 2
 
 
-def test_a_plot_is_saved_as_a_page(result, tmp_path):
+def test_plot_is_saved_as_html(result, tmp_path):
     result.plot().save(tmp_path / "plot.html")
     assert (tmp_path / "plot.html").read_text().count("<svg") == 2
 
 
-def test_what_was_mapped_frame_by_frame_gets_the_same_methods(arrays):
+def test_mapper_output_becomes_result(arrays):
     recording = tofuse.from_arrays(arrays[0], arrays[1])
     mapper = tofuse.Mapper(threads=1)
     for frame in recording:
@@ -179,7 +179,7 @@ def test_progress_is_shown_on_request(arrays, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["millimetres", "unit", "list", "camera"])
-def test_depth_comes_in_any_form(arrays, kind):
+def test_from_arrays_accepts_depth_formats(arrays, kind):
     depth, K, _ = arrays
     camera = K
     options = {}
@@ -198,7 +198,7 @@ def test_depth_comes_in_any_form(arrays, kind):
     assert frame.camera.fx == 70
 
 
-def test_images_beside_depth_are_kept(arrays):
+def test_from_arrays_keeps_images_and_timestamps(arrays):
     depth, K, _ = arrays
     color = np.full((*depth.shape, 3), 90, np.uint8)
     amplitude = np.arange(depth.size).reshape(depth.shape)
@@ -236,7 +236,7 @@ def test_images_beside_depth_are_kept(arrays):
         ({"reference": np.eye(4)}, "reference"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(arrays, change, named):
+def test_inconsistent_arrays_are_rejected(arrays, change, named):
     given = {"depth": arrays[0], "camera": arrays[1], **change}
     with pytest.raises(tofuse.InputError) as error:
         tofuse.from_arrays(given.pop("depth"), given.pop("camera"), **given)
@@ -244,12 +244,12 @@ def test_arrays_that_do_not_fit_are_refused(arrays, change, named):
 
 
 @pytest.mark.parametrize("suffix", ["glb", "gltf", "ply", "obj", "stl"])
-def test_a_mesh_is_saved_as_other_programs_read_it(result, tmp_path, suffix):
+def test_saved_mesh_is_read_by_trimesh(result, tmp_path, suffix):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / f"model.{suffix}"
     result.mesh.save(path)
     read = trimesh.load(path, force="mesh", process=False)
-    flip = 1 if suffix == "ply" else -1  # the others stand with y up
+    flip = 1 if suffix == "ply" else -1  # the others have y up
     mine = result.mesh.vertices + result.mesh.offset
     np.testing.assert_allclose(
         np.sort(read.bounds * [1, flip, flip], axis=0), [mine.min(0), mine.max(0)], atol=1e-5
@@ -260,7 +260,7 @@ def test_a_mesh_is_saved_as_other_programs_read_it(result, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "las", "e57"])
-def test_a_cloud_is_saved_by_its_suffix(result, tmp_path, suffix):
+def test_cloud_format_follows_suffix(result, tmp_path, suffix):
     if suffix == "e57":
         pytest.importorskip("pye57")
     path = tmp_path / f"cloud.{suffix}"
@@ -272,14 +272,14 @@ def test_a_cloud_is_saved_by_its_suffix(result, tmp_path, suffix):
     )
 
 
-def test_an_unknown_suffix_names_the_known_ones(result, tmp_path):
+def test_unknown_suffix_error_lists_known_ones(result, tmp_path):
     with pytest.raises(tofuse.InputError, match=r"\.glb, \.gltf, \.ply, \.obj, \.usdz, \.stl"):
         result.mesh.save(tmp_path / "model.docx")
     with pytest.raises(tofuse.InputError, match=r"\.ply, \.pcd"):
         result.cloud.save(tmp_path / "model.glb")
 
 
-def test_a_library_that_is_missing_is_named(result, monkeypatch):
+def test_missing_library_is_named(result, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "open3d", None)
@@ -287,7 +287,7 @@ def test_a_library_that_is_missing_is_named(result, monkeypatch):
         result.mesh.to_open3d()
 
 
-def test_viewing_serves_the_page_until_it_is_stopped(result):
+def test_view_serves_page(result):
     pytest.importorskip("viser")
     from urllib.request import urlopen
 
@@ -301,12 +301,12 @@ def test_viewing_serves_the_page_until_it_is_stopped(result):
         stop(server)
 
 
-def test_a_path_is_no_recording() -> None:
+def test_reconstruct_rejects_path() -> None:
     with pytest.raises(InputError, match=r"is a str, not a recording; pass tofuse\.open"):
         tofuse.reconstruct("recording")  # type: ignore[arg-type]
 
 
-def test_a_registration_is_shown_in_one_line() -> None:
+def test_registration_repr_is_one_line() -> None:
     points = np.random.default_rng(0).random((300, 3))
     shown = repr(tofuse.register(points, points, method=Icp()))
     assert shown == (
@@ -315,7 +315,7 @@ def test_a_registration_is_shown_in_one_line() -> None:
     )
 
 
-def test_options_are_given_as_in_a_file(arrays) -> None:
+def test_options_follow_config_file_schema(arrays) -> None:
     recording = tofuse.from_arrays(arrays[0][:2], arrays[1])
     options = {"method": "thesis", "fusion": {"voxel_m": 0.1}}
     found = tofuse.reconstruct(recording, options, threads=1)
@@ -326,7 +326,7 @@ def test_options_are_given_as_in_a_file(arrays) -> None:
             tofuse.reconstruct(recording, wrong)
 
 
-def test_a_filter_that_learned_from_the_recording_is_in_the_report(tmp_path) -> None:
+def test_fitted_filter_is_in_report(tmp_path) -> None:
     simulate("box", tmp_path / "rec", every=20, frames=9, effects=Effects.none(shot_noise=True))
     options = {"filters": [{"part": "background"}]}
     found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), options, threads=1)
@@ -334,7 +334,7 @@ def test_a_filter_that_learned_from_the_recording_is_in_the_report(tmp_path) -> 
     assert "background" in (tmp_path / "out/report.html").read_text()
 
 
-def test_a_result_is_saved_after_its_recording_is_gone(arrays, tmp_path) -> None:
+def test_result_is_saved_after_recording_is_deleted(arrays, tmp_path) -> None:
     convert(tofuse.from_arrays(arrays[0][:2], arrays[1]), tmp_path / "rec")
     found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), threads=1)
     shutil.rmtree(tmp_path / "rec")

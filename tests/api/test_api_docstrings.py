@@ -15,7 +15,7 @@ NAMES = [name for name in tofuse.__all__ if name != "__version__"]
 
 
 def methods(kind: type) -> Iterator[tuple[str, Any]]:
-    """Public methods and properties that a class of ours defines, inherited ones included."""
+    """Public methods and properties that a class of tofuse defines, inherited ones included."""
     for name in dir(kind):
         if name.startswith("_"):
             continue
@@ -31,20 +31,20 @@ def methods(kind: type) -> Iterator[tuple[str, Any]]:
             yield name, member.fget if isinstance(member, property) else member.func
 
 
-def unnamed(function: Any, text: str) -> list[str]:
+def undocumented(function: Any, text: str) -> list[str]:
     """Parameters that a docstring does not name."""
     parameters = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
     return [p for p in parameters if not re.search(rf"\b{re.escape(p)}\b", text)]
 
 
 def faults(name: str) -> list[str]:
-    """What the docstrings of a public name, and of its methods, lack."""
+    """Gaps in the docstrings of a public name and of its methods."""
     public = getattr(tofuse, name)
     text = inspect.getdoc(public) or ""
     if not text.strip():
         return [f"{name} has no docstring"]
     if not inspect.isclass(public):
-        return [f"{name}: {p}" for p in unnamed(public, text)]
+        return [f"{name}: {p}" for p in undocumented(public, text)]
     # Fields are described by the class that declares them, arguments by `__init__` as well.
     bases = [kind for kind in public.__mro__ if kind.__module__.startswith("tofuse.")]
     text = " ".join(kind.__doc__ or "" for kind in bases)
@@ -53,12 +53,12 @@ def faults(name: str) -> list[str]:
     )
     found = []
     if public.__init__ is not object.__init__ and not issubclass(public, BaseException):
-        found = [f"{name}: {p}" for p in unnamed(public.__init__, text)]
+        found = [f"{name}: {p}" for p in undocumented(public.__init__, text)]
     for method, function in methods(public):
         words = inspect.getdoc(function) or ""
         if not words.strip():
             found.append(f"{name}.{method} has no docstring")
-        found += [f"{name}.{method}: {p}" for p in unnamed(function, words)]
+        found += [f"{name}.{method}: {p}" for p in undocumented(function, words)]
     return found
 
 
@@ -67,9 +67,9 @@ def test_docstrings_name_every_parameter(name: str) -> None:
     assert faults(name) == []
 
 
-def test_a_parameter_that_is_not_named_is_found() -> None:
+def test_undocumented_parameter_is_detected() -> None:
     def scaled(value: float, factor: float) -> float:
         """Multiply a value."""
         return value * factor
 
-    assert unnamed(scaled, scaled.__doc__ or "") == ["factor"]
+    assert undocumented(scaled, scaled.__doc__ or "") == ["factor"]

@@ -24,7 +24,7 @@ def recordings(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_lines_are_paths_and_globs_from_the_folder_of_the_list(recordings: Path) -> None:
+def test_list_lines_are_relative_paths_and_globs(recordings: Path) -> None:
     found = jobs_of(
         recordings, "# two\na/frames*   # of a\n\nb/frames9\n/x/y z.bag\nc#1/recording\n"
     )
@@ -38,17 +38,17 @@ def test_lines_are_paths_and_globs_from_the_folder_of_the_list(recordings: Path)
     assert all(job.arguments == () for job in found)
 
 
-def test_a_recording_of_two_patterns_is_taken_once(recordings: Path) -> None:
+def test_recording_matched_twice_is_listed_once(recordings: Path) -> None:
     found = jobs_of(recordings, "a/*\n*/frames9\n")
     assert [job.name for job in found] == ["frames9", "frames10", "b-frames9"]
 
 
-def test_names_stay_when_a_list_grows(recordings: Path) -> None:
+def test_names_are_stable_when_list_grows(recordings: Path) -> None:
     before = jobs_of(recordings, "a/frames9\n")
     assert jobs_of(recordings, "a/frames9\nb/frames9\n")[0] == before[0]
 
 
-def test_names_are_told_apart_in_any_case(tmp_path: Path) -> None:
+def test_names_are_unique_ignoring_case(tmp_path: Path) -> None:
     found = jobs_of(tmp_path, "/One\n/one\n/jobs\n/batch.csv\n/..hidden\n/con:x\n")
     names = [job.name for job in found]
     assert len({name.lower() for name in names}) == len(names)
@@ -70,21 +70,21 @@ def test_names_are_told_apart_in_any_case(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_tables_have_options(name: str, text: str, recordings: Path) -> None:
+def test_tables_set_options_per_job(name: str, text: str, recordings: Path) -> None:
     one, other = jobs_of(recordings, text, name)
     assert set(one.arguments) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
     assert (one.name, one.memory) == ("frames9", None)
     assert other == Job("far", one.recording, ("--max-depth=4.5",), 2_000_000_000)
 
 
-def test_all_jobs_of_a_toml_can_share_options(recordings: Path) -> None:
+def test_toml_jobs_share_options(recordings: Path) -> None:
     text = '[all]\nevery = 2\nseed = 1\n[[job]]\nrecording = "a/*"\nseed = 3\n'
     found = jobs_of(recordings, text, "list.toml")
     assert [job.arguments for job in found] == [("--every=2", "--seed=3")] * 2
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("list.txt", "# nothing\n", "lists no recording"),
         ("list.txt", "a/nothing*\n", "line 1: nothing matches a/nothing*"),
@@ -110,14 +110,14 @@ def test_all_jobs_of_a_toml_can_share_options(recordings: Path) -> None:
         ("list.toml", "[[job\n", "is not TOML"),
     ],
 )  # fmt: skip
-def test_bad_lists_are_refused(name: str, text: str, said: str, recordings: Path) -> None:
+def test_invalid_lists_are_rejected(name: str, text: str, message: str, recordings: Path) -> None:
     with pytest.raises(InputError) as caught:
         jobs_of(recordings, text, name)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).startswith(str(recordings / name))
 
 
-def test_unreadable_lists_are_refused(tmp_path: Path) -> None:
+def test_unreadable_lists_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="doesn't exist"):
         read_jobs(tmp_path / "none.txt", run_arguments)
     with pytest.raises(InputError, match="is a folder"):
@@ -127,7 +127,7 @@ def test_unreadable_lists_are_refused(tmp_path: Path) -> None:
         read_jobs(tmp_path / "list.txt", run_arguments)
 
 
-def test_a_key_tells_recordings_and_options_apart(tmp_path: Path) -> None:
+def test_job_key_depends_on_recording_and_options(tmp_path: Path) -> None:
     out = tmp_path / "out"
     bag, other = tmp_path / "one.bag", tmp_path / "two.bag"
     for path in (bag, other):
@@ -159,11 +159,11 @@ def test_a_key_tells_recordings_and_options_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "size"), [("4GB", 4_000_000_000), ("1.5 mb", 1_500_000), ("2GiB", 2 << 30), ("7", 7)]
 )
-def test_amounts_of_memory(text: str, size: int) -> None:
+def test_memory_sizes_are_parsed(text: str, size: int) -> None:
     assert parse_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1GB", "4 PB", "nan", "1e3", "9" * 400 + "GB"])
-def test_no_amounts_of_memory(text: str) -> None:
+def test_invalid_memory_sizes_are_rejected(text: str) -> None:
     with pytest.raises(ValueError, match="not an amount of memory"):
         parse_bytes(text)

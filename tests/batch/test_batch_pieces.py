@@ -27,7 +27,7 @@ from tofuse.batch.pieces import DaskExecutor
 
 
 @pytest.fixture(scope="module")
-def measured() -> Iterator:
+def batch_benchmark() -> Iterator:
     """The benchmark, which starts clusters and compares results."""
     pytest.importorskip("psutil")
     with pytest.MonkeyPatch.context() as patch:
@@ -35,7 +35,7 @@ def measured() -> Iterator:
         # Workers look up the functions of this module by their names.
         known = [str(Path(__file__).parent), str(HELPERS), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(known))
-        # Not the half minute that a scheduler waits for the connection to a killed worker.
+        # Shorter than the half minute that a scheduler waits for a killed worker to connect.
         patch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
         import batch
 
@@ -43,9 +43,9 @@ def measured() -> Iterator:
 
 
 @pytest.fixture(scope="module")
-def cluster(measured) -> Iterator[str]:
+def cluster(batch_benchmark) -> Iterator[str]:
     """The address of a cluster of two workers."""
-    with measured.local_cluster(2) as (address, _):
+    with batch_benchmark.local_cluster(2) as (address, _):
         yield address
 
 
@@ -60,8 +60,8 @@ def failing(k: int) -> int:
     raise ValueError(f"piece {k}")
 
 
-def test_a_run_on_a_cluster_gives_the_same_bytes(
-    measured, cluster: str, tmp_path: Path, monkeypatch
+def test_cluster_run_gives_same_bytes(
+    batch_benchmark, cluster: str, tmp_path: Path, monkeypatch
 ) -> None:
     from tofuse.lab.simulation.effects import Effects
     from tofuse.lab.simulation.record import simulate
@@ -80,29 +80,31 @@ def test_a_run_on_a_cluster_gives_the_same_bytes(
     assert main([*words, "--out", str(tmp_path / "here")]) == 0
     assert main([*words, "--out", str(tmp_path / "there"), "--scheduler", cluster]) == 0
     assert there == [3]  # submaps
-    assert measured.contents(tmp_path / "here") == measured.contents(tmp_path / "there")
+    assert batch_benchmark.contents(tmp_path / "here") == batch_benchmark.contents(
+        tmp_path / "there"
+    )
 
 
-def test_submaps_on_a_cluster_are_refined_to_the_same_bits(cluster: str) -> None:
+def test_cluster_refinement_is_bit_identical(cluster: str) -> None:
     truth = path(30)
     views, start = surfaces(truth, noise=0.005), drifted(truth)
     here = refined(Joint(submap=10), views, start)
-    told: list[str] = []
-    there = DaskExecutor(cluster, told.append)
+    messages: list[str] = []
+    there = DaskExecutor(cluster, messages.append)
     with using_executor(there):
         assert executor() is there
         found = refined(Joint(submap=10), views, start)
     there.close()
     assert isinstance(executor(), LocalExecutor)
     assert there.n_remote == 3
-    assert not told
+    assert not messages
     np.testing.assert_array_equal(found.poses, here.poses)
     assert found.support == here.support
     for a, b in zip(found.edges, here.edges, strict=True):
         np.testing.assert_array_equal(a.information, b.information)
 
 
-def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> None:  # noqa: F811
+def test_cluster_loop_search_is_bit_identical(cluster: str, turn) -> None:  # noqa: F811
     frames, _, start = turn
     options = Revisits(overlap=0.15)
     here = pushed(options, frames, start)
@@ -117,13 +119,13 @@ def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> No
         np.testing.assert_array_equal(a.information, b.information)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
-def test_a_killed_worker_loses_nothing(cluster: str) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_killed_worker_loses_no_results(cluster: str) -> None:
     there = DaskExecutor(cluster, lambda text: None)
     killed: set[int] = set()
 
     def arguments(k: int) -> tuple[int]:
-        if k == 12 and not killed:  # some pieces are being done
+        if k == 12 and not killed:  # some pieces are in progress
             pids = there._client.run(os.getpid)
             killed.add(next(iter(pids.values())))
             os.kill(next(iter(killed)), signal.SIGKILL)
@@ -135,21 +137,21 @@ def test_a_killed_worker_loses_nothing(cluster: str) -> None:
     assert [square for square, _ in found] == [k * k for k in range(40)]
 
 
-def test_an_error_of_a_piece_is_told_as_if_it_had_been_done_here(cluster) -> None:
-    told: list[str] = []
-    there = DaskExecutor(cluster, told.append)
+def test_worker_error_is_raised_as_in_local_run(cluster) -> None:
+    messages: list[str] = []
+    there = DaskExecutor(cluster, messages.append)
     with pytest.raises(ValueError, match="piece 0"):
         there.map(failing, 3, lambda k: (k,))
     there.close()
-    assert told == [
+    assert messages == [
         f"{cluster}: a worker failed (piece 0); the rest of the run is done on this machine"
     ]
 
 
-def test_a_scheduler_that_goes_away_is_told_once_and_the_rest_done_here(measured) -> None:
-    told: list[str] = []
-    with measured.local_cluster(1) as (address, _):
-        there = DaskExecutor(address, told.append)
+def test_lost_scheduler_falls_back_to_local_execution(batch_benchmark) -> None:
+    messages: list[str] = []
+    with batch_benchmark.local_cluster(1) as (address, _):
+        there = DaskExecutor(address, messages.append)
         some = there.map(slowly_squared, 3, lambda k: (k,))
         assert os.getpid() not in {pid for _, pid in some}
     rest = there.map(slowly_squared, 5, lambda k: (k,))
@@ -158,19 +160,19 @@ def test_a_scheduler_that_goes_away_is_told_once_and_the_rest_done_here(measured
     there.map(slowly_squared, 2, lambda k: (k,))
     there.close()
     gone = f"{address}: the scheduler disappeared; the rest of the run is done on this machine"
-    assert told == [gone]
+    assert messages == [gone]
 
 
-def test_workers_that_would_give_other_results_are_refused(
-    measured, room_recording, tmp_path, monkeypatch, capsys, cluster
+def test_workers_of_other_versions_are_rejected(
+    batch_benchmark, room_recording, tmp_path, monkeypatch, capsys, cluster
 ) -> None:
     monkeypatch.setattr(pieces, "_program", lambda: ("tofuse 0.0", "numpy 1"))
     words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--scheduler", cluster]
     monkeypatch.setattr(DaskExecutor, "_check_workers", _checked_against(pieces._program()))
     assert main(words) == 2
-    said = capsys.readouterr().err
-    assert "results would differ: install the same versions there" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "results would differ: install the same versions there" in output
+    assert output.count("\n") == 1
 
 
 def _checked_against(mine):
@@ -183,13 +185,13 @@ def _checked_against(mine):
     return check
 
 
-def test_a_scheduler_that_is_not_there_is_told(
+def test_unreachable_scheduler_is_reported(
     room_recording: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     monkeypatch.setattr(client, "TIMEOUT_S", 1.0)
     words = ["run", str(room_recording), "--out", str(tmp_path / "out")]
     assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("tofuse: tcp://127.0.0.1:1: no Dask scheduler answers; start one")
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("tofuse: tcp://127.0.0.1:1: no Dask scheduler answers; start one")
+    assert output.count("\n") == 1
     assert not (tmp_path / "out").exists()

@@ -20,16 +20,16 @@ from paths import BENCHMARKS
 from tofuse.batch import client
 from tofuse.cli import main
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 JOBS = [f"seed-{k}" for k in range(3)]
 WORDS = ("--every", "4", "--threads", "1")
 
 
 @pytest.fixture
-def measured(monkeypatch) -> ModuleType:
+def batch_benchmark(monkeypatch) -> ModuleType:
     """The benchmark, which starts clusters, kills their workers and compares results."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    # Not the half minute for which a connection to a scheduler or worker that is gone is tried.
+    # Shorter than the half minute for which a lost scheduler or worker is retried.
     monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
     pytest.importorskip("psutil")
     import batch
@@ -47,9 +47,9 @@ def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.fixture(scope="module")
-def alone(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `tofuse run` gives of each of them."""
-    out = tmp_path_factory.mktemp("alone")
+def single_runs(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of `tofuse run` for each of them."""
+    out = tmp_path_factory.mktemp("single_runs")
     for k, name in enumerate(JOBS):
         words = ("--out", out / name, "--seed", k, *WORDS)
         assert main(["run", str(room_recording), *map(str, words)]) == 0
@@ -67,9 +67,11 @@ def records(out: Path) -> list[dict[str, object]]:
     return [json.loads(path.read_text()) for path in sorted((out / "jobs").glob("*.json"))]
 
 
-def same(measured: ModuleType, alone: Path, out: Path) -> bool:
+def same(batch_benchmark: ModuleType, single_runs: Path, out: Path) -> bool:
     assert states(out) == dict.fromkeys(JOBS, "done")
-    return measured.same_results([Path(name) for name in JOBS], alone, out) == len(JOBS)
+    return batch_benchmark.same_results([Path(name) for name in JOBS], single_runs, out) == len(
+        JOBS
+    )
 
 
 def wait_until(happened: Callable[[], object], seconds: float = 120) -> None:
@@ -83,7 +85,7 @@ def running(out: Path) -> bool:
     return (out / "jobs").is_dir() and any(r["state"] == "running" for r in records(out))
 
 
-def test_bad_recordings_cost_nobody_else(room_recording: Path, tmp_path: Path, capsys) -> None:
+def test_bad_recordings_do_not_stop_batch(room_recording: Path, tmp_path: Path, capsys) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "camera.json").write_text("{")
@@ -91,17 +93,17 @@ def test_bad_recordings_cost_nobody_else(room_recording: Path, tmp_path: Path, c
     out = tmp_path / "out"
     words = ["batch", str(tmp_path / "list.txt"), "--out", str(out), "--workers", "2"]
     assert main([*words, "--only", "nothing"]) == 2
-    said = capsys.readouterr().err
-    assert "none of 1 recordings gave a result; nothing: " in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "none of 1 recordings gave a result; nothing: " in output
+    assert output.count("\n") == 1
     assert main([*words, "--print-jobs"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [shlex.split(line)[-1] for line in lines] == ["nothing", "broken", room_recording.name]
 
     assert main(words) == 3
-    said = capsys.readouterr().out
-    assert said.startswith("1 of 3 recordings have a result: ")
-    assert f"nothing: {tmp_path / 'nothing'}: doesn't exist" in said
+    output = capsys.readouterr().out
+    assert output.startswith("1 of 3 recordings have a result: ")
+    assert f"nothing: {tmp_path / 'nothing'}: doesn't exist" in output
     assert states(out) == {"nothing": "failed", "broken": "failed", room_recording.name: "done"}
     page = (out / "batch.html").read_text()
     assert f'<img src="jobs/{room_recording.name}.jpg"' in page
@@ -111,46 +113,46 @@ def test_bad_recordings_cost_nobody_else(room_recording: Path, tmp_path: Path, c
     assert made["peak_bytes"] > 50_000_000
 
     before = (out / room_recording.name / "run.json").stat().st_mtime_ns
-    assert main([*words, "--json"]) == 3  # only what failed is tried again
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert {e["name"] for e in told if e["event"] == "job"} == {"nothing", "broken"}
-    assert told[-1] == {
+    assert main([*words, "--json"]) == 3  # only failed jobs are retried
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {e["name"] for e in events if e["event"] == "job"} == {"nothing", "broken"}
+    assert events[-1] == {
         "event": "result", "out": str(out), "jobs": 3, "done": 1, "failed": 2,
         "verdicts": {made["verdict"]: 1},
     }  # fmt: skip
     assert (out / room_recording.name / "run.json").stat().st_mtime_ns == before
 
 
-def test_killed_jobs_and_a_killed_batch_lose_nothing(
-    measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+def test_killed_jobs_and_batch_are_resumed(
+    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     words = ("--workers", 2, "--retries", 10)
-    batch = measured.start_batch(listed, out, *words)
-    pids = lambda: measured.children(batch.pid)  # noqa: E731
-    assert measured.kill_often(batch, pids, 4, 0.5, seed=3) == 4
+    batch = batch_benchmark.start_batch(listed, out, *words)
+    pids = lambda: batch_benchmark.children(batch.pid)  # noqa: E731
+    assert batch_benchmark.kill_often(batch, pids, 4, 0.5, seed=3) == 4
     wait_until(pids)
     jobs = pids()
     batch.kill()
     batch.communicate()
-    # Nobody asks for what they do any more.
+    # Jobs whose batch is gone must end.
     wait_until(lambda: not any(Path(f"/proc/{pid}/exe").exists() for pid in jobs), 20)
-    measured.finish(measured.start_batch(listed, out, *words))
-    assert same(measured, alone, out)
+    batch_benchmark.finish(batch_benchmark.start_batch(listed, out, *words))
+    assert same(batch_benchmark, single_runs, out)
     assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
-def test_an_interrupted_batch_says_what_is_done(
-    measured: ModuleType, listed: Path, tmp_path: Path
+def test_interrupted_batch_reports_progress(
+    batch_benchmark: ModuleType, listed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    batch = measured.start_batch(listed, out)
+    batch = batch_benchmark.start_batch(listed, out)
     wait_until(lambda: running(out))
     batch.send_signal(signal.SIGINT)
-    _, said = batch.communicate(timeout=60)
+    _, output = batch.communicate(timeout=60)
     assert batch.returncode == 130
     assert (
-        said
+        output
         == "tofuse: interrupted, 0 of 3 recordings are done; run the same command again to resume\n"
     )
 
@@ -158,47 +160,47 @@ def test_an_interrupted_batch_says_what_is_done(
 Started = AbstractContextManager[tuple[str, Callable[[], list[int]]]]
 
 
-def begun(measured: ModuleType, kind: str, folder: Path) -> Started:
+def started_cluster(batch_benchmark: ModuleType, kind: str, folder: Path) -> Started:
     """A Dask cluster of two workers."""
     if kind == "LocalCluster":
-        return measured.local_cluster(2)
-    return measured.own_processes(2, folder)
+        return batch_benchmark.local_cluster(2)
+    return batch_benchmark.own_processes(2, folder)
 
 
 @pytest.mark.parametrize("kind", ["LocalCluster", "own processes"])
-def test_workers_of_dask_that_are_killed_lose_nothing(
-    kind: str, measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+def test_killed_dask_workers_lose_no_results(
+    kind: str, batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     out = tmp_path / "out"
-    with begun(measured, kind, tmp_path / "dask") as (address, pids):
-        batch = measured.start_batch(listed, out, "--scheduler", address, "--retries", 10)
-        assert measured.kill_often(batch, pids, 2, 0.5, seed=4) == 2
-        measured.finish(batch)
-    assert same(measured, alone, out)
+    with started_cluster(batch_benchmark, kind, tmp_path / "dask") as (address, pids):
+        batch = batch_benchmark.start_batch(listed, out, "--scheduler", address, "--retries", 10)
+        assert batch_benchmark.kill_often(batch, pids, 2, 0.5, seed=4) == 2
+        batch_benchmark.finish(batch)
+    assert same(batch_benchmark, single_runs, out)
 
 
-def test_a_scheduler_that_goes_away_loses_nothing(
-    measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
+def test_batch_resumes_after_lost_scheduler(
+    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     out = tmp_path / "out"
-    with measured.own_processes(2, tmp_path / "dask") as (address, _):
-        batch = measured.start_batch(listed, out, "--scheduler", address)
+    with batch_benchmark.own_processes(2, tmp_path / "dask") as (address, _):
+        batch = batch_benchmark.start_batch(listed, out, "--scheduler", address)
         wait_until(lambda: "done" in states(out).values() if out.is_dir() else False)
-    _, said = batch.communicate(timeout=60)
+    _, output = batch.communicate(timeout=60)
     assert batch.returncode == 3
-    assert said == (
+    assert output == (
         f"tofuse: {address}: the scheduler disappeared; restart it, and run the same command again "
         "to resume\n"
     )
-    with measured.own_processes(2, tmp_path / "dask"):
+    with batch_benchmark.own_processes(2, tmp_path / "dask"):
         words = ("--scheduler", tmp_path / "dask" / "scheduler.json")
-        measured.finish(measured.start_batch(listed, out, *words))
-    assert same(measured, alone, out)
+        batch_benchmark.finish(batch_benchmark.start_batch(listed, out, *words))
+    assert same(batch_benchmark, single_runs, out)
 
 
-def test_a_scheduler_that_is_not_there_is_told(
+def test_unreachable_scheduler_is_reported(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
@@ -206,32 +208,32 @@ def test_a_scheduler_that_is_not_there_is_told(
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
         words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
         assert main(words) == 2
-        said = capsys.readouterr().err
-        assert said.startswith(f"tofuse: {address}: no Dask scheduler answers; start one")
-        assert said.count("\n") == 1
+        output = capsys.readouterr().err
+        assert output.startswith(f"tofuse: {address}: no Dask scheduler answers; start one")
+        assert output.count("\n") == 1
     words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
     assert main(words) == 2
     assert "is not a file of a Dask scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_workers_without_tofuse_are_told(
-    measured: ModuleType, listed: Path, tmp_path: Path, monkeypatch
+def test_workers_without_tofuse_are_reported(
+    batch_benchmark: ModuleType, listed: Path, tmp_path: Path, monkeypatch
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['tofuse'] = None\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with measured.own_processes(1, tmp_path / "dask") as (address, _):
+    with batch_benchmark.own_processes(1, tmp_path / "dask") as (address, _):
         monkeypatch.undo()
         monkeypatch.syspath_prepend(str(BENCHMARKS))
-        batch = measured.start_batch(listed, tmp_path / "out", "--scheduler", address)
-        _, said = batch.communicate(timeout=120)
-    assert batch.returncode == 2, said
-    assert "install this version of tofuse on its scheduler and its workers" in said
-    assert said.count("\n") == 1
+        batch = batch_benchmark.start_batch(listed, tmp_path / "out", "--scheduler", address)
+        _, output = batch.communicate(timeout=120)
+    assert batch.returncode == 2, output
+    assert "install this version of tofuse on its scheduler and its workers" in output
+    assert output.count("\n") == 1
 
 
-def test_a_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:
+def test_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:
     words = [str(tmp_path / "a.jpg"), str(room_recording), "--out", str(tmp_path / "out")]
     job = subprocess.Popen([sys.executable, "-m", "tofuse.cli.job", *words], stdin=subprocess.PIPE)
     assert job.stdin is not None

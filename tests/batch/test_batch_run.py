@@ -53,7 +53,7 @@ def cancelled(task: Task) -> Record:
 
 
 class Scripted(Workers):
-    """Follow the script for the next start of a job, else finish it; one at a time."""
+    """Return the scripted outcome of the next start of a job, or finish it; one job at a time."""
 
     def __init__(self, script: dict[str, Sequence[Outcome]] | None = None) -> None:
         self.script = {name: list(steps) for name, steps in (script or {}).items()}
@@ -80,7 +80,7 @@ class Scripted(Workers):
         return future
 
     def lost(self) -> InputError | None:
-        self.busy = False  # the loop has heard of it when it asks this
+        self.busy = False  # the loop asks this after it has received the outcome
         return self.gone
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ def table(folder: BatchFolder) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_what_was_killed_is_begun_again(folder: BatchFolder) -> None:
+def test_killed_job_is_restarted(folder: BatchFolder) -> None:
     workers = Scripted({"a": [killed, killed, done]})
     notes = run(folder, workers)
     assert sorted(workers.started) == ["a", "a", "a", "b", "c"]
@@ -116,7 +116,7 @@ def test_what_was_killed_is_begun_again(folder: BatchFolder) -> None:
     assert status_of(JOBS, folder) == 0
 
 
-def test_what_is_killed_each_time_is_given_up(folder: BatchFolder) -> None:
+def test_repeatedly_killed_job_fails(folder: BatchFolder) -> None:
     workers = Scripted({"a": [killed] * 9})
     run(folder, workers)
     assert workers.started.count("a") == 3
@@ -125,7 +125,7 @@ def test_what_is_killed_each_time_is_given_up(folder: BatchFolder) -> None:
     assert status_of(JOBS, folder) == 3
 
 
-def test_what_fails_costs_nobody_else(folder: BatchFolder) -> None:
+def test_failed_job_does_not_stop_others(folder: BatchFolder) -> None:
     workers = Scripted({"b": [failed]})
     run(folder, workers)
     assert workers.started.count("b") == 1
@@ -139,12 +139,12 @@ def test_what_fails_costs_nobody_else(folder: BatchFolder) -> None:
     assert status_of(JOBS, folder) == 0
 
 
-def test_frames_without_a_pose_are_told(folder: BatchFolder) -> None:
+def test_degraded_job_sets_exit_status(folder: BatchFolder) -> None:
     run(folder, Scripted({"c": [lambda task: done(task, "degraded", status=3)]}))
     assert status_of(JOBS, folder) == 3
 
 
-def test_workers_that_go_away_lose_nothing(folder: BatchFolder, monkeypatch) -> None:
+def test_batch_resumes_after_lost_workers(folder: BatchFolder, monkeypatch) -> None:
     workers = Scripted({"b": [cancelled], "c": [cancelled]})
     monkeypatch.setattr(workers, "accepts", lambda _: True)  # all at once
     workers.gone = InputError("the scheduler went away")
@@ -156,18 +156,18 @@ def test_workers_that_go_away_lose_nothing(folder: BatchFolder, monkeypatch) -> 
     assert again.started == ["b", "c"]
 
 
-def test_a_task_that_was_cancelled_is_handed_over_again(folder: BatchFolder) -> None:
+def test_cancelled_task_is_resubmitted(folder: BatchFolder) -> None:
     workers = Scripted({"b": [cancelled]})
     run(folder, workers)
     assert workers.started == ["a", "b", "c", "b"]
 
 
-def test_a_worker_that_could_not_write_leaves_a_row(folder: BatchFolder) -> None:
+def test_unwritten_record_is_listed(folder: BatchFolder) -> None:
     run(folder, Scripted({"a": [lambda _: Record("", "failed", reason="it does not see /out")]}))
     assert table(folder)[0]["reason"] == "it does not see /out"
 
 
-def test_the_table_grows(folder: BatchFolder) -> None:
+def test_table_is_updated_after_each_job(folder: BatchFolder) -> None:
     seen: list[int] = []
     run(folder, Scripted(), ended=lambda *_: seen.append(len(table(folder))))
     assert seen == [1, 2, 3]
@@ -177,13 +177,13 @@ def test_the_table_grows(folder: BatchFolder) -> None:
     assert (row["recording"], row["verdict"], row["seconds"]) == ("/a", "good", "1.5")
 
 
-def test_the_page_is_made_anew_while_jobs_are_to_come(folder: BatchFolder) -> None:
+def test_page_refreshes_while_jobs_are_pending(folder: BatchFolder) -> None:
     pages: list[str] = []
     run(folder, Scripted(), ended=lambda *_: pages.append(folder.html.read_text()))
     assert ['http-equiv="refresh"' in page for page in pages] == [True, True, False]
 
 
-def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> None:
+def test_waiting_for_workers_is_reported_once(folder: BatchFolder, monkeypatch) -> None:
     monkeypatch.setattr(loop, "_NO_WORKER_S", 0.0)
     monkeypatch.setattr(loop, "_POLL_S", 0.001)
     workers = Scripted()
@@ -197,7 +197,7 @@ def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> N
     assert run(folder, workers) == ["no worker is available for a: waiting for one"]
 
 
-def test_other_options_need_overwrite(folder: BatchFolder) -> None:
+def test_changed_options_need_overwrite(folder: BatchFolder) -> None:
     run(folder, Scripted())
     changed = (replace(JOBS[0], arguments=("--every=2",)), *JOBS[1:])
     with pytest.raises(OutputError, match="of another recording, or of other options"):
@@ -207,10 +207,10 @@ def test_other_options_need_overwrite(folder: BatchFolder) -> None:
     assert workers.started == ["a"]
 
 
-def test_a_result_of_somebody_else_is_not_replaced(folder: BatchFolder) -> None:
+def test_foreign_result_is_not_replaced(folder: BatchFolder) -> None:
     strange = folder.result(JOBS[0])
     strange.mkdir()
-    (strange / ".tofuse-unfinished").mkdir()  # of a run that was killed
+    (strange / ".tofuse-unfinished").mkdir()  # from a killed run
     assert pending(JOBS, folder, overwrite=False) == list(JOBS)
     (strange / "run.json").write_text("{}")
     with pytest.raises(OutputError, match="pass --overwrite"):
@@ -220,21 +220,21 @@ def test_a_result_of_somebody_else_is_not_replaced(folder: BatchFolder) -> None:
 @pytest.mark.parametrize(
     "damage", ["{", "[]", "null", '{"key": "", "state": "odd"}', '{"key": 1, "state": "done"}']
 )
-def test_a_damaged_record_counts_for_nothing(damage: str, folder: BatchFolder) -> None:
+def test_damaged_record_is_ignored(damage: str, folder: BatchFolder) -> None:
     run(folder, Scripted())
     (folder.jobs / "a.json").write_text(damage)
     assert folder.record(JOBS[0]) is None
     assert pending(JOBS, folder, overwrite=True) == [JOBS[0]]
 
 
-def test_a_result_that_was_changed_is_made_anew(folder: BatchFolder) -> None:
+def test_changed_result_is_recomputed(folder: BatchFolder) -> None:
     run(folder, Scripted())
     (folder.result(JOBS[0]) / "run.json").write_text("{}")
     (folder.result(JOBS[1]) / "run.json").unlink()
     assert pending(JOBS, folder, overwrite=False) == list(JOBS[:2])
 
 
-def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
+def test_foreign_folder_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(OutputError, match="contains no earlier batch"):
         BatchFolder(tmp_path).prepare()
@@ -243,7 +243,7 @@ def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
         BatchFolder(tmp_path / "note.txt").prepare()
 
 
-def test_what_others_say_can_not_break_the_page(folder: BatchFolder) -> None:
+def test_page_escapes_html(folder: BatchFolder) -> None:
     job = Job("a", "/<script>alert(1)</script>", ("--topic=<b>",))
     record = Record("", "failed", reason='<img src=x onerror="alert(1)">, "x"\n=1')
     folder.write(job, record)
@@ -256,7 +256,7 @@ def test_what_others_say_can_not_break_the_page(folder: BatchFolder) -> None:
     assert (row["recording"], row["reason"]) == (job.recording, record.reason)
 
 
-def test_a_full_disk_is_told_in_a_line(folder: BatchFolder, monkeypatch) -> None:
+def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
     def full(*_args: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -265,7 +265,7 @@ def test_a_full_disk_is_told_in_a_line(folder: BatchFolder, monkeypatch) -> None
         run(folder, Scripted())
 
 
-def test_memory_limits_how_many_go_on(monkeypatch) -> None:
+def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
     monkeypatch.setattr("tofuse.batch.workers.machine_memory", lambda: 100)
     workers = LocalWorkers(4)
     try:
@@ -283,7 +283,7 @@ def test_memory_limits_how_many_go_on(monkeypatch) -> None:
         workers.close()
 
 
-def test_memory_is_a_resource_of_dask(monkeypatch) -> None:
+def test_dask_memory_resource_limits_concurrency(monkeypatch) -> None:
     there = [{"nthreads": 4, "resources": {"memory": 200.0}}, {"nthreads": 2, "resources": {}}]
     workers = object.__new__(DaskWorkers)
     workers._address, workers._running, workers._looked = "tcp://there", set(), -10.0
@@ -300,7 +300,7 @@ def test_memory_is_a_resource_of_dask(monkeypatch) -> None:
         at_a_time[job.memory] = len(workers._running)
     assert at_a_time == {None: 6, 100: 2, 201: 0}
     there.clear()
-    workers.check(large)  # some may come
+    workers.check(large)  # suitable workers may join later
 
 
 class Remote:
@@ -318,7 +318,7 @@ class Remote:
         return self.outcome
 
 
-def test_what_dask_says_is_understood() -> None:
+def test_dask_outcomes_are_translated() -> None:
     scheduler = pytest.importorskip("distributed.scheduler", reason="Dask is not installed")
     workers = object.__new__(DaskWorkers)
     workers._address = "tcp://there"
@@ -344,23 +344,23 @@ def test_what_dask_says_is_understood() -> None:
     bug = ZeroDivisionError()
     assert handed("error", bug).exception() is bug
     assert handed("cancelled").cancelled()
-    # The scheduler went away between two questions.
+    # The scheduler disappeared between two calls.
     assert handed("finished", OSError("gone")).cancelled()
 
 
-def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_missing_dask_is_reported(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(__import__("sys").modules, "dask", None)
     (tmp_path / "list.txt").write_text("/a\n")
     words = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out")]
     assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
-    said = capsys.readouterr().err
-    assert "pip install 'tofuse[dask]'" in said
-    assert said.count("\n") == 1
+    text = capsys.readouterr().err
+    assert "pip install 'tofuse[dask]'" in text
+    assert text.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "text"),
     [
         (["--workers", "0"], "'0' is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
@@ -369,7 +369,7 @@ def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],
 )
-def test_bad_words_are_told_in_a_line(words, said, tmp_path: Path, capsys) -> None:
+def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> None:
     (tmp_path / "list.txt").write_text("/a\n")
     line = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), *words]
     try:
@@ -378,14 +378,14 @@ def test_bad_words_are_told_in_a_line(words, said, tmp_path: Path, capsys) -> No
         status = end.code
     assert status == 2
     found = capsys.readouterr().err
-    assert said in found
+    assert text in found
     assert found.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"),
+    ("seconds", "text"),
     [(4.21, "4.2 s"), (59.97, "1 min 0 s"), (200, "3 min 20 s"), (7500, "2 h 5 min")],
 )
-def test_durations(seconds: float, said: str) -> None:
-    assert duration(seconds) == said
+def test_durations_are_formatted(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

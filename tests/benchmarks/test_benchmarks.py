@@ -43,7 +43,7 @@ def scripts(monkeypatch):
 
 @pytest.fixture
 def small_room(scripts, tmp_path, monkeypatch):
-    """A recording of six views where the simulated room would be kept."""
+    """A recording of six views in place of the simulated room."""
     sequences, scaling = scripts["sequences"], scripts["scaling"]
     frames = scaling.made_frames(96, 6)
     monkeypatch.setattr(sequences, "OUT", tmp_path)
@@ -62,41 +62,41 @@ def small_room(scripts, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end", "offline_system"])
-def test_script_says_how_it_is_used(script):
+def test_script_prints_help(script):
     command = [sys.executable, str(BENCHMARKS / f"{script}.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "--threads" in done.stdout
 
 
-def test_whole_run_as_a_process(scripts, small_room):
+def test_end_to_end_run_is_measured(scripts, small_room):
     end_to_end = scripts["end_to_end"]
     room = small_room / "recordings" / "room"
     spent = end_to_end.tofuse_run(room, ["--end", "4"], 1)
     assert spent.frames == 4
     assert {"opening", "reading", "tracking", "fusion"} <= set(spent.stages)
     assert 0 < sum(spent.stages.values()) < spent.wall_s
-    assert spent.peak_mb > 50  # what it imports alone
+    assert spent.peak_mb > 50  # the imports alone
     lines = list(end_to_end.table([("tofuse run", [spent])]))
     assert f"{spent.ms_per_frame:.1f}" in lines[1]
     slow = dataclasses.replace(spent, stages={"tracking": 1.3, "loops": 0.01})
     stages = [line.split() for line in list(end_to_end.table([("tofuse run", [slow])]))[2:]]
     fraction = f"{1.3 / slow.wall_s:.0%}"
     assert stages[0] == ["tracking", "1.3", "325.0", fraction]  # ms of each of 4 frames
-    assert "loops" not in [line[0] for line in stages]  # hardly any time
+    assert "loops" not in [line[0] for line in stages]  # negligible time
     with pytest.raises(RuntimeError, match=r"nothing: doesn.t exist"):
         end_to_end.tofuse_run(room / "nothing", [], 1)
 
 
-def test_tracking_without_peers(scripts, small_room, tmp_path, monkeypatch, capsys):
+def test_tracking_benchmark_runs_without_peers(scripts, small_room, tmp_path, monkeypatch, capsys):
     tracking = scripts["tracking"]
     for name in ("open3d", "small_gicp", "kiss_icp"):
         monkeypatch.setitem(sys.modules, name, None)
-    # What it does to the process must not reach the other tests.
+    # Must not limit the threads of other tests.
     monkeypatch.setattr(tracking, "limit_threads", lambda count: None)
     out = tmp_path / "out"
     tracking.main(["--sequences", "room", "--threads", "1", "--out", str(out)])
 
-    assert capsys.readouterr().out.count("not installed") >= 10  # told at once, and in the table
+    assert capsys.readouterr().out.count("not installed") >= 10  # printed at once, and in the table
     found = json.loads((out / "tracking.json").read_text())["sequences"]
     (rows,) = found.values()
     by_name = {row["method"]: row for row in rows}
@@ -114,14 +114,14 @@ def test_tracking_without_peers(scripts, small_room, tmp_path, monkeypatch, caps
     assert (out / "tracking.png").stat().st_size > 1000
 
 
-def test_tracking_refuses_an_unknown_sequence(scripts, capsys):
+def test_tracking_rejects_unknown_sequence(scripts, capsys):
     with pytest.raises(SystemExit):
         scripts["tracking"].main(["--sequences", "garden"])
     assert "garden" in capsys.readouterr().err
 
 
 class _Drifting:
-    """A tracker that goes `error_m` too far with each frame."""
+    """A tracker whose drift grows by `error_m` times the square of the frame number."""
 
     tuning = ""
 
@@ -140,7 +140,7 @@ class _Drifting:
         return self.T
 
 
-def test_the_tuning_with_the_least_error_is_chosen(scripts, small_room):
+def test_best_tuning_is_chosen(scripts, small_room):
     sequence = scripts["sequences"].load("room", Path())
     still = np.tile(np.eye(4), (6, 1, 1))
     object.__setattr__(sequence, "reference", still)
@@ -151,7 +151,7 @@ def test_the_tuning_with_the_least_error_is_chosen(scripts, small_room):
     assert how == "best of 3 on 6 frames, cleaned"
 
 
-def test_the_fit_of_pairs_finds_a_logistic_model(scripts):
+def test_pair_fit_recovers_logistic_model(scripts):
     pairs = scripts["pairs"]
     rng = np.random.default_rng(0)
     x = np.column_stack([np.ones(4000), rng.uniform(0, 1, (4000, 2))])
@@ -163,14 +163,14 @@ def test_the_fit_of_pairs_finds_a_logistic_model(scripts):
     assert pairs.roc_area(known.astype(float), known) == 1
 
 
-def test_pairs_are_spread_over_the_recording(scripts):
+def test_pairs_are_spread_over_recording(scripts):
     chosen = scripts["pairs"].chosen
     assert chosen(10, 3, 3) == [(0, 3), (3, 6), (6, 9)]
     assert chosen(4, 3, 8) == [(0, 3)]
     assert chosen(3, 3, 8) == []
 
 
-def test_peers_see_the_same_surface_without_distortion(scripts):
+def test_undistorted_images_show_same_surface(scripts):
     camera = BrownConrady(176, 144, 150.0, 150.0, 87.0, 71.0, k1=-0.2, k2=0.05)
     normal, distance = np.array([0.3, -0.2, 0.9]), 2.0
     rays = np.concatenate([camera.rays(), np.ones((144, 176, 1))], -1)
@@ -187,7 +187,7 @@ def test_peers_see_the_same_surface_without_distortion(scripts):
     assert np.abs(untouched.points @ normal - distance).max() > 0.03
 
 
-def test_poses_of_the_scanner_app_fit_its_images(scripts, shared_data):
+def test_scanner_app_poses_are_consistent_with_images(scripts, shared_data):
     sequence = scripts["sequences"].load("iphone", shared_data)
     assert len(sequence.frames) == 70
     found = map_consistency(sequence.checked, sequence.reference, 12)
@@ -197,7 +197,7 @@ def test_poses_of_the_scanner_app_fit_its_images(scripts, shared_data):
     assert not map_consistency(sequence.checked, flipped, 12).inlier_ratio > 0.5
 
 
-def test_the_made_room_is_one_room(scripts):
+def test_synthetic_room_is_consistent(scripts):
     scaling = scripts["scaling"]
     frames = scaling.made_frames(96, 20)
     T = se3.inverse(scaling.made_pose(0)) @ scaling.made_pose(19)
@@ -210,7 +210,7 @@ def test_the_made_room_is_one_room(scripts):
     assert np.median(np.abs(still)) > 0.05
 
 
-def test_scaling_runs_small(scripts, capsys, monkeypatch):
+def test_scaling_benchmark_runs(scripts, capsys, monkeypatch):
     scaling = scripts["scaling"]
     monkeypatch.setattr(scaling, "compilation", lambda: iter(["left out"]))
     monkeypatch.setattr(scaling, "BANDWIDTH_BYTES", 1 << 20)
@@ -221,7 +221,7 @@ def test_scaling_runs_small(scripts, capsys, monkeypatch):
     assert "outside of kernels" in text
 
 
-def test_frames_go_forth_and_back(scripts):
+def test_frames_run_forth_and_back(scripts):
     scaling = scripts["scaling"]
     frames = scaling.made_frames(48, 3)
     order = list(scaling.forth_and_back(frames, 7))
@@ -230,7 +230,7 @@ def test_frames_go_forth_and_back(scripts):
     assert order[4].depth is frames[0].depth
 
 
-def test_watched_kernels_count_the_bytes_of_their_arrays(scripts):
+def test_kernel_watch_counts_bytes(scripts):
     scaling = scripts["scaling"]
     frames = scaling.made_frames(48, 2)
     scaling.timed(scaling.tracker(48), iter(frames))
@@ -239,7 +239,7 @@ def test_watched_kernels_count_the_bytes_of_their_arrays(scripts):
         scaling.timed(scaling.tracker(48), iter(frames))
         assert steps.iterate_level is not before
     assert steps.iterate_level is before
-    # Every iteration goes over the source's rows (at most 16 floats a point) and the whole target.
+    # Every iteration reads the source's rows (at most 16 floats a point) and the whole target.
     found = spent["iterate_level"]
     assert found.calls >= 3  # levels
     source = 48 * 36 * 4 * 16
@@ -247,7 +247,7 @@ def test_watched_kernels_count_the_bytes_of_their_arrays(scripts):
     assert found.seconds > 0
 
 
-def test_graphs_with_false_loops_have_the_same_true_ones(scripts):
+def test_false_loops_leave_true_edges_unchanged(scripts):
     pose_graphs = scripts["pose_graphs"]
     clean, truth = pose_graphs.make_graph("walk", 1, 0.0)
     graph, _ = pose_graphs.make_graph("walk", 1, 0.3)
@@ -255,7 +255,7 @@ def test_graphs_with_false_loops_have_the_same_true_ones(scripts):
     np.testing.assert_array_equal(graph.measurements[:m], clean.measurements)
     false = len(graph.edges) - m
     assert false / graph.loop.sum() == pytest.approx(0.3, abs=0.01)
-    # Six degrees of freedom an edge, as the information says; false ones are gross.
+    # True edges have six degrees of freedom by their information; false ones are gross outliers.
     exact = graph.with_poses(truth)
     assert exact.chi2(np.arange(len(graph.edges)) < m) / m == pytest.approx(6, abs=1)
     assert exact.chi2(np.arange(len(graph.edges)) >= m) / false > 1000
@@ -263,7 +263,7 @@ def test_graphs_with_false_loops_have_the_same_true_ones(scripts):
     assert pose_graphs.ate(clean, truth) > 0.01
 
 
-def test_a_general_solver_comes_to_the_same_minimum(scripts):
+def test_general_solver_finds_same_minimum(scripts):
     pose_graphs = scripts["pose_graphs"]
     relative = se3.exp(np.tile([0.3, 0.0, 0.1, 0.02, 0.5, 0.1], (12, 1)))
     graph = chain(relative, [Measured(0, 12, np.eye(4), np.eye(6))])

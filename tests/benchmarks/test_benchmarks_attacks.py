@@ -32,7 +32,7 @@ def attacks(monkeypatch):
 
 
 def test_fuzzed_files_are_read_or_rejected(attacks, tmp_path: Path) -> None:
-    """Of every format that is registered, and of every function that reads files."""
+    """For every registered format and every function that reads files."""
     _, mutation = attacks
     called: set[CodeType] = set()
     formats = set()
@@ -78,7 +78,7 @@ def calls_recorded(called: set[CodeType]) -> Iterator[None]:
 
 
 def reading() -> dict[str, FunctionType]:
-    """The functions of tofuse, by name, that read files as their names say."""
+    """The functions of tofuse whose names say that they read files, by name."""
     found = {}
     for module in pkgutil.walk_packages(tofuse.__path__, "tofuse."):
         if module.name == "tofuse.__main__":
@@ -91,7 +91,7 @@ def reading() -> dict[str, FunctionType]:
     return found
 
 
-def test_a_crash_is_recorded_and_the_next_seed_tried(attacks) -> None:
+def test_crash_is_recorded_and_next_seed_runs(attacks) -> None:
     _, mutation = attacks
     found = list(mutation.run("pose", 3, first=7))
     assert [seed for seed, _ in found] == [7, 8, 9]
@@ -100,7 +100,7 @@ def test_a_crash_is_recorded_and_the_next_seed_tried(attacks) -> None:
     assert crashed == (0, "its process ended with 1")
 
 
-def test_signals_are_sent_in_functions_that_exist(attacks) -> None:
+def test_signal_stages_name_existing_functions(attacks) -> None:
     from attacks.environments import ENVIRONMENTS, STAGES
 
     assert len(ENVIRONMENTS) >= 40
@@ -112,12 +112,12 @@ def test_signals_are_sent_in_functions_that_exist(attacks) -> None:
         assert callable(owner)
 
 
-def test_power_cuts(attacks) -> None:
+def test_power_cuts_cause_no_faults(attacks) -> None:
     attack, _ = attacks
     assert attack.cuts(0, 10, seed=3) == (10, [])
 
 
-def test_a_journal_continues_where_it_was_stopped(attacks, tmp_path: Path) -> None:
+def test_journal_resumes_where_it_stopped(attacks, tmp_path: Path) -> None:
     from attacks.journal import Journal
 
     path, settings = tmp_path / "new" / "a.jsonl", {"seed": 1}

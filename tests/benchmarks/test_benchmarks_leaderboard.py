@@ -17,7 +17,7 @@ from tofuse.registration.base import Registrar, Registration
 
 
 class Inline:
-    """An executor that works there and then."""
+    """An executor that runs work immediately."""
 
     def submit(self, work, *arguments):
         future = Future()
@@ -37,7 +37,7 @@ def board(monkeypatch, tmp_path):
     return leaderboard
 
 
-def test_a_part_that_is_registered_is_a_row(board, monkeypatch):
+def test_registered_part_becomes_row(board, monkeypatch):
     @parts.part("registration", "of-a-test")
     @dataclass(frozen=True)
     class OfATest(Registrar):
@@ -55,7 +55,7 @@ def test_a_part_that_is_registered_is_a_row(board, monkeypatch):
     assert {"ndt", "ls3d", "icp, gnc", "icp, comprehensive", "any-pair"} <= names
 
 
-def test_graphs_are_done_once_and_make_a_page(board, monkeypatch, tmp_path):
+def test_graph_results_are_reused_and_tabulated(board, monkeypatch, tmp_path):
     graphs = board.BOARDS["graphs"]
     monkeypatch.setattr(type(graphs), "methods", lambda _: ["elch", "levenberg-marquardt"])
     board.run_missing(["graphs"], 1, tmp_path, Inline(), [])
@@ -68,12 +68,12 @@ def test_graphs_are_done_once_and_make_a_page(board, monkeypatch, tmp_path):
     assert files[0].exists()
     text = board.page(["graphs"], 1)
     rows = [line for line in text.splitlines() if line.startswith(("| elch", "| levenberg"))]
-    assert rows[0].startswith("| levenberg")  # it withstands false loops
+    assert rows[0].startswith("| levenberg")  # it is robust to false loops
     score = json.loads(board.kept("graphs", "elch", "noise1/room/0").read_text())
     assert 0 < score["ate"] < score["before"]
 
 
-def test_what_fails_is_said_and_done_the_next_time(board, monkeypatch, tmp_path, capsys):
+def test_failed_case_is_reported_and_not_stored(board, monkeypatch, tmp_path, capsys):
     def broken(*_):
         raise ValueError("no such view")
 
@@ -84,7 +84,7 @@ def test_what_fails_is_said_and_done_the_next_time(board, monkeypatch, tmp_path,
     assert not list((tmp_path / "kept").rglob("*.json"))
 
 
-def test_guesses_are_off_by_what_the_column_says(board):
+def test_initial_guess_errors_match_column(board):
     from leaders import two_views
 
     rng = np.random.default_rng(0)
@@ -96,7 +96,7 @@ def test_guesses_are_off_by_what_the_column_says(board):
         assert np.linalg.norm(moved) == pytest.approx(metres)
 
 
-def test_statements_compare_shares_and_errors(board):
+def test_statements_compare_rates_and_errors(board):
     from leaders.statements import statements
 
     def row(right, off):

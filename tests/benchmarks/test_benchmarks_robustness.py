@@ -64,7 +64,7 @@ def compare(scoring, poses, truth, reasons=(), groups=None):
 ANYWHERE = se3.exp(np.array([3.0, -1.0, 0.5, 0.4, -1.2, 0.3]))
 
 
-def test_poses_in_any_world_are_right(scoring) -> None:
+def test_score_is_invariant_to_world_frame(scoring) -> None:
     truth = walk()
     score = compare(scoring, ANYWHERE @ truth, truth)
     assert (score.wrong, score.unmarked, score.joins) == (0, 0, 0)
@@ -72,7 +72,7 @@ def test_poses_in_any_world_are_right(scoring) -> None:
     assert score.ate_m == pytest.approx(0, abs=1e-9)
 
 
-def test_a_few_wrong_poses_do_not_move_the_alignment(scoring) -> None:
+def test_alignment_is_robust_to_outliers(scoring) -> None:
     truth = walk()
     estimate = ANYWHERE @ truth
     estimate[4] = moved(estimate[4], 0.06, 0, 0, 0, 0, 0)
@@ -84,7 +84,7 @@ def test_a_few_wrong_poses_do_not_move_the_alignment(scoring) -> None:
     assert score.joins == 1  # five frames that belong together, 9 m off
 
 
-def test_frames_without_a_pose_are_not_wrong_but_not_covered(scoring) -> None:
+def test_lost_frames_reduce_coverage_only(scoring) -> None:
     truth = walk()
     estimate = truth.copy()
     estimate[10:] = np.nan
@@ -107,7 +107,7 @@ def test_frames_without_a_pose_are_not_wrong_but_not_covered(scoring) -> None:
         ({"unobservable": [0, 1, 0, 0, 0, 0]}, None),
     ],
 )
-def test_what_marks_a_wrong_pose(scoring, change, mark) -> None:
+def test_wrong_pose_is_marked_by_status_or_uncertainty(scoring, change, mark) -> None:
     """One pose has an error of 10 cm along x."""
     truth = walk()
     estimate = truth.copy()
@@ -124,7 +124,7 @@ def test_what_marks_a_wrong_pose(scoring, change, mark) -> None:
     assert scoring.marks(one, 12, error, scoring.Tolerance()) == ({mark} if mark else set())
 
 
-def test_reasons_mark_the_frames_that_they_name(scoring) -> None:
+def test_reasons_mark_their_frames(scoring) -> None:
     truth = walk()
     estimate = truth.copy()
     estimate[[3, 12, 25]] = moved(estimate[[3, 12, 25]], 0, 0.2, 0, 0, 0, 0)
@@ -133,7 +133,7 @@ def test_reasons_mark_the_frames_that_they_name(scoring) -> None:
         assert (score.wrong, score.unmarked, score.by_reason) == (3, unmarked, 3 - unmarked)
 
 
-def test_a_stated_break_marks_the_later_piece_even_if_it_is_larger(scoring) -> None:
+def test_stated_break_marks_later_part(scoring) -> None:
     truth = walk()
     estimate = truth.copy()
     estimate[10:] = se3.exp(np.array([0.5, 0, 0, 0, 0, 0])) @ truth[10:]
@@ -144,11 +144,11 @@ def test_a_stated_break_marks_the_later_piece_even_if_it_is_larger(scoring) -> N
             [scoring.Part(estimate, records)], scoring.Truth(truth, np.zeros(30, np.intp))
         )
         assert score.unmarked == unmarked
-        assert score.unmarked_strict == 10  # the first ten say nothing
+        assert score.unmarked_strict == 10  # the first ten state no uncertainty
         assert score.joins == 1
 
 
-def test_drift_is_no_wrong_join_but_a_seam_is(scoring) -> None:
+def test_discontinuity_is_wrong_join_but_drift_is_not(scoring) -> None:
     truth = walk(60)
     drifting = np.array([T @ se3.exp([0.01 * k, 0, 0, 0, 0, 0]) for k, T in enumerate(truth)])
     assert compare(scoring, drifting, truth).joins == 0
@@ -164,7 +164,7 @@ def test_drift_is_no_wrong_join_but_a_seam_is(scoring) -> None:
     assert compare(scoring, turned, truth).joins == 1
     few = truth.copy()
     few[40:42] = se3.exp(np.array([0.5, 0, 0, 0, 0, 0])) @ few[40:42]
-    assert compare(scoring, few, truth).joins == 0  # two frames are no side
+    assert compare(scoring, few, truth).joins == 0  # two frames are too few for one side of a join
     three = truth.copy()
     three[20:40] = se3.exp(np.array([0.5, 0, 0, 0, 0, 0])) @ three[20:40]
     three[40:] = se3.exp(np.array([0, 0.8, 0, 0, 0, 0])) @ three[40:]
@@ -188,7 +188,7 @@ def component(frames, T=None, joined=None, own=None):
     return SimpleNamespace(frames=frames, T_main_component=T, joined=joined, result=own)
 
 
-def test_a_result_without_components_is_one_part(scoring) -> None:
+def test_result_without_components_is_one_part(scoring) -> None:
     poses = walk(5)
     (one,) = scoring.parts_of(result(poses, range(10, 15)), range(10, 16))
     np.testing.assert_array_equal(one.posed, [True] * 5 + [False])
@@ -198,7 +198,7 @@ def test_a_result_without_components_is_one_part(scoring) -> None:
 
 
 @pytest.mark.parametrize("counted_from", [20, 0])
-def test_components_of_their_own_are_parts(scoring, counted_from) -> None:
+def test_unconnected_components_are_separate_parts(scoring, counted_from) -> None:
     """Frames 0 to 9 are the main one, 10 to 19 are joined to it, 20 to 24 are not."""
     truth = walk(25)
     main = truth.copy()
@@ -219,7 +219,7 @@ def test_components_of_their_own_are_parts(scoring, counted_from) -> None:
     whole = np.array([0] * 20 + [1] * 5)
     score = scoring.score(parts, scoring.Truth(truth, whole))
     assert (score.main, score.covered, score.wrong, score.joins) == (20, 25, 0, 0)
-    # Where all could be connected, what is left apart is not covered.
+    # Where all could be connected, unconnected frames are not covered.
     score = scoring.score(parts, scoring.Truth(truth, np.zeros(25, np.intp)))
     assert score.covered == 20
 
@@ -228,7 +228,7 @@ def test_components_of_their_own_are_parts(scoring, counted_from) -> None:
 
 
 def flat_wall(k, x):
-    """A bumpy wall 2 m away, seen from x, 0.1 s after the last."""
+    """A wall 2 m away, 0.1 s after the previous frame; looks the same from any x."""
     camera = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
     depth = np.full((30, 40), 2.0, np.float32)
     light = np.full((30, 40), 1000.0, np.float32)
@@ -242,11 +242,11 @@ def made_take(stress, count=40, step=0.02):
     return stress.Take(frames, poses, {})
 
 
-def test_groups_are_frames_that_see_the_same(stress) -> None:
+def test_groups_are_overlapping_frames(stress) -> None:
     took = made_take(stress, 12)
     assert (stress.groups(took.frames, took.poses) == 0).all()
     poses = took.poses.copy()
-    poses[6:, 0, 3] += 1.6  # of 2 m that one sees
+    poses[6:, 0, 3] += 1.6  # of the 2 m in view
     np.testing.assert_array_equal(stress.groups(took.frames, poses), [0] * 6 + [1] * 6)
     found = stress.groups(took.frames, poses, blind=[2, 3])
     np.testing.assert_array_equal(found, [0, 0, -1, -1, 0, 0] + [1] * 6)
@@ -255,7 +255,7 @@ def test_groups_are_frames_that_see_the_same(stress) -> None:
 
 
 @pytest.mark.parametrize("how", ["lid", "hand"])
-def test_a_covered_lens_shows_nothing_of_the_scene(stress, how) -> None:
+def test_covered_lens_hides_scene(stress, how) -> None:
     took = made_take(stress)
     rng = np.random.default_rng(1)
     spoilt, bad = stress.hidden(took, 1.0, how, rng)
@@ -272,7 +272,7 @@ def test_a_covered_lens_shows_nothing_of_the_scene(stress, how) -> None:
     assert [frame.index for frame in case.recording] == list(range(40))
 
 
-def test_amplitude_and_range_change_as_said(stress) -> None:
+def test_brightness_and_range_offset_are_applied(stress) -> None:
     frame = flat_wall(0, 0.0)
     bright = stress.brighter(frame, 4.0)
     np.testing.assert_array_equal(bright.amplitude_image, 4000.0)
@@ -286,7 +286,7 @@ def test_amplitude_and_range_change_as_said(stress) -> None:
     np.testing.assert_allclose(stress.farther(radial, 0.05).depth, 2.05, atol=1e-6)
 
 
-def test_falloff_is_taken_out_of_raw_amplitude_only(stress) -> None:
+def test_falloff_is_corrected_in_raw_amplitude_only(stress) -> None:
     frame = flat_wall(0, 0.0)
     frame.amplitude_image[0, 0] = 65535
     transmission = np.full((30, 40), 0.5)
@@ -297,7 +297,7 @@ def test_falloff_is_taken_out_of_raw_amplitude_only(stress) -> None:
     assert stress.evenly_lit(other, transmission) is other
 
 
-def test_two_places_go_on_in_time_and_twice_does_not(stress) -> None:
+def test_two_places_are_contiguous_in_time_and_twice_has_gap(stress) -> None:
     took, other = made_take(stress), made_take(stress, 20)
     away = other.poses.copy()
     away[:, 0, 3] += stress.APART_M
@@ -312,7 +312,7 @@ def test_two_places_go_on_in_time_and_twice_does_not(stress) -> None:
     assert (stress.as_case("wall", "twice", again).truth.groups == 0).all()
 
 
-def test_random_order_keeps_frames_and_poses_together(stress) -> None:
+def test_shuffling_keeps_frames_and_poses_together(stress) -> None:
     took = made_take(stress)
     mixed = stress.shuffled(took, np.random.default_rng(0))
     times = np.array([frame.timestamp for frame in mixed.frames])
@@ -321,7 +321,7 @@ def test_random_order_keeps_frames_and_poses_together(stress) -> None:
         assert pose[0, 3] == pytest.approx(0.02 * frame.index)
 
 
-def test_quick_turns_and_close_up_leave_the_path_and_come_back(stress) -> None:
+def test_quick_turns_and_close_up_return_to_path(stress) -> None:
     def path(t):
         T = np.eye(4)
         T[2, 3] = 0.5 * t
@@ -344,7 +344,7 @@ def test_quick_turns_and_close_up_leave_the_path_and_come_back(stress) -> None:
     assert speed.max() < 2.5
 
 
-def test_the_cases_of_a_scene(stress, monkeypatch) -> None:
+def test_scene_cases_are_selected(stress, monkeypatch) -> None:
     short = replace(stress.SCENES["rail"], frames=8)
     found = list(stress.cases(short, 0, quick=True, containing="frame"))
     names = [case.name for case in found]
@@ -363,7 +363,7 @@ def test_the_cases_of_a_scene(stress, monkeypatch) -> None:
         assert scene.again < stress.scene_frames(scene.name)
 
 
-def test_a_run_gives_a_row_and_what_fails_is_counted(stress, monkeypatch, capsys, tmp_path) -> None:
+def test_runs_are_summarised_and_crashes_counted(stress, monkeypatch, capsys, tmp_path) -> None:
     import robustness
 
     short = {"rail": replace(stress.SCENES["rail"], frames=6)}
@@ -384,7 +384,7 @@ def test_a_run_gives_a_row_and_what_fails_is_counted(stress, monkeypatch, capsys
     assert (tmp_path / "robustness_stress.json").is_file()
 
 
-def test_real_recordings_are_found(monkeypatch, shared_data) -> None:
+def test_real_recordings_have_reference_poses(monkeypatch, shared_data) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import recorded
 

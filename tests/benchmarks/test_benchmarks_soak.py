@@ -26,7 +26,7 @@ def usages(soak, memory, descriptors=7, threads=3):
     return [soak.Usage(100 * (k + 1), m, descriptors, threads) for k, m in enumerate(memory)]
 
 
-def test_a_leak_is_detected(soak, capsys) -> None:
+def test_leak_is_detected(soak, capsys) -> None:
     flat = [int(5e8 + 1e5 * (-1) ** k) for k in range(10)]
     assert soak.bounded(usages(soak, flat), soak.RUN_BYTES)
     filled = [int(1e8 * min(k + 1, 4)) for k in range(10)]  # caches fill at the beginning
@@ -41,7 +41,7 @@ def test_a_leak_is_detected(soak, capsys) -> None:
     assert capsys.readouterr().out.count("FAILED") == 3
 
 
-def test_a_store_may_fill_but_not_overflow(soak) -> None:
+def test_store_may_fill_its_budget_but_not_exceed_it(soak) -> None:
     def filling(budget: int) -> list:
         return [
             soak.Usage(100 * k, int(5e8 + 1e7 * k), 7, 3, stored=int(1e7 * k), budget=budget)
@@ -52,7 +52,7 @@ def test_a_store_may_fill_but_not_overflow(soak) -> None:
     assert not soak.bounded(filling(5 * 10**7), soak.RUN_BYTES)
 
 
-def test_descriptors_are_counted_without_those_of_stores(soak) -> None:
+def test_descriptors_of_stores_are_not_counted(soak) -> None:
     before = soak.Usage.measured(1).descriptors
     spilled = soak.SpillFile()
     spilled.append(np.zeros(10, np.uint8))
@@ -63,7 +63,7 @@ def test_descriptors_are_counted_without_those_of_stores(soak) -> None:
     assert soak.Usage.measured(4).descriptors == before
 
 
-def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) -> None:
+def test_all_live_frames_are_recorded(soak, tmp_path: Path, capsys) -> None:
     """Two minutes of camera time with missing, duplicate and late frames."""
     assert soak.live(32, 120.0, 10.0, tmp_path, mapped=False)
     sent = soak.Camera(32, 1200, 10.0)
@@ -82,7 +82,7 @@ def test_all_frames_of_a_live_camera_are_recorded(soak, tmp_path: Path, capsys) 
     assert camera.sent.repeated == repeated >= camera.sent.doubled
 
 
-def test_a_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
+def test_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
     camera = soak.Camera(32, 70, 10.0)
     list(camera._frames(70))
     assert min(camera.sent.missing, camera.sent.doubled, camera.sent.late) > 0

@@ -41,7 +41,7 @@ def own_offsets() -> np.ndarray:
 
 
 def made_views(*, known: bool, constant: float = 0.0) -> list[PlaneView]:
-    """Planes from 0.8 to 4 m, tilted to all sides."""
+    """Planes from 0.8 to 4 m, tilted in all directions."""
     rng = np.random.default_rng(7)
     rays = np.concatenate([CAMERA.rays(), np.ones((48, 64, 1))], -1).reshape(-1, 3).astype(float)
     directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -53,11 +53,13 @@ def made_views(*, known: bool, constant: float = 0.0) -> list[PlaneView]:
         true = 1 / (directions @ plane)
         measured = true + constant + wiggle(true) + own_offsets().ravel()
         measured = measured + rng.normal(0, NOISE_M, true.shape)
-        told = np.eye(3) * (1e10 if known else 1e-12)
+        information = np.eye(3) * (1e10 if known else 1e-12)
         start = plane * (1 if known else 1.02) + (0 if known else rng.normal(0, 0.003, 3))
         seen = np.flatnonzero((true > 0.7) & (true < 4.5))
         sigma = np.full(len(seen), NOISE_M)
-        views.append(PlaneView(k, start, told, seen, measured[seen], sigma, directions[seen]))
+        views.append(
+            PlaneView(k, start, information, seen, measured[seen], sigma, directions[seen])
+        )
     return views
 
 
@@ -70,7 +72,7 @@ def curve_error(fit: DepthFit, constant: float = 0.0) -> np.ndarray:
 
 
 def bent(error: np.ndarray) -> np.ndarray:
-    """What is neither constant nor scale."""
+    """The part of the error that is neither constant nor proportional to range."""
     r = np.linspace(0, 1, len(error))
     return error - np.polyval(np.polyfit(r, error, 1), r)
 
@@ -79,7 +81,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def test_known_planes_give_curve_constant_and_offsets() -> None:
+def test_known_planes_constrain_curve_constant_and_offsets() -> None:
     fit = calibrate_depth(made_views(known=True, constant=0.03), CAMERA)
     assert rms(curve_error(fit, 0.03)) < 0.001
     offsets = fit.correction.pixel_bias_m
@@ -93,7 +95,7 @@ def test_known_planes_give_curve_constant_and_offsets() -> None:
     assert not any("scale" in warning for warning in fit.warnings)
 
 
-def test_unknown_planes_give_all_but_constant_and_scale() -> None:
+def test_unknown_planes_constrain_all_but_constant_and_scale() -> None:
     fit = calibrate_depth(made_views(known=False), CAMERA)
     assert rms(bent(curve_error(fit))) < 0.001
     assert rms(curve_error(fit)) < 0.005
@@ -103,14 +105,14 @@ def test_unknown_planes_give_all_but_constant_and_scale() -> None:
     assert "scale" in fit.warnings[0]
 
 
-def test_a_constant_is_left_alone_where_it_can_not_be_told() -> None:
+def test_unconstrained_constant_is_not_corrected() -> None:
     far = calibrate_depth(made_views(known=False, constant=0.03), CAMERA)
     error = curve_error(far, 0.03)
     assert rms(bent(error)) < 0.002
     assert abs(error.mean()) > 0.01
 
 
-def test_outliers_and_wraps_do_no_harm() -> None:
+def test_fit_is_robust_to_outliers() -> None:
     rng = np.random.default_rng(9)
     views = []
     for view in made_views(known=True):
@@ -120,7 +122,7 @@ def test_outliers_and_wraps_do_no_harm() -> None:
     assert rms(curve_error(calibrate_depth(views, CAMERA))) < 0.0015
 
 
-def test_one_distance_is_refused() -> None:
+def test_single_distance_is_rejected() -> None:
     views = [
         replace(view, measured_m=1.0 + 0.01 * view.measured_m) for view in made_views(known=True)
     ]
@@ -128,7 +130,7 @@ def test_one_distance_is_refused() -> None:
         calibrate_depth(views, CAMERA)
 
 
-def test_two_corrections_are_one_after_the_other() -> None:
+def test_composed_correction_applies_both_in_order() -> None:
     r = np.linspace(0.5, 4.5, 60)
     first = DepthCorrection(r, wiggle(r))
     second = DepthCorrection(r[::3], 0.01 * r[::3], np.full((1, 50), 0.002, np.float32))
@@ -142,12 +144,12 @@ EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath", "mixed_p
 
 @pytest.fixture(scope="module")
 def views() -> Recording:
-    """A simulated SR4000 that wiggles by 20 mm (peak), before a wall with a board."""
+    """A simulated SR4000 with a wiggling error of 20 mm (peak), facing a board on a wall."""
     return simulate_recording("checkerboard", frames=20, effects=EFFECTS, correction=False)
 
 
 def simulated_error(fit: DepthFit) -> tuple[float, float]:
-    """What is left of the curve's error, and what there was, rms in m."""
+    """Residual and original error of the curve, rms in m."""
     true = calibrated(camera_model("sr4000"), EFFECTS)
     assert true.pixel_bias_m is not None
     r = np.linspace(*fit.range_m, 300)
@@ -156,7 +158,7 @@ def simulated_error(fit: DepthFit) -> tuple[float, float]:
     return rms(found - bias), rms(bias)
 
 
-def test_board_on_a_wall_takes_wiggling_below_2_mm(views: Recording) -> None:
+def test_board_on_wall_reduces_wiggling_below_2_mm(views: Recording) -> None:
     fit = calibrate_depth(*board_planes(views, BOARD, "amplitude", wall=True))
     after, before = simulated_error(fit)
     assert before > 0.010
@@ -166,12 +168,12 @@ def test_board_on_a_wall_takes_wiggling_below_2_mm(views: Recording) -> None:
     assert simulated_error(alone)[0] < 0.0035
 
 
-def test_wall_at_unknown_poses_takes_wiggling_below_3_mm(views: Recording) -> None:
+def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> None:
     fit = calibrate_depth(*scene_planes(views, 1, 0))
     assert simulated_error(fit)[0] < 0.003
 
 
-def test_command_writes_a_correction_that_is_applied(
+def test_command_writes_correction_that_is_applied(
     views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = camera_model("sr4000")
@@ -192,7 +194,7 @@ def test_command_writes_a_correction_that_is_applied(
     assert after.metadata["corrected"] is True
     moved = (after[0].radial_range - before.radial_range)[before.valid]
     assert 0.003 < np.abs(moved).mean() < 0.03
-    # Once more: what is left is small, and both are one correction.
+    # Calibrating again adds little; both corrections are composed into one.
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main([*command, "--overwrite"]) == 0
@@ -204,7 +206,7 @@ def test_command_writes_a_correction_that_is_applied(
     assert "--board" in capsys.readouterr().err
 
 
-def test_real_sr4000_from_two_places_is_refused(shared_data: Path) -> None:
+def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     """Planes are found, but from two places in a corridor they do not determine the curve."""
     recording = open_recording(shared_data / "sr4000_corridor")
     found, camera = scene_planes(recording, 4, 0)
@@ -217,7 +219,7 @@ def test_real_sr4000_from_two_places_is_refused(shared_data: Path) -> None:
         calibrate_depth(found, camera)
 
 
-def test_no_board_and_no_frames_with_amplitude(views: Recording) -> None:
+def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
     bare = [replace(frame, amplitude_image=None) for frame in views.select(0, 2)]
     recording = Recording.of(ArraySource(bare), "bare", "simulated")
     with pytest.raises(InputError, match="omit --board"):

@@ -58,21 +58,21 @@ def test_focal_length_within_0_2_percent_and_principal_point_within_half_a_pixel
     assert np.sqrt((rays**2).sum(-1).mean()) < 0.5  # over all of the image, distortion included
 
 
-def test_deviations_say_how_far_off_it_may_be() -> None:
+def test_standard_deviations_bound_errors() -> None:
     found = fitted()
     for name in ("fx", "fy", "cx", "cy"):
         assert abs(getattr(found.camera, name) - getattr(TRUE, name)) < 4 * found.sigma[name]
     assert found.sigma["fx"] < 0.003 * TRUE.fx
     assert found.sigma.keys() >= {"k1"}
-    # What the views don't tell is held at 0 and has no deviation.
+    # Coefficients that the views do not constrain are fixed at 0, without a deviation.
     held = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
     assert all(getattr(found.camera, name) == 0 for name in held)
     assert found.rms_px < 0.1
     assert found.before_px == pytest.approx(found.rms_px, abs=0.02)
 
 
-def test_corners_lie_at_pixel_centres_from_zero() -> None:
-    """Half a pixel, as enlarging may add, would show in the mean."""
+def test_corners_follow_pixel_centre_convention() -> None:
+    """An offset of half a pixel, as upsampling may add, would show in the mean."""
     corners = find_corners(frames()[0].amplitude_image, BOARD)
     assert corners is not None
     found = board_pose(TRUE, corners, BOARD)
@@ -88,7 +88,7 @@ def test_corners_lie_at_pixel_centres_from_zero() -> None:
     assert np.abs(offsets).max() < 0.1
 
 
-def test_a_view_that_does_not_fit_is_left_out_and_named() -> None:
+def test_inconsistent_view_is_excluded_and_reported() -> None:
     chosen = list(frames()[:10])
     image = chosen[4].amplitude_image
     v, u = np.mgrid[0:144, 0:176].astype(np.float32)
@@ -100,7 +100,7 @@ def test_a_view_that_does_not_fit_is_left_out_and_named() -> None:
     assert found.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
 
 
-def test_the_same_place_counts_once() -> None:
+def test_duplicate_viewpoints_are_excluded() -> None:
     found = calibrate_lens(recording_of([*frames()[:8], *frames()[:8]]), BOARD)
     assert len(found.views) == len([k for k, _ in found.left_out if k >= 8])
     assert all("like another" in why for k, why in found.left_out if k >= 8)
@@ -121,7 +121,7 @@ def _bare(frame: RangeFrame) -> RangeFrame:
         (lambda: [CloudFrame.of(np.eye(3))], BOARD, "contains clouds"),
     ],
 )
-def test_what_tells_no_lens_is_refused(chosen, board: Board, message: str) -> None:
+def test_unsuitable_recordings_are_rejected(chosen, board: Board, message: str) -> None:
     with pytest.raises(InputError) as caught:
         calibrate_lens(recording_of(chosen()), board)
     assert message in str(caught.value)
@@ -149,7 +149,7 @@ def poses_facing(count: int, tilt: float) -> list[np.ndarray]:
     return out
 
 
-def test_views_all_alike_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_degenerate_viewpoints_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Pinhole(320, 240, 250, 250, 160, 120)
     views = views_of(camera, poses_facing(12, 0.01))
     monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
@@ -166,7 +166,7 @@ def test_views_all_alike_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda c: c.model,
 )
-def test_every_kind_of_lens_comes_back(camera: Pinhole, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_lens_model_is_recovered(camera: Pinhole, monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(camera, poses_facing(16, 0.5))
     monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
     found = calibrate_lens(recording_of(frames()[:1]), BOARD, camera.model)
@@ -188,12 +188,12 @@ def _seen(camera: Camera, views: list[BoardView]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("text", ["8x6", "8x6:0", "2x6:0.1", "8x6:-1", "8x6:e", "axb:c", ""])
-def test_boards_that_make_no_sense(text: str) -> None:
+def test_invalid_boards_are_rejected(text: str) -> None:
     with pytest.raises(InputError, match="--board"):
         Board.parse(text)
 
 
-def test_command_writes_a_camera_that_readers_take(
+def test_command_writes_camera_for_readers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = replace(TRUE, fx=200.0)
@@ -206,9 +206,9 @@ def test_command_writes_a_camera_that_readers_take(
     out = tmp_path / "new" / "camera.json"
     command = ["calibrate", "lens", str(tmp_path / "rec"), "--board", "8x6:0.1"]
     assert main([*command, "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "fx 2" in told
-    assert "+-" in told
+    printed = capsys.readouterr().out
+    assert "fx 2" in printed
+    assert "+-" in printed
     about = json.loads(out.read_text())
     assert about["depth_unit_m"] == 0.0001
     assert about["amplitude_kind"] == "range_compensated"

@@ -1,4 +1,4 @@
-"""Intrinsics from files as other programs write them."""
+"""Intrinsics from files of other programs."""
 
 from __future__ import annotations
 
@@ -81,18 +81,18 @@ def written(folder: Path, name: str, text: str) -> Path:
     return folder / name
 
 
-def test_bouguet_script(tmp_path: Path) -> None:
+def test_bouguet_script_is_read(tmp_path: Path) -> None:
     found = read_lens_file(written(tmp_path, "Calib_Results.m", BOUGUET.format(skew="0.000")))
     assert found.format == "bouguet"
     assert isinstance(found.camera, BrownConrady)
-    # The principal point is counted from 0: the toolbox takes MATLAB's 1 off.
+    # The principal point is counted from 0: the toolbox subtracts MATLAB's 1.
     assert (found.camera.cx, found.camera.cy) == (302.95574476146538, 242.79219523054692)
     assert found.camera.fy == 657.82209761158424
     assert found.camera.k2 == 0.134603934513618
     assert found.camera.p2 == -1.347e-05
 
 
-def test_bouguet_mat(tmp_path: Path) -> None:
+def test_bouguet_mat_is_read(tmp_path: Path) -> None:
     values = {
         "fc": np.array([[500.0], [501.0]]),
         "cc": np.array([[310.0], [230.0]]),
@@ -107,7 +107,7 @@ def test_bouguet_mat(tmp_path: Path) -> None:
     assert camera == BrownConrady(640, 480, 500, 501, 310, 230, -0.2, 0.1, 0.001, 0.002, 0.0)
 
 
-def test_skew_becomes_a_table_of_rays(tmp_path: Path) -> None:
+def test_skew_becomes_ray_table(tmp_path: Path) -> None:
     path = written(tmp_path, "Calib_Results.m", BOUGUET.format(skew="0.004"))
     found = read_lens_file(path)
     assert isinstance(found.camera, RayTable)
@@ -125,7 +125,7 @@ def test_skew_becomes_a_table_of_rays(tmp_path: Path) -> None:
     assert 657.82209761158424 * yd + 242.792195230547 == pytest.approx(v, abs=1e-3)
 
 
-def test_callab_and_its_origin(tmp_path: Path) -> None:
+def test_callab_origin_conventions(tmp_path: Path) -> None:
     centre = written(tmp_path, "a.cal", CALLAB.format(origin="center", more=""))
     corner = written(tmp_path, "b.cal", CALLAB.format(origin="corner", more=""))
     found = read_lens_file(centre)
@@ -137,7 +137,7 @@ def test_callab_and_its_origin(tmp_path: Path) -> None:
     assert (moved.cx, moved.cy) == pytest.approx((315.771, 235.929))
 
 
-def test_callab_of_two_cameras(tmp_path: Path) -> None:
+def test_callab_camera_is_selected_by_index(tmp_path: Path) -> None:
     one = CALLAB.format(origin="center", more="")
     second = "\n".join(
         line.replace("camera.0.", "camera.1.").replace("601.951", "700")
@@ -155,7 +155,7 @@ def test_callab_of_two_cameras(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
-def test_opencv_as_it_writes_itself(tmp_path: Path, suffix: str) -> None:
+def test_opencv_file_storage_is_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"camera.{suffix}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 640)
@@ -170,7 +170,7 @@ def test_opencv_as_it_writes_itself(tmp_path: Path, suffix: str) -> None:
     assert found.camera == Rational(640, 480, 500.5, 501.5, 310.25, 230.75, *k[0])
 
 
-def test_opencv_with_thin_prism_is_inverted_as_opencv_projects(tmp_path: Path) -> None:
+def test_opencv_thin_prism_model_is_inverted(tmp_path: Path) -> None:
     k = [-0.2, 0.1, 1e-3, -2e-3, 0.05, 0, 0, 0, 0.003, -0.001, 0.002, 0.001, 0.01, -0.02]
     data = {
         "image_size": [64, 48],
@@ -195,7 +195,9 @@ def test_opencv_with_thin_prism_is_inverted_as_opencv_projects(tmp_path: Path) -
         ("equidistant", [0.05, -0.02, 0.01, -0.002], Fisheye),
     ],
 )
-def test_ros_camera_info(tmp_path: Path, model: str, values: list[float], expected: type) -> None:
+def test_ros_camera_info_is_read(
+    tmp_path: Path, model: str, values: list[float], expected: type
+) -> None:
     text = ROS.format(model=model, count=len(values), values=values)
     found = read_lens_file(written(tmp_path, "left.yaml", text))
     assert found.format == "ros"
@@ -220,16 +222,16 @@ def test_ros_camera_info(tmp_path: Path, model: str, values: list[float], expect
         ("a.m", "\x00fc = [", "known"),
     ],
 )
-def test_broken_files_are_refused_in_one_line(
-    tmp_path: Path, name: str, text: str, message: str
-) -> None:
+def test_broken_files_are_rejected(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         read_lens_file(written(tmp_path, name, text))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_command(tmp_path: Path, room_recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_command(
+    tmp_path: Path, room_recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = written(tmp_path, "Calib_Results.m", BOUGUET.format(skew="0.004"))
     out = tmp_path / "lens" / "camera.json"
     command = ["calibrate", "import", str(source), "--out", str(out)]

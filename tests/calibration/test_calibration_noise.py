@@ -46,13 +46,13 @@ def still_frames(scene: str, camera: str, count: int, first_seed: int = 0) -> li
 
 
 @pytest.mark.parametrize(("scene", "camera"), [("corner", "sr4000"), ("wall", "pico-flexx")])
-def test_a_still_recording_gives_the_noise_that_the_camera_has(scene: str, camera: str) -> None:
+def test_static_recording_recovers_camera_noise(scene: str, camera: str) -> None:
     fit = estimate_noise(recording_of(still_frames(scene, camera, 8)))
     assert fit.law == "amplitude"
     assert fit.frames == 8
     assert fit.stretches == 1
     assert fit.rms_log_error < 0.1
-    # Other frames of the same view, of which nothing was used.
+    # Other frames of the same view, which the fit did not use.
     others = still_frames(scene, camera, 12, first_seed=100)
     variance = np.stack([f.radial_range for f in others]).var(0, ddof=1)
     valid = np.all([f.valid for f in others], 0)
@@ -60,20 +60,20 @@ def test_a_still_recording_gives_the_noise_that_the_camera_has(scene: str, camer
     edges = np.quantile(predicted[valid], np.linspace(0, 1, 7))
     for low, high in itertools.pairwise(edges):
         inside = valid & (predicted >= low) & (predicted <= high)
-        # The median of chi squared with 11 degrees of freedom, over them.
+        # 0.94: median of chi squared with 11 degrees of freedom, divided by 11.
         ratio = np.median(variance[inside] / predicted[inside]) / 0.94
         assert np.sqrt(ratio) == pytest.approx(1, abs=0.1)
 
 
-def test_it_also_agrees_with_the_electronics() -> None:
+def test_estimate_agrees_with_built_in_model() -> None:
     fit = estimate_noise(recording_of(still_frames("corner", "sr4000", 8)))
     frame = still_frames("corner", "sr4000", 1)[0]
-    believed = frame.valid & (NOISE["sr4000"].sigma(frame) < 0.2)
-    ratio = fit.model.sigma(frame)[believed] / NOISE["sr4000"].sigma(frame)[believed]
+    reliable = frame.valid & (NOISE["sr4000"].sigma(frame) < 0.2)
+    ratio = fit.model.sigma(frame)[reliable] / NOISE["sr4000"].sigma(frame)[reliable]
     assert np.quantile(ratio, [0.05, 0.95]) == pytest.approx([1, 1], abs=0.15)
 
 
-def test_three_frames_do() -> None:
+def test_three_frames_suffice() -> None:
     fit = estimate_noise(recording_of(still_frames("corner", "sr4000", 8)[:3]))
     full = estimate_noise(recording_of(still_frames("corner", "sr4000", 8)))
     frame = still_frames("corner", "sr4000", 1)[0]
@@ -96,7 +96,7 @@ def plain_frames(
     ]  # fmt: skip
 
 
-def test_depth_alone_gives_the_law_over_range() -> None:
+def test_depth_alone_gives_range_law() -> None:
     r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
     fit = estimate_noise(recording_of(plain_frames(0.002 + 0.003 * r**2)), "mine")
     assert fit.law == "range"
@@ -105,7 +105,7 @@ def test_depth_alone_gives_the_law_over_range() -> None:
     assert fit.model.range.b == pytest.approx(0.003, rel=0.1)
 
 
-def test_depth_in_coarse_units() -> None:
+def test_quantization_noise_is_included() -> None:
     frames = [
         replace(f, depth=np.round(f.depth, 3)) for f in plain_frames(np.full((60, 80), 0.0004), 20)
     ]
@@ -114,7 +114,7 @@ def test_depth_in_coarse_units() -> None:
     assert model.range.a + model.range.b * 4 == pytest.approx(0.00049, rel=0.15)
 
 
-def test_one_range_tells_no_growth_and_the_careful_law_is_taken() -> None:
+def test_single_range_gives_conservative_law() -> None:
     frames = [
         replace(f, depth=np.float32(2) + (f.depth - np.linspace(0.5, 4, 80, dtype=np.float32)))
         for f in plain_frames(np.full((60, 80), 0.01))
@@ -125,7 +125,7 @@ def test_one_range_tells_no_growth_and_the_careful_law_is_taken() -> None:
     assert "extrapolated" in " ".join(fit.warnings)
 
 
-def test_confidence_is_used_where_it_tells_and_only_there() -> None:
+def test_confidence_is_used_only_if_informative() -> None:
     levels = (np.arange(60)[:, None] // 15 + np.zeros(80, int)).astype(np.uint8)
     table = np.array([0.1, 0.05, 0.02, 0.01])
     fit = estimate_noise(recording_of(plain_frames(table[levels], confidence=levels)))
@@ -138,7 +138,7 @@ def test_confidence_is_used_where_it_tells_and_only_there() -> None:
     assert estimate_noise(recording_of(empty)).model.range.b == pytest.approx(0.004, rel=0.1)
 
 
-def test_amplitude_that_says_nothing_is_left_out() -> None:
+def test_uninformative_amplitude_is_ignored() -> None:
     rng = np.random.default_rng(2)
     r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
     nonsense = rng.uniform(10, 1000, (60, 80)).astype(np.float32)
@@ -148,7 +148,7 @@ def test_amplitude_that_says_nothing_is_left_out() -> None:
     assert fit.model.amplitude is None
 
 
-def test_flickering_edges_do_not_disturb() -> None:
+def test_estimate_is_robust_to_flickering_edges() -> None:
     r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
     frames = plain_frames(0.003 * r**2)
     rng = np.random.default_rng(8)
@@ -160,7 +160,7 @@ def test_flickering_edges_do_not_disturb() -> None:
     assert estimate_noise(recording_of(flicker)).model.range.b == pytest.approx(0.003, rel=0.15)
 
 
-def test_several_stretches_are_one_estimate() -> None:
+def test_static_segments_are_combined() -> None:
     r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
     near = plain_frames(0.003 * r**2, 5)
     far = [replace(f, depth=f.depth + np.float32(0.7)) for f in near]
@@ -188,14 +188,14 @@ def test_several_stretches_are_one_estimate() -> None:
         ),
     ],
 )
-def test_what_tells_nothing_is_refused(frames, message: str) -> None:
+def test_unsuitable_recordings_are_rejected(frames, message: str) -> None:
     with pytest.raises(InputError) as caught:
         estimate_noise(recording_of(frames()))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = camera_model("sr4000")
     writer = RecordingWriter(
         tmp_path / "rec", model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
@@ -214,14 +214,14 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["noise", str(tmp_path / "rec"), "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main(["noise", str(tmp_path / "rec"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert NoiseModel.from_dict(told["model"]).amplitude == NoiseModel.load(out).amplitude
+    printed = json.loads(capsys.readouterr().out)
+    assert NoiseModel.from_dict(printed["model"]).amplitude == NoiseModel.load(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
     with pytest.raises(InputError, match="a must be 0 to 5"):
         noise_model_for(recording)
 
 
-def test_families_are_found_by_name_format_and_size() -> None:
+def test_sensor_family_is_found_by_name_format_and_size() -> None:
     frame = plain_frames(np.full(80, 0.01), 1)
     assert noise_model_for(recording_of(frame)) == NOISE["unknown"]
     assert noise_model_for(recording_of(frame, sensor="Kinect v1")) == NOISE["kinect1"]
@@ -232,7 +232,7 @@ def test_families_are_found_by_name_format_and_size() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.01, 30.0])
-def test_counts_of_another_gain_are_noticed(gain: float) -> None:
+def test_amplitude_gain_mismatch_is_corrected(gain: float) -> None:
     frames = still_frames("wall", "pico-flexx", 8)
     other = [replace(f, amplitude_image=f.amplitude_image * np.float32(gain)) for f in frames]
     model = noise_model_for(recording_of(other))
@@ -243,14 +243,14 @@ def test_counts_of_another_gain_are_noticed(gain: float) -> None:
     assert np.median(model.sigma(other[0])[seen] / right[seen]) == pytest.approx(1, abs=0.15)
 
 
-def test_sr4000_corridor(shared_data: Path) -> None:
+def test_real_sr4000_noise_agrees_with_data_description(shared_data: Path) -> None:
     fit = estimate_noise(open_recording(shared_data / "sr4000_corridor"))
     assert (fit.law, fit.stretches, fit.frames) == ("amplitude", 2, 8)
     assert fit.rms_log_error < 0.1
-    # Of the family's table, which was not fitted to these bins.
+    # The error of the family's built-in model, which was not fitted to these bins.
     assert fit.before < 0.15
     assert fit.model.confidence is not None
-    # Medians of deviations of z over four frames, as the data's description has them; the median
+    # Medians of deviations of z over four frames, from the description of the data; the median
     # of chi with three degrees of freedom is 0.89 of the deviation.
     described = np.array([133, 92, 67, 46, 31, 22, 13.5]) / 1000
     ratio = 0.89 * np.array(fit.model.confidence.sigma_m)[1:] / described

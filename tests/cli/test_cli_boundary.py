@@ -24,7 +24,7 @@ from tofuse.lab.simulation.record import simulate
 sys.path.insert(0, str(BENCHMARKS))
 from attacks.environments import ENVIRONMENTS, attempt
 
-# One of each kind; `benchmarks/attack.py` runs all.
+# One of each kind; `benchmarks/attack.py` runs all of them.
 CHOSEN = (
     "512 MB of addresses",
     "1024 MB of addresses",
@@ -45,7 +45,7 @@ CHOSEN = (
     "SIGTERM at the end",
 )
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits and paths of Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs limits and paths of Linux")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,9 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", CHOSEN)
-def test_hostile_environments(name: str, clouds: Path, tmp_path: Path) -> None:
+def test_hostile_environments_give_result_or_one_line_error(
+    name: str, clouds: Path, tmp_path: Path
+) -> None:
     (environment,) = [e for e in ENVIRONMENTS if e.name == name]
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
     assert outcome.faults == (), outcome.stderr
@@ -71,21 +73,21 @@ def shell(script: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-def test_what_only_prints_and_can_not_says_so(clouds: Path) -> None:
-    status, said = shell(f"tofuse inspect {clouds} > /dev/full")
-    assert (status, said) == (
+def test_unwritable_stdout_is_reported(clouds: Path) -> None:
+    status, stderr = shell(f"tofuse inspect {clouds} > /dev/full")
+    assert (status, stderr) == (
         2,
         "tofuse: standard output: can't be written (no space left on device)\n",
     )
     assert shell("tofuse --help > /dev/full")[0] == 2
-    status, said = shell(f"tofuse inspect {clouds} | true; exit ${{PIPESTATUS[0]}}")
+    status, stderr = shell(f"tofuse inspect {clouds} | true; exit ${{PIPESTATUS[0]}}")
     assert status in (0, 141)  # it may be read before the reader ends
-    assert "Traceback" not in said
-    status, said = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
-    assert (status, said) == (141, "")
+    assert "Traceback" not in stderr
+    status, stderr = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
+    assert (status, stderr) == (141, "")
 
 
-def test_a_damaged_image_is_reported_without_lines_of_its_library(tmp_path: Path) -> None:
+def test_damaged_image_prints_no_library_messages(tmp_path: Path) -> None:
     made_exports.make_tiff3d(tmp_path / "a")
     path = tmp_path / "a" / "00001.range.tif"
     noise = np.random.default_rng(0).integers(1000, 3000, (24, 32)).astype(np.uint16)
@@ -97,12 +99,12 @@ def test_a_damaged_image_is_reported_without_lines_of_its_library(tmp_path: Path
               "cx": 15.5, "cy": 11.5, "distortion": [0.0] * 4, "depth_unit_m": 0.001,
               "depth_kind": "range"}  # fmt: skip
     (tmp_path / "camera.json").write_text(json.dumps(camera))
-    _, said = shell(f"tofuse inspect {tmp_path}/a --camera {tmp_path}/camera.json")
-    assert said.count("\n") <= 1
-    assert "TIFF_Error" not in said
+    _, stderr = shell(f"tofuse inspect {tmp_path}/a --camera {tmp_path}/camera.json")
+    assert stderr.count("\n") <= 1
+    assert "TIFF_Error" not in stderr
     script = f"import cv2; cv2.imread({str(path)!r}, cv2.IMREAD_UNCHANGED)"
     alone = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert b"TIFF" in alone.stderr  # which OpenCV alone says
+    assert b"TIFF" in alone.stderr  # OpenCV alone prints it
 
 
 class Broken:
@@ -115,7 +117,7 @@ class Broken:
         raise BrokenPipeError
 
 
-def test_an_outlet_never_fails(tmp_path: Path) -> None:
+def test_safe_stream_never_raises(tmp_path: Path) -> None:
     out = SafeStream(Broken())  # type: ignore[arg-type]
     assert out.write("text") == 4
     out.writelines(["a", "b"])
@@ -144,17 +146,17 @@ def test_an_outlet_never_fails(tmp_path: Path) -> None:
         (BrokenPipeError(32, "Broken pipe"), 2, "Broken pipe"),
     ],
 )
-def test_what_stops_a_command_is_said_in_a_line(error, status, says, capfd) -> None:
+def test_command_failures_are_reported_in_one_line(error, status, says, capfd) -> None:
     def fail() -> int:
         raise error
 
     assert run_command(fail) == status
-    said = capfd.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
+    stderr = capfd.readouterr().err
+    assert says in stderr
+    assert stderr.count("\n") == 1
 
 
-def test_a_fault_of_ours_is_a_line_too_and_can_be_seen(capfd, monkeypatch) -> None:
+def test_program_bug_is_one_line_unless_traceback_is_requested(capfd, monkeypatch) -> None:
     def fail() -> int:
         raise ZeroDivisionError("in\nsome depth")
 
@@ -166,7 +168,7 @@ def test_a_fault_of_ours_is_a_line_too_and_can_be_seen(capfd, monkeypatch) -> No
 
 
 @pytest.mark.parametrize("place", ["prepare_process", "report_bugs"])
-def test_an_interruption_before_the_command_is_a_line_too(place, capfd, monkeypatch) -> None:
+def test_interrupt_during_startup_is_reported_in_one_line(place, capfd, monkeypatch) -> None:
     def interrupted(*_args: object) -> None:
         raise KeyboardInterrupt
 
@@ -175,7 +177,7 @@ def test_an_interruption_before_the_command_is_a_line_too(place, capfd, monkeypa
     assert capfd.readouterr().err == f"tofuse: interrupted; {cli._UNCHANGED}\n"
 
 
-def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:
+def test_ignored_signals_stay_ignored(tmp_path: Path) -> None:
     """As under nohup."""
     script = (
         "import os, signal, sys\n"
@@ -187,10 +189,10 @@ def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_a_signal_in_a_destructor_is_not_lost(name: str, status: int) -> None:
-    """Python drops what is raised there: Ctrl-C would be without effect."""
+def test_signal_in_destructor_is_not_lost(name: str, status: int) -> None:
+    """Python discards exceptions raised there: Ctrl-C would have no effect."""
     script = (
         "import os, signal, sys, threading, time, weakref\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -250,7 +252,7 @@ CGROUPS = {
 
 
 @pytest.mark.parametrize("name", CGROUPS)
-def test_quotas_of_containers_count(name, tmp_path, monkeypatch) -> None:
+def test_container_quotas_limit_cores(name, tmp_path, monkeypatch) -> None:
     files, wanted = CGROUPS[name]
     for path, text in files.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
@@ -262,7 +264,7 @@ def test_quotas_of_containers_count(name, tmp_path, monkeypatch) -> None:
     assert cores.usable_cores.__wrapped__() == expected
 
 
-def test_the_second_of_two_runs_is_refused_at_once(clouds: Path, tmp_path: Path, capfd) -> None:
+def test_second_run_into_same_folder_is_rejected(clouds: Path, tmp_path: Path, capfd) -> None:
     from tofuse.results.folder import OutputFolder
 
     with OutputFolder(tmp_path / "out"):

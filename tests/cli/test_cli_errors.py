@@ -51,7 +51,7 @@ def blank_all(recording: Path) -> None:
         write_png(file, np.zeros_like(read_image(file)))
 
 
-def noise_of_junk(recording: Path) -> None:
+def fill_all_with_junk(recording: Path) -> None:
     for file in (recording / "depth").iterdir():
         file.write_bytes(b"junk")
 
@@ -82,7 +82,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "missing folder": (shutil.rmtree, ("rec", "doesn't exist")),
     "empty folder": (empty, ("rec", "empty folder")),
     "all images truncated": (truncate_all, ("none of 4 frames", "000000.png", "cut off")),
-    "all images junk": (noise_of_junk, ("none of 4 frames", "000000.png")),
+    "all images junk": (fill_all_with_junk, ("none of 4 frames", "000000.png")),
     "other sizes": (lambda r: camera(r, width=99), ("99", "176")),
     "broken json": (lambda r: (r / "camera.json").write_text('{"a": '), ("camera.json", "JSON")),
     "empty json": (lambda r: (r / "camera.json").write_text(""), ("camera.json", "JSON")),
@@ -107,39 +107,39 @@ BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_bad_recordings(name, recording, tmp_path, capfd) -> None:
+def test_bad_recordings_are_rejected(name, recording, tmp_path, capfd) -> None:
     damage, says = BROKEN[name]
     damage(recording)
     before = listing(tmp_path)
-    said = refuses(capfd, "run", recording, "--out", tmp_path / "a" / "out", says=says)
-    assert ";" in said  # what to do about it
+    message = refuses(capfd, "run", recording, "--out", tmp_path / "a" / "out", says=says)
+    assert ";" in message  # the remedy
     assert listing(tmp_path) == before
 
 
-def test_an_unknown_key_does_not_add_lines_to_a_failure(recording, tmp_path, capfd) -> None:
+def test_unknown_key_adds_no_lines_to_error(recording, tmp_path, capfd) -> None:
     camera(recording, colour_of_case="grey")
     blank_all(recording)
     refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("0 valid points",))
 
 
-def test_files_that_may_not_be_read(recording, tmp_path, capfd, monkeypatch) -> None:
-    # Permissions mean nothing to root, so the system call is made to refuse.
+def test_unreadable_files_are_rejected(recording, tmp_path, capfd, monkeypatch) -> None:
+    # Permissions do not restrict root, so the system call is made to fail.
     def refuse(self: Path, *_args: object, **_options: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
 
     monkeypatch.setattr(Path, "open", refuse)
     monkeypatch.setattr(Path, "read_bytes", refuse)
-    said = refuses(
+    message = refuses(
         capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied")
     )
-    assert "Traceback" not in said
+    assert "Traceback" not in message
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.skipif(
-    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows may read everything"
+    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows can read everything"
 )
-def test_permissions(recording, tmp_path, capfd) -> None:
+def test_missing_permissions_are_reported(recording, tmp_path, capfd) -> None:
     (recording / "camera.json").chmod(0)
     refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("camera.json", "ermission"))
     (recording / "depth").chmod(0)
@@ -167,7 +167,7 @@ def _with(folder: Path, name: str) -> Path:
 
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])
-def test_bad_output_folders(name, options, recording, tmp_path, capfd) -> None:
+def test_bad_output_folders_are_rejected(name, options, recording, tmp_path, capfd) -> None:
     out = OUTPUTS[name](tmp_path)
     before = listing(tmp_path)
     refuses(capfd, "run", recording, "--out", out, *options, says=(str(out), "--out"))
@@ -175,7 +175,7 @@ def test_bad_output_folders(name, options, recording, tmp_path, capfd) -> None:
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
-def test_no_space_or_permission_for_the_output(code, recording, tmp_path, capfd, monkeypatch):
+def test_unwritable_output_is_reported(code, recording, tmp_path, capfd, monkeypatch):
     open_file = Path.open
 
     def full(self: Path, mode: str = "r", *args: object, **named: object) -> object:
@@ -186,13 +186,13 @@ def test_no_space_or_permission_for_the_output(code, recording, tmp_path, capfd,
     monkeypatch.setattr(Path, "open", full)
     before = listing(tmp_path)
     out = tmp_path / "out"
-    said = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))
-    assert os.strerror(code).lower() in said.lower()
-    assert ".tofuse" not in said
+    message = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))
+    assert os.strerror(code).lower() in message.lower()
+    assert ".tofuse" not in message
     assert listing(tmp_path) == before
 
 
-def test_a_folder_that_cannot_be_made(recording, tmp_path, capfd, monkeypatch) -> None:
+def test_failing_folder_creation_is_reported(recording, tmp_path, capfd, monkeypatch) -> None:
     def refuse(self: Path, *_args: object, **_options: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
 
@@ -292,7 +292,7 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("name", USAGE)
-def test_bad_usage(name, recording, tmp_path, capfd, monkeypatch) -> None:
+def test_bad_usage_is_reported(name, recording, tmp_path, capfd, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.move(recording, tmp_path / "REC")
     before = listing(tmp_path)
@@ -302,14 +302,14 @@ def test_bad_usage(name, recording, tmp_path, capfd, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["rig"]])
-def test_no_command_shows_the_help(words, capsys) -> None:
+def test_missing_command_prints_help(words, capsys) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(words)
-    said, complaint = capsys.readouterr()
+    out, err = capsys.readouterr()
     assert stopped.value.code == 0
-    assert said.startswith("usage: tofuse")
-    assert "commands:" in said
-    assert not complaint
+    assert out.startswith("usage: tofuse")
+    assert "commands:" in out
+    assert not err
 
 
 CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -337,20 +337,20 @@ CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_bad_configurations(name, recording, tmp_path, capfd) -> None:
+def test_bad_configurations_are_rejected(name, recording, tmp_path, capfd) -> None:
     text, says = CONFIGS[name]
     config = tmp_path / "my.toml"
     config.write_text(text, encoding="latin-1")
     words = ("run", recording, "--out", tmp_path / "out", "--config", config)
     if "method" not in text:
         words += ("--method", "thesis")
-    said = refuses(capfd, *words, says=says)
-    assert "my.toml" in said or "--method" in said
+    message = refuses(capfd, *words, says=says)
+    assert "my.toml" in message or "--method" in message
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"schema": 1}', '{"schema": 1, "config": 3}', "{}"])
-def test_a_run_json_that_is_none(text, recording, tmp_path, capfd) -> None:
+def test_invalid_run_json_is_rejected(text, recording, tmp_path, capfd) -> None:
     config = tmp_path / "run.json"
     config.write_text(text)
     words = ("run", recording, "--out", tmp_path / "out", "--config", config)
@@ -368,7 +368,7 @@ def test_a_run_json_that_is_none(text, recording, tmp_path, capfd) -> None:
         ("0 3 nan 0 0 0 0 0 1\n", ("line 1",)),
     ],
 )
-def test_bad_loops(text, says, recording, tmp_path, capfd) -> None:
+def test_bad_loop_files_are_rejected(text, says, recording, tmp_path, capfd) -> None:
     loops = tmp_path / "loops.txt"
     loops.write_text(text)
     words = ("run", recording, "--out", tmp_path / "out", "--loops", loops)
@@ -388,14 +388,14 @@ GRAPHS = {
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_broken_graphs(name, tmp_path, capfd) -> None:
+def test_broken_graphs_are_rejected(name, tmp_path, capfd) -> None:
     graph = tmp_path / "in.g2o"
     graph.write_text(GRAPHS[name], encoding="latin-1")
     refuses(capfd, "optimize", graph, "--out", tmp_path / "out.g2o", says=("in.g2o",))
     assert not (tmp_path / "out.g2o").exists()
 
 
-def test_trajectories_that_do_not_match_in_time(tmp_path, capfd) -> None:
+def test_unmatched_trajectories_are_rejected(tmp_path, capfd) -> None:
     for name, start in (("a.txt", 0), ("b.txt", 1000)):
         lines = [f"{start + k} {k} 0 0 0 0 0 1" for k in range(5)]
         (tmp_path / name).write_text("\n".join(lines))
@@ -407,12 +407,12 @@ def test_trajectories_that_do_not_match_in_time(tmp_path, capfd) -> None:
     refuses(capfd, "evaluate", tmp_path / "a.txt", tmp_path / "d.txt", says=("d.txt",))
 
 
-def test_inspect_of_nothing_readable(recording, capfd) -> None:
+def test_inspect_rejects_unreadable_recording(recording, capfd) -> None:
     truncate_all(recording)
     refuses(capfd, "inspect", recording, says=("none of 4 frames",))
 
 
-def test_what_no_room_foresaw_is_still_one_line(capfd, monkeypatch) -> None:
+def test_unexpected_errors_are_one_line(capfd, monkeypatch) -> None:
     def fail(*_args: object, **_options: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO), "some/file")
 

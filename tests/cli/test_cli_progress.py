@@ -31,7 +31,7 @@ class Clock:
         return self.now
 
 
-def test_pace_is_that_of_the_last_steps() -> None:
+def test_pace_is_that_of_recent_steps() -> None:
     clock = Clock()
     pace = Pace(200, clock)
     assert (pace.per_second, pace.seconds_left) == (None, None)
@@ -53,7 +53,7 @@ def test_pace_is_that_of_the_last_steps() -> None:
     assert unknown.seconds_left is None
 
 
-def test_health_tells_of_the_newest_frame_and_of_what_was_lost() -> None:
+def test_health_shows_newest_frame_and_lost_count() -> None:
     health = Health()
     assert health.markup == ""
     seen = []
@@ -90,7 +90,7 @@ def test_durations_are_short(seconds: float, words: str) -> None:
     assert module._duration(seconds) == words
 
 
-def test_who_looks_decides(monkeypatch) -> None:
+def test_output_stream_selects_progress_type(monkeypatch) -> None:
     assert isinstance(progress_for(as_json=True), JsonProgress)
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     assert isinstance(progress_for(as_json=False), QuietProgress)
@@ -98,7 +98,7 @@ def test_who_looks_decides(monkeypatch) -> None:
     assert isinstance(progress_for(as_json=False), TerminalProgress)
 
 
-def test_programs_hear_how_far_it_is(capsys) -> None:
+def test_json_progress_reports_events(capsys) -> None:
     with JsonProgress() as progress:
         progress.stage("tracking", 2)
         progress.advance(FrameRecord(4, 0.0, "tracked", inlier_share=0.912345))
@@ -132,9 +132,9 @@ print("done")
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="terminals of other systems")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX terminal")
 @pytest.mark.parametrize("columns", [50, 100])
-def test_a_terminal_shows_stages_and_is_clean_afterwards(columns: int) -> None:
+def test_terminal_shows_stages_and_is_cleared_at_end(columns: int) -> None:
     import pty
 
     ours, theirs = pty.openpty()
@@ -147,7 +147,7 @@ def test_a_terminal_shows_stages_and_is_clean_afterwards(columns: int) -> None:
     while time.monotonic() < deadline:
         try:
             chunk = os.read(ours, 65536)
-        except OSError:  # Linux says so when the other end is closed
+        except OSError:  # raised by Linux when the other end is closed
             break
         if not chunk:
             break
@@ -165,6 +165,6 @@ def test_a_terminal_shows_stages_and_is_clean_afterwards(columns: int) -> None:
     health = "93% inliers, 1 without a pose" if columns == 100 else "93%"
     pattern = rf"\d/40 +\d+\.\d/s, \d+\.\d s left +{health}"
     assert any(re.search(pattern, line) for line in lines), lines
-    # What was shown is wiped out line by line before the last word.
+    # The display is erased line by line before the final output.
     assert lines[-2:] == ["done", ""] or lines[-1] == "done"
     assert re.search(r"\x1b\[2K[^a-zA-Z0-9]*done", text)

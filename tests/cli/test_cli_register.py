@@ -25,7 +25,7 @@ from tofuse.registration.base import Registration
 
 FILES = {"registration.json", "transform.txt", "aligned.ply", "report.html"}
 MAP = np.array([512_345.25, 4_012_345.5, 310.0])
-MIDDLE = np.add(MAP, (0, 0, 2.0))  # of the clouds there
+MIDDLE = np.add(MAP, (0, 0, 2.0))  # centre of the clouds there
 T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
 
 
@@ -45,8 +45,8 @@ def clouds(tmp_path) -> tuple[Path, Path]:
     return tmp_path / "source.ply", tmp_path / "target.ply"
 
 
-def told(capfd, *words: object) -> tuple[int, dict]:
-    """Run with --json; nothing but one object is printed."""
+def register_json(capfd, *words: object) -> tuple[int, dict]:
+    """Run with --json, which prints exactly one object."""
     capfd.readouterr()
     status = call("register", *words, "--json")
     out = capfd.readouterr().out
@@ -55,7 +55,7 @@ def told(capfd, *words: object) -> tuple[int, dict]:
 
 
 def gap(T: np.ndarray, truth: np.ndarray, at: np.ndarray) -> tuple[float, float]:
-    """How far apart two motions take a point (m), and their angle (degrees)."""
+    """Distance between a point moved by two motions (m), and their angle (degrees)."""
     step = se3.transform(T, at[None]) - se3.transform(truth, at[None])
     return float(np.linalg.norm(step)), float(np.degrees(se3.angle(se3.inverse(T) @ truth)))
 
@@ -71,21 +71,21 @@ def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
     return se3.inverse(poses[target]) @ poses[source]
 
 
-def test_two_frames_of_a_recording(room_recording, tmp_path, capfd) -> None:
+def test_two_frames_of_recording_are_registered(room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
-    status, said = told(
+    status, output = register_json(
         capfd, f"{room_recording}#3", f"{room_recording}#0", "--out", out, "--threads", 2
     )
     assert status == 0
-    assert said["believed"] is True
-    assert said["probability"] > 0.9
-    assert said["reason"] == ""
-    assert (said["source"]["frame"], said["target"]["frame"]) == (3, 0)
-    assert said["source"]["format"] == "native"
-    near(said["T_target_source"], true_motion(room_recording, 3, 0), metres=0.03, degrees=1)
+    assert output["believed"] is True
+    assert output["probability"] > 0.9
+    assert output["reason"] == ""
+    assert (output["source"]["frame"], output["target"]["frame"]) == (3, 0)
+    assert output["source"]["format"] == "native"
+    near(output["T_target_source"], true_motion(room_recording, 3, 0), metres=0.03, degrees=1)
     assert {p.name for p in out.iterdir()} == FILES
     written = json.loads((out / "registration.json").read_text())
-    assert {**written, "out": str(out)} == said
+    assert {**written, "out": str(out)} == output
     assert written["schema"] == 1
     assert len(written["covariance"]) == 36
     covariance = np.reshape(written["covariance"], (6, 6))
@@ -93,10 +93,10 @@ def test_two_frames_of_a_recording(room_recording, tmp_path, capfd) -> None:
         covariance @ np.reshape(written["information"], (6, 6)), np.eye(6), atol=1e-6
     )
     assert written["sigma_m"] == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-    np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), said["T_target_source"])
+    np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), output["T_target_source"])
     frame = open_recording(room_recording)[3]
     ply = read_ply(out / "aligned.ply")
-    moved = se3.transform(np.array(said["T_target_source"]), frame.points.astype(float))
+    moved = se3.transform(np.array(output["T_target_source"]), frame.points.astype(float))
     np.testing.assert_allclose(ply.points, moved, atol=1e-5)
     np.testing.assert_array_equal(ply.amplitude, frame.amplitude)
     page = (out / "report.html").read_text()
@@ -105,43 +105,43 @@ def test_two_frames_of_a_recording(room_recording, tmp_path, capfd) -> None:
     assert (out / "report.html").stat().st_size < 4e6
 
 
-def test_the_index_is_that_of_the_recording(room_recording, capfd) -> None:
+def test_frame_numbers_select_source_and_target(room_recording, capfd) -> None:
     """Source and target are not mixed up: the other way round gives the inverse."""
-    _, there = told(capfd, f"{room_recording}#5", f"{room_recording}#4")
-    _, back = told(capfd, f"{room_recording}#4", f"{room_recording}#5")
+    _, there = register_json(capfd, f"{room_recording}#5", f"{room_recording}#4")
+    _, back = register_json(capfd, f"{room_recording}#4", f"{room_recording}#5")
     near(there["T_target_source"], true_motion(room_recording, 5, 4), metres=0.03, degrees=1)
     near(se3.inverse(back["T_target_source"]), np.array(there["T_target_source"]), metres=0.03)
 
 
-def test_what_is_printed(room_recording, capfd) -> None:
+def test_result_is_printed(room_recording, capfd) -> None:
     assert call("register", f"{room_recording}#1", f"{room_recording}#0") == 0
-    said = capfd.readouterr().out.splitlines()
-    assert said[0].startswith("accepted: probability")
-    start = next(k for k, line in enumerate(said) if line.startswith("T_target_source"))
-    rows = [line.removeprefix("T_target_source").split() for line in said[start : start + 4]]
+    output = capfd.readouterr().out.splitlines()
+    assert output[0].startswith("accepted: probability")
+    start = next(k for k, line in enumerate(output) if line.startswith("T_target_source"))
+    rows = [line.removeprefix("T_target_source").split() for line in output[start : start + 4]]
     T = np.array(rows, float)
     near(T, true_motion(room_recording, 1, 0), metres=0.03, degrees=1)
-    names = [line.split("  ")[0] for line in said if not line.startswith(" ")]
+    names = [line.split("  ")[0] for line in output if not line.startswith(" ")]
     assert names[1:] == ["translation", "rotation", "T_target_source", "overlap", "rms distance",
                          "sigma"]  # fmt: skip
     angle = np.degrees(se3.angle(T))
-    assert f"{angle:.3f}" in next(line for line in said if line.startswith("rotation"))
+    assert f"{angle:.3f}" in next(line for line in output if line.startswith("rotation"))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las", ".laz"])
-def test_clouds_of_each_format(suffix, clouds, capfd) -> None:
+def test_clouds_of_each_format_are_registered(suffix, clouds, capfd) -> None:
     paths = []
     for path in clouds:
         points = read_ply(path).points.astype(float)
         other = path.with_suffix(suffix)
         paths.append(other)
         write_cloud(other, points)
-    status, said = told(capfd, *paths)
+    status, output = register_json(capfd, *paths)
     assert status == 0
-    assert said["believed"] is True
-    assert said["probability"] > 0.9
-    assert said["source"]["format"] == ("las" if suffix == ".laz" else suffix[1:])
-    near(said["T_target_source"], T_SMALL)
+    assert output["believed"] is True
+    assert output["probability"] > 0.9
+    assert output["source"]["format"] == ("las" if suffix == ".laz" else suffix[1:])
+    near(output["T_target_source"], T_SMALL)
 
 
 def write_cloud(path: Path, points: np.ndarray) -> None:
@@ -168,7 +168,7 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
         data.write(path)
 
 
-def test_scans_of_one_e57(clouds, tmp_path, capfd) -> None:
+def test_scans_of_one_e57_are_registered(clouds, tmp_path, capfd) -> None:
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "scans.e57"
     file = pye57.E57(str(path), mode="w")
@@ -176,14 +176,14 @@ def test_scans_of_one_e57(clouds, tmp_path, capfd) -> None:
         points = read_ply(cloud).points.astype(float)
         file.write_scan_raw({f"cartesian{a}": points[:, k] for k, a in enumerate("XYZ")})
     file.close()
-    status, said = told(capfd, f"{path}#0", f"{path}#1")
+    status, output = register_json(capfd, f"{path}#0", f"{path}#1")
     assert status == 0
-    near(said["T_target_source"], T_SMALL)
+    near(output["T_target_source"], T_SMALL)
     refuses(capfd, "register", path, f"{path}#1", says=("scans.e57", "contains 2 frames", "#0"))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las"])
-def test_map_coordinates_come_back_to_the_millimetre(
+def test_map_coordinates_keep_millimetre_precision(
     suffix, clouds, tmp_path, capfd, light_page
 ) -> None:
     """Half a million and four millions of metres from the origin, where float32 steps by 0.25 m."""
@@ -192,71 +192,71 @@ def test_map_coordinates_come_back_to_the_millimetre(
     write_cloud(paths[0], source)
     write_cloud(paths[1], target)
     out = tmp_path / "out"
-    _, said = told(capfd, *paths, "--out", out)
-    T = np.array(said["T_target_source"])
+    _, output = register_json(capfd, *paths, "--out", out)
+    T = np.array(output["T_target_source"])
     shift = np.eye(4)
     shift[:3, 3] = MAP
     truth = shift @ T_SMALL @ se3.inverse(shift)
     near(T, truth, MIDDLE)
-    assert gap(T, truth, MIDDLE)[0] > 1e-9  # of the clouds, not given away by the test
-    np.testing.assert_allclose(said["reference_point_m"], MIDDLE, atol=1.5)
-    assert said["warnings"] == []  # what readers take off is added again
+    assert gap(T, truth, MIDDLE)[0] > 1e-9  # estimated from the clouds, not leaked by the test
+    np.testing.assert_allclose(output["reference_point_m"], MIDDLE, atol=1.5)
+    assert output["warnings"] == []  # the offset that readers subtract is added again
     aligned = read_ply(out / "aligned.ply")
     assert aligned.points.dtype == np.float64
     np.testing.assert_allclose(aligned.points, se3.transform(T, source), atol=1e-3)
     np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), T)
-    # As a guess the result leads to itself: nothing is lost on the way out and in.
-    _, again = told(capfd, *paths, "--guess", out / "registration.json")
+    # With the result as guess the result is the same: it is stored without loss.
+    _, again = register_json(capfd, *paths, "--guess", out / "registration.json")
     near(again["T_target_source"], T, MIDDLE, metres=0.002, degrees=0.1)
 
 
-def test_a_cloud_of_a_map_and_one_about_the_origin(tmp_path, capfd) -> None:
-    """Without a guess they are laid over each other; the result is between the files."""
+def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
+    """Without a guess the centres are aligned first; the result is in the frames of the files."""
     target = bumpy_ball(6000, 1) + MAP
     source = se3.transform(se3.inverse(T_SMALL), bumpy_ball(6000, 2))
     write_cloud(tmp_path / "map.ply", target)
     write_cloud(tmp_path / "local.ply", source)
-    _, said = told(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
+    _, output = register_json(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
     shift = np.eye(4)
     shift[:3, 3] = MAP
-    near(said["T_target_source"], shift @ T_SMALL, metres=0.02, degrees=1)
+    near(output["T_target_source"], shift @ T_SMALL, metres=0.02, degrees=1)
 
 
-def test_an_image_and_a_cloud(room_recording, tmp_path, capfd) -> None:
+def test_image_and_cloud_are_registered(room_recording, tmp_path, capfd) -> None:
     frame = open_recording(room_recording)[0]
     write_ply(
         tmp_path / "cloud.ply",
         GeometryRecord(frame.points, color=np.zeros_like(frame.points, np.uint8)),
     )
-    status, said = told(
+    status, output = register_json(
         capfd, f"{room_recording}#1", tmp_path / "cloud.ply",
         "--camera", room_recording / "camera.json",
     )  # fmt: skip
     assert status == 0
-    near(said["T_target_source"], true_motion(room_recording, 1, 0), metres=0.05, degrees=1.5)
+    near(output["T_target_source"], true_motion(room_recording, 1, 0), metres=0.05, degrees=1.5)
 
 
-def test_single_depth_images(room_recording, tmp_path, capfd) -> None:
+def test_single_depth_images_are_registered(room_recording, tmp_path, capfd) -> None:
     for k in (0, 2):
         shutil.copy(room_recording / "depth" / f"{k:06d}.png", tmp_path / f"{k}.png")
     lone = tmp_path / "2.png", tmp_path / "0.png"
     refuses(capfd, "register", *lone, says=("2.png", "without a camera", "--camera"))
-    _, said = told(capfd, *lone, "--camera", room_recording / "camera.json")
-    assert said["source"]["format"] == "depth-png"
-    near(said["T_target_source"], true_motion(room_recording, 2, 0), metres=0.05, degrees=1.5)
+    _, output = register_json(capfd, *lone, "--camera", room_recording / "camera.json")
+    assert output["source"]["format"] == "depth-png"
+    near(output["T_target_source"], true_motion(room_recording, 2, 0), metres=0.05, degrees=1.5)
     shutil.copy(room_recording / "camera.json", tmp_path / "camera.json")
-    _, beside = told(capfd, *lone)
-    assert beside["T_target_source"] == said["T_target_source"]
+    _, beside = register_json(capfd, *lone)
+    assert beside["T_target_source"] == output["T_target_source"]
     inside = room_recording / "depth" / "000002.png"
     refuses(capfd, "register", inside, lone[1], says=(f"use {room_recording}#2",))
 
 
-def test_a_path_with_a_number_sign_is_a_path(clouds, tmp_path, capfd) -> None:
+def test_path_may_contain_number_sign(clouds, tmp_path, capfd) -> None:
     odd = tmp_path / "scan#7.ply"
     shutil.copy(clouds[0], odd)
-    _, said = told(capfd, odd, f"{clouds[1]}#0")
-    assert (said["source"]["path"], said["source"]["frame"]) == (str(odd), 0)
-    assert (said["target"]["path"], said["target"]["frame"]) == (str(clouds[1]), 0)
+    _, output = register_json(capfd, odd, f"{clouds[1]}#0")
+    assert (output["source"]["path"], output["source"]["frame"]) == (str(odd), 0)
+    assert (output["target"]["path"], output["target"]["frame"]) == (str(clouds[1]), 0)
 
 
 GUESSES = {
@@ -274,15 +274,15 @@ def tum_words(T: np.ndarray) -> str:
 
 
 @pytest.mark.parametrize("form", GUESSES)
-def test_a_guess_is_read_in_each_form(form, tmp_path) -> None:
+def test_guess_formats_are_read(form, tmp_path) -> None:
     T = se3.exp([4e5, -2, 0.3, 0.4, -0.2, 1.0])
     path = tmp_path / "guess"
     path.write_text(GUESSES[form](T))
     np.testing.assert_allclose(read_pose(path), T, rtol=0, atol=1e-9)
 
 
-def test_a_guess_decides_where_it_starts(clouds, tmp_path, capfd, monkeypatch) -> None:
-    """The engine is given the guess, or none."""
+def test_guess_is_passed_to_registration(clouds, tmp_path, capfd, monkeypatch) -> None:
+    """Registration receives the guess, or none."""
     seen = []
 
     def spy(source, target, *, guess=None):
@@ -292,11 +292,11 @@ def test_a_guess_decides_where_it_starts(clouds, tmp_path, capfd, monkeypatch) -
     monkeypatch.setattr(pair_module, "register", spy)
     T = se3.exp([0.1, 0.2, 0.3, 0.4, -0.2, 1.0])
     (tmp_path / "guess.txt").write_text(GUESSES["tum"](T))
-    _, said = told(capfd, *clouds, "--guess", tmp_path / "guess.txt")
+    _, output = register_json(capfd, *clouds, "--guess", tmp_path / "guess.txt")
     np.testing.assert_allclose(seen[0], T, atol=1e-9)
-    np.testing.assert_allclose(said["T_target_source"], T, atol=1e-9)
-    assert said["guess"] == str(tmp_path / "guess.txt")
-    told(capfd, *clouds)
+    np.testing.assert_allclose(output["T_target_source"], T, atol=1e-9)
+    assert output["guess"] == str(tmp_path / "guess.txt")
+    register_json(capfd, *clouds)
     assert seen[1] is None
 
 
@@ -320,17 +320,17 @@ BAD_GUESSES = {
 
 
 @pytest.mark.parametrize("name", BAD_GUESSES)
-def test_a_bad_guess_is_refused(name, clouds, tmp_path, capfd) -> None:
+def test_bad_guess_is_rejected(name, clouds, tmp_path, capfd) -> None:
     text, says = BAD_GUESSES[name]
     guess = tmp_path / "guess.txt"
     if text is not None:
         guess.write_text(text)
     before = listing(tmp_path)
-    said = refuses(
+    output = refuses(
         capfd, "register", *clouds, "--guess", guess, "--out", tmp_path / "out",
         says=(str(guess), *says),
     )  # fmt: skip
-    assert ";" in said  # what to do about it
+    assert ";" in output  # the remedy
     assert listing(tmp_path) == before
 
 
@@ -375,24 +375,24 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
     ["missing", "missing recording", "empty cloud", "nan cloud", "few points", "no cloud",
      "several frames", "out of range", "out of range of one", "negative", "no number"],
 )  # fmt: skip
-def test_a_bad_view_is_refused(name, role, clouds, room_recording, tmp_path, capfd) -> None:
+def test_bad_view_is_rejected(name, role, clouds, room_recording, tmp_path, capfd) -> None:
     bad, says = bad_view(name, tmp_path, room_recording)
     before = listing(tmp_path)
     words = (bad, clouds[1]) if role == "source" else (clouds[0], bad)
-    said = refuses(capfd, "register", *words, "--out", tmp_path / "out", says=says)
-    assert ";" in said
+    output = refuses(capfd, "register", *words, "--out", tmp_path / "out", says=says)
+    assert ";" in output
     assert listing(tmp_path) == before
 
 
-def test_a_camera_for_two_clouds_is_refused(clouds, room_recording, capfd) -> None:
+def test_camera_for_clouds_is_rejected(clouds, room_recording, capfd) -> None:
     refuses(
         capfd, "register", *clouds, "--camera", room_recording / "camera.json",
         says=("--camera", "'ply'", "leave it out"),
     )  # fmt: skip
 
 
-def test_clouds_that_share_nothing_are_refused_in_a_line(tmp_path, capfd) -> None:
-    """No motion is fixed by points on a line."""
+def test_degenerate_clouds_are_rejected(tmp_path, capfd) -> None:
+    """Points on a line do not constrain the motion."""
     for k in range(2):
         write_ply(tmp_path / f"{k}.ply", GeometryRecord(np.linspace([0, 0, 1], [1, 0, 1 + k], 40)))
     refuses(capfd, "register", tmp_path / "0.ply", tmp_path / "1.ply", says=("tofuse: ",))
@@ -407,16 +407,18 @@ def test_clouds_that_share_nothing_are_refused_in_a_line(tmp_path, capfd) -> Non
         (("a.ply", "b.ply", "--gess", "x"), ("--gess", "--guess")),
     ],
 )
-def test_bad_usage(words, says, capfd) -> None:
+def test_bad_usage_is_reported(words, says, capfd) -> None:
     refuses(capfd, "register", *words, says=says, prefix="tofuse register: ")
 
 
-def test_overwrite_alone_is_refused(clouds, capfd) -> None:
+def test_overwrite_without_out_is_rejected(clouds, capfd) -> None:
     refuses(capfd, "register", *clouds, "--overwrite", says=("--overwrite", "--out"))
 
 
-def test_an_output_folder_of_others_is_refused(clouds, tmp_path, capfd, monkeypatch) -> None:
-    monkeypatch.setattr(pair_module, "register", lambda *a, **k: pytest.fail("work was begun"))
+def test_foreign_output_folder_is_rejected(clouds, tmp_path, capfd, monkeypatch) -> None:
+    monkeypatch.setattr(
+        pair_module, "register", lambda *a, **k: pytest.fail("registration was started")
+    )
     for name, content in (("photo.jpg", "mine"), ("run.json", "{}"), ("registration.json", "{}")):
         out = tmp_path / f"for {name}"
         out.mkdir()
@@ -427,9 +429,7 @@ def test_an_output_folder_of_others_is_refused(clouds, tmp_path, capfd, monkeypa
         assert (out / name).read_text() == content
 
 
-def test_overwrite_replaces_an_earlier_result_and_nothing_else(
-    clouds, tmp_path, capfd, light_page
-) -> None:
+def test_overwrite_replaces_only_earlier_result(clouds, tmp_path, capfd, light_page) -> None:
     out = tmp_path / "out"
     assert call("register", *clouds, "--out", out) == 0
     first = (out / "registration.json").read_text()
@@ -444,7 +444,7 @@ def test_overwrite_replaces_an_earlier_result_and_nothing_else(
     assert (out / "notes.txt").read_text() == "mine"
 
 
-def test_a_failure_while_writing_leaves_an_earlier_result(
+def test_write_failure_keeps_earlier_result(
     clouds, tmp_path, capfd, monkeypatch, light_page
 ) -> None:
     out = tmp_path / "out"
@@ -465,7 +465,7 @@ def test_a_failure_while_writing_leaves_an_earlier_result(
 
 
 def made(T: np.ndarray, **more: object) -> Registration:
-    """A result of an engine that knows only what it must."""
+    """A registration with only the required fields."""
     plain = Registration(T, True, 3, 80, 100, 0.1, 0.004, 1e6 * np.eye(6))
     return replace(plain, **more)
 
@@ -484,21 +484,21 @@ def made(T: np.ndarray, **more: object) -> Registration:
         ({}, 3, "not verified: the method can't verify its result"),
     ],
 )
-def test_belief_decides_the_exit_status(
+def test_verification_sets_exit_status(
     more, status, says, clouds, tmp_path, capfd, monkeypatch, light_page
 ) -> None:
-    """Whatever else the engine leaves out."""
+    """Even if all optional fields are missing."""
     monkeypatch.setattr(pair_module, "register", lambda *a, **k: made(T_SMALL, **more))
     assert call("register", *clouds, "--out", tmp_path / "out") == status
     assert capfd.readouterr().out.splitlines()[0] == says
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
-    again, said = told(capfd, *clouds)
+    again, output = register_json(capfd, *clouds)
     assert again == status
-    assert said["believed"] is more.get("believed")
-    assert said["runner_up"] is said["margin"] is said["overlap"] is None
+    assert output["believed"] is more.get("believed")
+    assert output["runner_up"] is output["margin"] is output["overlap"] is None
 
 
-def test_a_page_of_a_pair_of_which_hardly_anything_is_known(tmp_path, monkeypatch, capfd) -> None:
+def test_report_of_minimal_pair(tmp_path, monkeypatch, capfd) -> None:
     """Too few points for surfaces, no distance, and a start far away."""
     for name in ("a&b.ply", "target.ply"):
         write_ply(tmp_path / name, GeometryRecord(np.random.default_rng(1).normal(size=(12, 3))))
@@ -527,7 +527,7 @@ def printed(capfd, monkeypatch, clouds, found: Registration) -> dict[str, str]:
     return {line[:15].strip(): line[15:].strip() for line in named}
 
 
-def test_degenerate_directions_in_words(clouds, capfd, monkeypatch) -> None:
+def test_degenerate_directions_are_described(clouds, capfd, monkeypatch) -> None:
     wall = np.eye(6)[[0, 1, 5]]
     mixed = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] @ wall
     both = "1.00 mm, 0.057°"
@@ -539,39 +539,45 @@ def test_degenerate_directions_in_words(clouds, capfd, monkeypatch) -> None:
         (np.eye(6)[:3], "sliding in any direction", "0.057° (1"),
         (np.array([[1, 1, 0, 0, 0, 0]]) / np.sqrt(2), "sliding along (0.71, 0.71, 0.00)", both),
     ):
-        said = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=free))
-        assert says in said["unobservable"], says
-        # What is not observable is not part of the stated accuracy.
-        assert said["sigma"].startswith(sigma), says
-        _, data = told(capfd, *clouds)
+        output = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=free))
+        assert says in output["unobservable"], says
+        # Unobservable directions are not part of the stated accuracy.
+        assert output["sigma"].startswith(sigma), says
+        _, data = register_json(capfd, *clouds)
         assert data["covariance"] is None
-    said = printed(capfd, monkeypatch, clouds, made(np.eye(4)))
-    assert "unobservable" not in said
-    said = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=np.eye(6)))
-    assert said["sigma"].startswith("unknown")
+    output = printed(capfd, monkeypatch, clouds, made(np.eye(4)))
+    assert "unobservable" not in output
+    output = printed(capfd, monkeypatch, clouds, made(np.eye(4), unobservable=np.eye(6)))
+    assert output["sigma"].startswith("unknown")
 
 
-def test_information_that_is_no_good_gives_no_accuracy(clouds, capfd, monkeypatch) -> None:
+def test_invalid_information_gives_no_accuracy(clouds, capfd, monkeypatch) -> None:
     for information in (np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6)):
         found = made(np.eye(4), information=information, rms_m=float("nan"))
         monkeypatch.setattr(pair_module, "register", lambda *a, found=found, **k: found)
-        _, said = told(capfd, *clouds)
-        assert said["covariance"] is said["sigma_m"] is said["sigma_rad"] is said["rms_m"] is None
+        _, output = register_json(capfd, *clouds)
+        assert (
+            output["covariance"]
+            is output["sigma_m"]
+            is output["sigma_rad"]
+            is output["rms_m"]
+            is None
+        )
 
 
-def test_the_runner_up_is_told_by_margin_and_place(clouds, capfd, monkeypatch) -> None:
+def test_runner_up_is_reported(clouds, capfd, monkeypatch) -> None:
     other = se3.exp([0.3, 0, 0, 0, 0, 0])
     found = made(np.eye(4), runner_up=other, margin=0.125, believed=True, probability=0.95,
                  overlap=0.8, support=0.7, contradiction=0.01)  # fmt: skip
-    said = printed(capfd, monkeypatch, clouds, found)
-    assert said["runner-up"] == "0.300 m and 0.0° away, fits 12 % fewer of the points"
+    output = printed(capfd, monkeypatch, clouds, found)
+    assert output["runner-up"] == "0.300 m and 0.0° away, fits 12 % fewer of the points"
     overlap = "80 % of the points overlap, 70 % support the pose, 1.0 % contradict it"
-    assert said["overlap"] == overlap
-    _, data = told(capfd, *clouds)
+    assert output["overlap"] == overlap
+    _, data = register_json(capfd, *clouds)
     np.testing.assert_allclose(data["runner_up"], other)
 
 
-def test_what_is_known_of_points_goes_along(clouds, tmp_path, capfd, light_page) -> None:
+def test_point_attributes_are_kept(clouds, tmp_path, capfd, light_page) -> None:
     points = read_ply(clouds[0]).points
     count = len(points)
     color = np.random.default_rng(1).integers(0, 255, (count, 3)).astype(np.uint8)
@@ -581,23 +587,23 @@ def test_what_is_known_of_points_goes_along(clouds, tmp_path, capfd, light_page)
         clouds[0],
         GeometryRecord(points, color=color, normals=normals, scalars={"intensity": light}),
     )
-    _, said = told(capfd, *clouds, "--out", tmp_path / "out")
+    _, output = register_json(capfd, *clouds, "--out", tmp_path / "out")
     aligned = read_ply(tmp_path / "out" / "aligned.ply")
     np.testing.assert_array_equal(aligned.color, color)
     np.testing.assert_array_equal(aligned.amplitude, light)
-    R = np.array(said["T_target_source"])[:3, :3]
+    R = np.array(output["T_target_source"])[:3, :3]
     np.testing.assert_allclose(aligned.normals, normals @ R.T, atol=1e-6)
 
 
-def test_a_bad_pose_of_a_trajectory_line_is_not_taken_for_a_matrix(tmp_path) -> None:
-    """Two lines of a trajectory hold sixteen numbers too, and are no rigid motion."""
+def test_two_trajectory_lines_are_not_read_as_matrix(tmp_path) -> None:
+    """Two lines of a trajectory also have sixteen numbers, but are no rigid motion."""
     write_tum(tmp_path / "t.txt", [0.0, 1.0], np.stack([np.eye(4), T_SMALL]))
     with pytest.raises(Exception, match=r"last row|rotation"):
         read_pose(tmp_path / "t.txt")
 
 
-def test_the_page_in_a_browser(room_recording, tmp_path) -> None:
-    """The three states differ, views can be switched off, and nothing is asked of others."""
+def test_report_in_browser(room_recording, tmp_path) -> None:
+    """The three states differ, views can be hidden, and the page makes no external requests."""
     out = tmp_path / "out"
     assert call("register", f"{room_recording}#4", f"{room_recording}#0", "--out", out) == 0
     page_file = out / "report.html"

@@ -93,7 +93,7 @@ def plain_run(room_recording, tmp_path_factory) -> Path:
     return out
 
 
-def test_the_files_of_the_contract(plain_run, room_recording) -> None:
+def test_output_files_follow_contract(plain_run, room_recording) -> None:
     assert {p.name for p in plain_run.iterdir()} == FILES
     times, poses = read_tum(plain_run / "trajectory.txt")
     recorded, _ = read_tum(room_recording / "groundtruth.txt")
@@ -112,7 +112,7 @@ def test_the_files_of_the_contract(plain_run, room_recording) -> None:
     assert not re.search(r"(src|href)=[\"']https?:", report)
 
 
-def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
+def test_run_json_follows_contract(plain_run, room_recording) -> None:
     data = run_json(plain_run)
     assert set(data) == {
         "schema",
@@ -180,13 +180,13 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         assert 0 <= values["removed"] <= 1
 
 
-def test_one_seed_one_result_whatever_the_threads(plain_run, room_recording, tmp_path) -> None:
+def test_result_is_independent_of_threads(plain_run, room_recording, tmp_path) -> None:
     for name, options in (("one", ["--threads", 1]), ("two", ["--threads", 2])):
         run(room_recording, "--out", tmp_path / name, *options)
         assert same(tmp_path / name) == same(plain_run)
 
 
-def test_the_seed_decides_what_is_random(room_recording, tmp_path) -> None:
+def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         options = ["--method", "thesis", "--seed", seed, "--threads", 1 + (name == "b")]
         run(room_recording, "--out", tmp_path / name, "--every", 2, *options)
@@ -195,7 +195,7 @@ def test_the_seed_decides_what_is_random(room_recording, tmp_path) -> None:
     assert len(found) == 2
 
 
-def test_an_earlier_run_json_gives_the_same_bytes(recording, tmp_path) -> None:
+def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
     for file in (recording / "confidence").iterdir():
@@ -215,12 +215,12 @@ def test_an_earlier_run_json_gives_the_same_bytes(recording, tmp_path) -> None:
     again = run_json(tmp_path / "b")
     assert again["config"] == config
     assert again["seed"] == 3
-    # What is said at the command line goes before what the file says.
+    # Options of the command line override those of the file.
     run(recording, "--out", tmp_path / "c", "--config", tmp_path / "a/run.json", "--seed", 4)
     assert run_json(tmp_path / "c")["seed"] == 4
 
 
-def test_options_of_a_toml_file(room_recording, tmp_path) -> None:
+def test_options_are_read_from_toml(room_recording, tmp_path) -> None:
     file = tmp_path / "my.toml"
     file.write_text('method = "thesis"\nfilters = []\n[fusion]\nvoxel_m = 0.1\n')
     run(room_recording, "--out", tmp_path / "out", "--config", file, "--guess", "identity")
@@ -230,7 +230,7 @@ def test_options_of_a_toml_file(room_recording, tmp_path) -> None:
     assert len(read_ply(tmp_path / "out/cloud.ply")) < 5000
 
 
-def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
+def test_filters_from_options_come_first(room_recording, tmp_path) -> None:
     thesis = ["--method", "thesis"]
     run(room_recording, "--out", tmp_path / "a", "--min-depth", 1, "--every", 4, *thesis)
     names = [f["part"] for f in run_json(tmp_path / "a")["config"]["filters"]]
@@ -250,12 +250,12 @@ def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
     filters = run_json(tmp_path / "c")["config"]["filters"]
     assert filters[0]["maximum"] == 2.5
     assert run_json(tmp_path / "c")["filters"]["distance"]["removed"] > 0.1
-    # Nothing beyond the limit is in the model: the camera hardly moves from where it began.
+    # Nothing beyond the limit is in the model, as the camera hardly moves from its first pose.
     first = read_ply(tmp_path / "c/cloud.ply").points
     assert np.linalg.norm(first, axis=1).max() < 4
 
 
-def test_an_object_is_segmented_from_its_background(tmp_path, full_report, capsys) -> None:
+def test_object_is_segmented_from_background(tmp_path, full_report, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=9, effects=effects)
     run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
@@ -268,19 +268,19 @@ def test_an_object_is_segmented_from_its_background(tmp_path, full_report, capsy
     assert 0.5 < made["filters"]["background"]["removed"] < 0.95
     # The wall is 4 m away.
     assert np.linalg.norm(read_ply(tmp_path / "out/cloud.ply").points, axis=1).max() < 2
-    # The run can be repeated from what it wrote.
+    # The run is reproducible from its run.json.
     again = ["--config", tmp_path / "out/run.json", "--threads", 1]
     run(tmp_path / "rec", "--out", tmp_path / "again", "--object", *again)
     assert same(tmp_path / "again") == same(tmp_path / "out")
 
 
-def test_what_lies_beyond_the_period_is_brought_back(room_recording, tmp_path) -> None:
+def test_ranges_beyond_period_are_unwrapped(room_recording, tmp_path) -> None:
     frames, period = list(open_recording(room_recording))[::2], 2.8
     source = ArraySource(wrapping(frames, period), metadata={"ambiguity_m": period})
     convert(Recording.of(source, "wrapped", "test"), tmp_path / "rec")
     farthest = {}
     for name, options in (("near", []), ("far", ["--unwrap"])):
-        # As it is the recording is refused or spoilt; which of them is not asked here.
+        # Without unwrapping the run is rejected or wrong; the test does not distinguish these.
         words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
         assert main(words) == 0 or name == "near"
         made = run_json(tmp_path / name)
@@ -293,21 +293,21 @@ def test_what_lies_beyond_the_period_is_brought_back(room_recording, tmp_path) -
     assert farthest["far"] == pytest.approx(true, rel=0.1)
 
 
-def test_what_says_no_period_is_not_unwrapped(recording, tmp_path, capsys) -> None:
+def test_unwrap_without_amplitude_is_rejected(recording, tmp_path, capsys) -> None:
     shutil.rmtree(recording / "amplitude")
     run(recording, "--out", tmp_path / "out", "--unwrap", status=2)
     assert "--unwrap: the recording can't be unwrapped" in capsys.readouterr().err
 
 
-def test_a_moving_camera_has_no_background(room_recording, tmp_path, capsys) -> None:
+def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -> None:
     run(room_recording, "--out", tmp_path / "out", "--object", status=2)
-    said = capsys.readouterr().err
-    assert "leave it out if the camera moves" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "leave it out if the camera moves" in output
+    assert output.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_a_bad_frame_in_the_middle_is_skipped_and_counted(recording, tmp_path, capsys) -> None:
+def test_unreadable_frame_is_skipped_and_counted(recording, tmp_path, capsys) -> None:
     file = recording / "depth/000004.png"
     file.write_bytes(file.read_bytes()[:200])
     run(recording, "--out", tmp_path / "out")
@@ -321,14 +321,14 @@ def test_a_bad_frame_in_the_middle_is_skipped_and_counted(recording, tmp_path, c
 
 
 @pytest.mark.usefixtures("full_report")
-def test_the_report_tells_of_a_bad_frame(recording, tmp_path) -> None:
+def test_report_mentions_unreadable_frame(recording, tmp_path) -> None:
     (recording / "depth/000002.png").write_bytes(b"")
     run(recording, "--out", tmp_path / "out", "--end", 4)
     report = (tmp_path / "out/report.html").read_text()
     assert "Frame 2 could not be read." in report
 
 
-def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> None:
+def test_blank_frame_is_lost(recording, tmp_path, capsys) -> None:
     file = recording / "depth/000003.png"
     write_png(file, np.zeros_like(read_image(file)))
     run(recording, "--out", tmp_path / "out", status=3)
@@ -344,11 +344,11 @@ def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> Non
 
 
 @pytest.mark.usefixtures("full_report")
-def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
+def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--end", 1)
     data = run_json(tmp_path / "out")
     assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
-    # Nothing was registered, so nothing is known of the accuracy.
+    # Nothing was registered, so the accuracy is unknown.
     assert data["verdict"] == "degraded"
     assert data["accuracy"] == {
         "position_m": None,
@@ -366,7 +366,7 @@ def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
     assert len(mesh.faces) > 1000
 
 
-def test_selection(room_recording, tmp_path) -> None:
+def test_frame_selection(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--start", 1, "--end", 7, "--every", 2)
     data = run_json(tmp_path / "out")
     assert [f["index"] for f in data["frames"]] == [1, 3, 5]
@@ -376,7 +376,7 @@ def test_selection(room_recording, tmp_path) -> None:
     np.testing.assert_array_equal(poses[0], np.eye(4))
 
 
-def test_several_inputs_and_a_folder_of_folders_are_joined(recording, tmp_path) -> None:
+def test_multiple_inputs_are_concatenated(recording, tmp_path) -> None:
     both = tmp_path / "both"
     both.mkdir()
     for name in ("b", "a"):
@@ -391,7 +391,7 @@ def test_several_inputs_and_a_folder_of_folders_are_joined(recording, tmp_path) 
     assert data["input"]["path"] == f"{both / 'a'} {both / 'b'}"
 
 
-def test_another_camera(recording, tmp_path) -> None:
+def test_camera_option_replaces_intrinsics(recording, tmp_path) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     wide = tmp_path / "wide.json"
     wide.write_text(json.dumps(camera | {"fx": camera["fx"] / 2, "fy": camera["fy"] / 2}))
@@ -401,7 +401,7 @@ def test_another_camera(recording, tmp_path) -> None:
     assert np.ptp(other[:, 0]) > 1.5 * np.ptp(own[:, 0])
 
 
-def test_loops_from_a_file(room_recording, tmp_path) -> None:
+def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]
     loops.write_text(f"# by hand\n0 6 {T[0, 3]} {T[1, 3]} {T[2, 3]} 0 0 0 1\n")
@@ -421,7 +421,7 @@ def test_loops_from_a_file(room_recording, tmp_path) -> None:
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
 
 
-def test_odometry_beside_the_images(recording, tmp_path) -> None:
+def test_odometry_file_is_used_as_guess(recording, tmp_path) -> None:
     shutil.copy(recording / "groundtruth.txt", recording / "odometry.txt")
     run(recording, "--out", tmp_path / "a", "--method", "thesis", "--guess", "odometry")
     run(recording, "--out", tmp_path / "b", "--method", "thesis")
@@ -429,13 +429,13 @@ def test_odometry_beside_the_images(recording, tmp_path) -> None:
     assert same(tmp_path / "a") != same(tmp_path / "b")
 
 
-def test_the_reference_is_never_used(recording, tmp_path, plain_run) -> None:
+def test_reference_is_never_used(recording, tmp_path, plain_run) -> None:
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
     run(recording, "--out", tmp_path / "out")
     assert same(tmp_path / "out") == same(plain_run)
 
 
-def test_json_lines_end_with_the_result(room_recording, tmp_path, capfd) -> None:
+def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     run(room_recording, "--out", tmp_path / "out", "--json", "--every", 2)
     done = capfd.readouterr()
     assert done.err == ""
@@ -450,7 +450,7 @@ def test_json_lines_end_with_the_result(room_recording, tmp_path, capfd) -> None
     assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
 
 
-def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
+def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
     run(recording, "--out", tmp_path / "out", "--every", 4)
@@ -460,13 +460,13 @@ def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
     assert sum("colour_of_case" in note for note in notes) == 1
     assert sum("multipath not applied" in note for note in notes) == 1
     assert len(notes) == 2
-    # Each reason, and what can be done about it.
+    # Each reason, and its remedy.
     assert len(done.out.splitlines()) <= 4 + 2 * len(run_json(tmp_path / "out")["reasons"])
     assert "\x1b" not in done.out
 
 
-def torn_apart(recording, config, **_options) -> Reconstruction:
-    """Reconstruct the two halves of a recording, and let nothing connect them."""
+def two_components(recording, config, **_options) -> Reconstruction:
+    """Reconstruct the two halves of a recording as unconnected components."""
     n = len(recording)
     main_part = reconstruct(recording.select(0, n // 2), config)
     other = reconstruct(recording.select(n // 2), config)
@@ -498,17 +498,15 @@ def torn_apart(recording, config, **_options) -> Reconstruction:
 
 
 @pytest.mark.usefixtures("full_report")
-def test_a_part_that_nothing_connects_has_its_own_result(
-    room_recording, tmp_path, monkeypatch, capfd
-) -> None:
-    monkeypatch.setattr(run_module, "reconstruct", torn_apart)
+def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.setattr(run_module, "reconstruct", two_components)
     out = tmp_path / "out"
     run(room_recording, "--out", out, status=3)
-    said = capfd.readouterr().out.splitlines()
-    assert "  degraded: The recording consists of 2 parts." in said
-    at = said.index("  degraded: The recording consists of 2 parts.")
-    assert said[at + 1].strip() == ADVICE["disconnected"]
-    assert said[-1] == f"and {out / 'component-1/report.html'}, for frames 4-7"
+    output = capfd.readouterr().out.splitlines()
+    assert "  degraded: The recording consists of 2 parts." in output
+    at = output.index("  degraded: The recording consists of 2 parts.")
+    assert output[at + 1].strip() == ADVICE["disconnected"]
+    assert output[-1] == f"and {out / 'component-1/report.html'}, for frames 4-7"
     assert {p.name for p in out.iterdir()} == FILES | {"component-1"}
     assert {p.name for p in (out / "component-1").iterdir()} == FILES
     for folder, frames in ((out, range(4)), (out / "component-1", range(4, 8))):
@@ -525,7 +523,7 @@ def test_a_part_that_nothing_connects_has_its_own_result(
     assert last["reasons"] == run_json(out)["reasons"]
 
 
-def test_an_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:
+def test_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:
     words = (room_recording, "--out", tmp_path / "out", "--every", 4)
     run(*words)
     before = contents(tmp_path)
@@ -545,7 +543,7 @@ def test_an_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> N
         ("writing", KeyboardInterrupt),
     ],
 )
-def test_an_interrupted_run_changes_nothing(
+def test_interrupted_run_changes_nothing(
     stage, error, plain_run, room_recording, tmp_path, monkeypatch
 ) -> None:
     words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--every", "4"]
@@ -564,7 +562,7 @@ def test_an_interrupted_run_changes_nothing(
     else:
         assert main(words) == (130 if error is KeyboardInterrupt else 2)
     assert contents(tmp_path) == before
-    # With nothing there before, nothing is there after, and the command works as it is.
+    # Without an earlier result nothing is left behind, and the same command then succeeds.
     words = ["run", str(room_recording), "--out", str(tmp_path / "new/out"), "--every", "4"]
     with contextlib.suppress(RuntimeError):
         main(words)
@@ -573,7 +571,7 @@ def test_an_interrupted_run_changes_nothing(
     assert main(words) == 0
 
 
-# Says when it is in the middle of tracking, and waits there.
+# Prints a line in the middle of tracking, and waits there.
 _SLOW = """
 import signal, sys, time
 from tofuse.cli import main
@@ -588,9 +586,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
+def test_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
     out, new = tmp_path / "out", tmp_path / "new"
     run(room_recording, "--out", out, "--every", 4)
     before = contents(out)
@@ -605,12 +603,12 @@ def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
         assert job.stdout is not None
         assert job.stdout.readline() == "middle\n"
         job.send_signal(how)
-        _, said = job.communicate(timeout=120)
+        _, output = job.communicate(timeout=120)
         if how == signal.SIGINT:
             assert job.returncode == 130
-            assert said == f"tofuse: interrupted; {cli._UNCHANGED}\n"
+            assert output == f"tofuse: interrupted; {cli._UNCHANGED}\n"
     found = contents(out)
-    # A process that was killed can't take its own things away; the next run does.
+    # A killed process can't remove its temporary files; the next run does.
     left = set() if how == signal.SIGINT else {STAGING, LOCK}
     assert {k: v for k, v in found.items() if k.split("/")[0] not in left} == before
     assert {p.name for p in new.iterdir()} == left if new.exists() else not left
@@ -635,7 +633,7 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("command", OPTIONS)
-def test_help_of_each_command(command, capsys) -> None:
+def test_each_command_has_help(command, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
     assert stop.value.code == 0
@@ -648,7 +646,7 @@ def test_help_of_each_command(command, capsys) -> None:
     assert "None" not in done.out
 
 
-def test_help_and_version(capsys) -> None:
+def test_help_and_version_are_printed(capsys) -> None:
     for words in (["--help"], ["--version"]):
         with pytest.raises(SystemExit) as stop:
             main(words)
@@ -659,7 +657,7 @@ def test_help_and_version(capsys) -> None:
     assert re.search(r"^tofuse \d+\.\d+", out, re.MULTILINE)
 
 
-def test_the_module_runs_too() -> None:
+def test_module_runs_as_script() -> None:
     words = [sys.executable, "-m", "tofuse", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("tofuse ")
@@ -668,7 +666,7 @@ def test_the_module_runs_too() -> None:
     assert done.stdout.startswith("usage: tofuse")
 
 
-def test_defaults_of_the_contract() -> None:
+def test_argument_defaults_follow_contract() -> None:
     arguments = make_parser().parse_args(["demo"])
     assert arguments.scene == "room"
     assert set(DEMO_SCENES) == {"room", "empty-room", "rail", "torso", "box", "peaks"}
@@ -677,7 +675,7 @@ def test_defaults_of_the_contract() -> None:
     assert (arguments.start, arguments.end, arguments.every) == (0, None, 1)
 
 
-def test_a_reader_of_the_output_that_goes_away_needs_no_words(room_recording) -> None:
+def test_closed_output_pipe_is_silent(room_recording) -> None:
     words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
     reading, writing = os.pipe()
     os.close(reading)
@@ -686,7 +684,7 @@ def test_a_reader_of_the_output_that_goes_away_needs_no_words(room_recording) ->
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_simulate_writes_what_run_reads(tmp_path, capsys) -> None:
+def test_simulated_recording_is_readable_by_run(tmp_path, capsys) -> None:
     words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
     assert main([*words, "--without", "all", "--seed", "3", "--uniform"]) == 0
     assert "2 frames" in capsys.readouterr().out
@@ -694,7 +692,7 @@ def test_simulate_writes_what_run_reads(tmp_path, capsys) -> None:
     assert len(run_json(tmp_path / "out")["frames"]) == 2
 
 
-def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
+def test_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
     def interrupt(_self, _record=None) -> None:
         raise KeyboardInterrupt
 
@@ -704,7 +702,7 @@ def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_demo_that_fails_says_where(tmp_path, capsys) -> None:
+def test_failure_demo_reports_degenerate_frames(tmp_path, capsys) -> None:
     out = tmp_path / "demo"
     assert main(["demo", "--failure", "--out", str(out)]) == 0
     assert "degraded" in capsys.readouterr().out
@@ -718,9 +716,9 @@ def test_the_demo_that_fails_says_where(tmp_path, capsys) -> None:
     assert stopped.value.code == 2
 
 
-def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
+def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
-    # A quarter of the way around.
+    # A quarter of the circle.
     monkeypatch.setattr(demo_module, "simulate_to", partial(demo_module.simulate_to, frames=6))
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)
     made = (FILES | {"recording"}) - {"mesh.ply", "mesh.glb"}
@@ -750,7 +748,7 @@ def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
     assert {p.name for p in out.iterdir()} == made
 
 
-def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
+def test_run_is_evaluated(plain_run, room_recording, capsys) -> None:
     words = ["evaluate", str(plain_run), str(room_recording), "--recording", str(room_recording)]
     assert main([*words, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
@@ -763,7 +761,7 @@ def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
         assert part in table
 
 
-def test_evaluate_against_what_a_recording_comes_with(plain_run, room_recording, tmp_path, capsys):
+def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_path, capsys):
     """In any format, not only the native one."""
     out = tmp_path / "tum"
     assert main(["convert", str(room_recording), "--out", str(out), "--to", "tum"]) == 0
@@ -782,12 +780,12 @@ def test_evaluate_against_what_a_recording_comes_with(plain_run, room_recording,
     assert "none.txt: doesn't exist" in capsys.readouterr().err
 
 
-def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
+def test_optimize_command_keeps_refined_poses(plain_run, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
     assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert re.match(r"8 poses, \d+ edges: squared error", told)
-    # The edges are what the refinement measured, so nothing is left to gain.
+    # The edges are those of the refinement, so there is nothing to improve.
     before, after = read_g2o(plain_run / "pose_graph.g2o"), read_g2o(out)
     assert after.ids.tolist() == list(range(8))
     assert np.abs(after.poses - before.poses).max() < 2e-3
@@ -799,7 +797,7 @@ def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
     assert "castellani" in capsys.readouterr().err
 
 
-def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
+def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     unit = " ".join(str(v) for v in 1e4 * np.eye(6)[np.triu_indices(6)])
     lines = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in (0, 1, 2, 3, 4, 9)]
     edges = [(0, 1, 1.01), (1, 2, 0.99), (2, 3, 1.0), (3, 4, 1.0)]
@@ -815,7 +813,7 @@ def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
 
 
-def test_how_fine_the_model_is(plain_run, room_recording, tmp_path) -> None:
+def test_faces_and_voxel_options_set_model_resolution(plain_run, room_recording, tmp_path) -> None:
     whole = read_ply(plain_run / "mesh.ply")
     sizes = {}
     for name, options in (("faces", ["--faces", "500"]), ("voxel", ["--voxel", "5cm"])):
@@ -832,7 +830,7 @@ def test_how_fine_the_model_is(plain_run, room_recording, tmp_path) -> None:
 @pytest.mark.parametrize(
     "options", [["--faces", "0"], ["--faces", "x"], ["--voxel", "0"], ["--voxel", "-1mm"]]
 )
-def test_a_model_of_no_size_is_refused(options, room_recording, tmp_path, capsys) -> None:
+def test_invalid_model_resolution_is_rejected(options, room_recording, tmp_path, capsys) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options])
     assert stopped.value.code == 2

@@ -11,7 +11,7 @@ from tofuse.evaluation.changes import changes
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 
-# The later session goes beside the earlier one.
+# The later session runs parallel to the earlier one.
 FIRST = HERE[::2]
 BESIDE = [T @ at(0.1, 0.05, 0.05, pitch=0.0) for T in FIRST]
 CHAIR = 4  # the box in the middle of the view
@@ -37,16 +37,16 @@ def near(change, box) -> bool:
     return bool(np.linalg.norm((change.centre - centre)[::2]) < reach)
 
 
-def test_nothing_changed_in_a_room_that_is_the_same(earlier) -> None:
+def test_unchanged_room_gives_no_changes(earlier) -> None:
     assert compared(earlier) == []
 
 
-def test_registration_errors_are_no_changes(earlier) -> None:
+def test_registration_errors_give_no_changes(earlier) -> None:
     off = se3.exp([0.006, -0.004, 0.005, 0.001, 0.002, -0.001])
     assert compared(earlier, poses=off @ np.array(BESIDE)) == []
 
 
-def test_a_box_that_was_moved_appears_and_vanishes_and_nothing_else(earlier) -> None:
+def test_moved_box_appears_and_vanishes(earlier) -> None:
     moved = with_moved(CHAIR, (0.25, 0.0, 0.0))
     found = compared(earlier, boxes=moved)
     assert {change.kind for change in found} == {"appeared", "vanished"}
@@ -58,7 +58,7 @@ def test_a_box_that_was_moved_appears_and_vanishes_and_nothing_else(earlier) -> 
 
 
 @pytest.mark.parametrize("kind", ["appeared", "vanished"])
-def test_a_box_that_came_or_went(earlier, kind) -> None:
+def test_added_or_removed_box_is_detected(earlier, kind) -> None:
     rest = BOXES[:CHAIR] + BOXES[CHAIR + 1 :]
     first, second = views(FIRST, 0), views(BESIDE, 100, boxes=rest)
     if kind == "vanished":
@@ -73,16 +73,16 @@ def test_a_box_that_came_or_went(earlier, kind) -> None:
     assert change.volume_m3 == pytest.approx(len(change.points) * change.voxel_m**3)
 
 
-def test_what_was_hidden_says_nothing(earlier) -> None:
-    """A box behind another one, as all views of the earlier session have it."""
+def test_occluded_regions_give_no_changes(earlier) -> None:
+    """A box that is occluded by another one in all views of the earlier session."""
     assert compared(earlier, boxes=(*BOXES, ((0.1, 0.95, 1.65), (0.08, 0.1, 0.05), 0.0))) == []
 
 
-def test_without_views_there_is_nothing_to_say(earlier) -> None:
+def test_no_views_give_no_changes(earlier) -> None:
     assert changes([], np.zeros((0, 4, 4)), earlier, np.array(FIRST)) == []
 
 
-def test_threads_change_nothing(earlier) -> None:
+def test_changes_are_independent_of_threads(earlier) -> None:
     moved = with_moved(CHAIR, (0.25, 0.0, 0.0))
     found = []
     for count in (1, 2):

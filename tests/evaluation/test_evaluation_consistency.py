@@ -32,7 +32,7 @@ from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import NativeSource
 from tofuse.recordings.recording import ArraySource, Recording, evenly
 
-# A room to look at, and poses that see it ------------------------------------------------------
+# A synthetic room, and poses in it -------------------------------------------------------------
 
 
 def room_range(rays: Float64, T: Float64) -> Float64:
@@ -69,8 +69,8 @@ def look(camera: Camera, poses: Float64, noise: float = 0.004) -> list[RangeFram
 PINHOLE = Pinhole(80, 60, 70.0, 71.0, 39.2, 30.1)
 
 
-def test_images_are_compared_with_the_camera_that_a_result_was_made_with(tmp_path: Path) -> None:
-    """Frames state a focal length 5 % too large, as the result has found."""
+def test_images_use_self_calibrated_camera_of_result(tmp_path: Path) -> None:
+    """Frames state a focal length 5 % too large, which the result has corrected."""
     poses = path(12)
     wrong = replace(PINHOLE, fx=PINHOLE.fx * 1.05, fy=PINHOLE.fy * 1.05)
     frames = [replace(frame, camera=wrong) for frame in look(PINHOLE, poses, 0.0)]
@@ -95,7 +95,7 @@ def test_images_are_compared_with_the_camera_that_a_result_was_made_with(tmp_pat
         evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 
 
-# The definition, once more, slowly -------------------------------------------------------------
+# A slow reference implementation of the definition ---------------------------------------------
 
 
 def twin(frames: list[RangeFrame], poses: Float64) -> tuple[float, float, int]:
@@ -172,7 +172,7 @@ def consistency_of_frames(frames, poses) -> Consistency:
     ],
     ids=["pinhole", "brown", "rational", "fisheye", "rays", "wide"],
 )
-def test_any_camera_gives_what_the_definition_says(camera: Camera) -> None:
+def test_every_camera_model_matches_definition(camera: Camera) -> None:
     poses = path(5)
     frames = look(camera, poses)
     bent = poses @ se3.exp(0.004 * np.random.default_rng(1).standard_normal((5, 6)))
@@ -183,7 +183,7 @@ def test_any_camera_gives_what_the_definition_says(camera: Camera) -> None:
     assert found.inlier_ratio == pytest.approx(share, rel=1e-3)
 
 
-def test_radial_range_is_brought_to_z() -> None:
+def test_radial_range_is_converted_to_z() -> None:
     poses = path(4)
     frames = look(PINHOLE, poses)
     radial = [RangeFrame(f.index, f.timestamp, f.camera, f.radial_range, "range") for f in frames]
@@ -192,7 +192,7 @@ def test_radial_range_is_brought_to_z() -> None:
     assert b.pairs == a.pairs > 2
 
 
-def test_exact_images_agree_exactly() -> None:
+def test_exact_images_are_consistent() -> None:
     poses = path(4)
     rays = PINHOLE.rays().astype(float)
     frames = [
@@ -200,12 +200,12 @@ def test_exact_images_agree_exactly() -> None:
         for k, T in enumerate(poses)
     ]
     found = consistency_of_frames(frames, poses)
-    assert found.rms_m < 0.004  # corners, where a plane is none
+    assert found.rms_m < 0.004  # corners, where the plane fit does not hold
     assert found.inlier_ratio > 0.95
 
 
-def test_worse_poses_agree_less() -> None:
-    """It ranks trajectories without a reference."""
+def test_worse_poses_are_less_consistent() -> None:
+    """Consistency ranks trajectories without a reference."""
     poses = path(8)
     frames = look(PINHOLE, poses)
     twists = np.random.default_rng(2).standard_normal((8, 6))
@@ -214,7 +214,7 @@ def test_worse_poses_agree_less() -> None:
     assert results[0].inlier_ratio > results[1].inlier_ratio > results[2].inlier_ratio
 
 
-def test_it_does_not_depend_on_threads_or_world() -> None:
+def test_consistency_is_independent_of_threads_and_world_frame() -> None:
     poses = path(8)
     frames = look(PINHOLE, poses)
     with threads(1):
@@ -225,7 +225,7 @@ def test_it_does_not_depend_on_threads_or_world() -> None:
     assert moved.rms_m == pytest.approx(one.rms_m, rel=1e-3)
 
 
-def test_nothing_overlaps() -> None:
+def test_views_without_overlap_have_no_pairs() -> None:
     away = np.stack([np.eye(4), se3.exp([0, 0, 0, 0, np.pi, 0])])
     found = consistency_of_frames(look(PINHOLE, away), away)
     assert found.pairs == 0
@@ -237,7 +237,7 @@ def test_nothing_overlaps() -> None:
     assert consistency_of_frames([], np.zeros((0, 4, 4))).pairs == 0
 
 
-def test_pairs_say_who_agrees() -> None:
+def test_agreements_identify_wrong_pose() -> None:
     poses = path(4)
     frames = look(PINHOLE, poses)
     poses[3] = poses[3] @ se3.exp([0, 0, 0.04, 0, 0, 0])
@@ -260,7 +260,7 @@ class Unreadable(ArraySource):
         return super().read(index)
 
 
-def test_frames_without_pose_and_unreadable_ones_are_left_out() -> None:
+def test_lost_and_unreadable_frames_are_skipped() -> None:
     poses = path(6)
     frames = look(PINHOLE, poses)
     given = poses.copy()
@@ -271,7 +271,7 @@ def test_frames_without_pose_and_unreadable_ones_are_left_out() -> None:
     assert found.frames == 4
 
 
-def test_what_can_not_be_compared_is_said() -> None:
+def test_invalid_input_is_rejected() -> None:
     clouds = [CloudFrame.of(np.ones((4, 3)), index=k) for k in range(2)]
     recording = Recording.of(ArraySource(clouds), "clouds", "test")
     with pytest.raises(InputError, match="clouds: contains clouds"):
@@ -282,23 +282,23 @@ def test_what_can_not_be_compared_is_said() -> None:
         map_consistency(recording, path(2), frames=0)
 
 
-def test_frames_are_chosen_evenly() -> None:
+def test_frames_are_sampled_evenly() -> None:
     assert evenly(np.arange(10), 100).tolist() == list(range(10))
     assert evenly(np.arange(101), 5).tolist() == [0, 25, 50, 75, 100]
     assert evenly(np.array([3, 8, 9]), 2).tolist() == [3, 9]
     assert evenly(np.arange(0), 5).tolist() == []
 
 
-def test_poses_go_to_the_nearest_frame() -> None:
+def test_poses_are_assigned_to_nearest_frame() -> None:
     T = path(4)
     out = poses_of_frames([0.0, 0.1, 0.2], [0.09, 0.105, 0.219, 0.35], T)
     assert np.isnan(out[0]).all()
-    assert np.array_equal(out[1], T[1])  # the last that is given for it
+    assert np.array_equal(out[1], T[1])  # the last of two poses for it
     assert np.array_equal(out[2], T[2])
 
 
-def test_depths_are_put_back_on_the_grid_of_the_recording() -> None:
-    """Neighbours that differ by exactly 5 % decide as they do in double precision."""
+def test_depths_are_requantized_to_recording_unit() -> None:
+    """Neighbours that differ by exactly 5 % are classified as in double precision."""
     camera = Pinhole(60, 40, 50.0, 50.0, 30.0, 20.0)
     base = 20 * np.arange(30, 620)
     unit = 0.0002
@@ -316,10 +316,10 @@ def test_depths_are_put_back_on_the_grid_of_the_recording() -> None:
         exact = bool(abs(n - c) <= 0.05 * c)
         assert known(z, unit) == (36 * 56 if exact else 36 * 54)
         differ += known(z, None) != known(z, unit)
-    assert differ > 0  # else this test shows nothing
+    assert differ > 0  # otherwise the test would be vacuous
 
 
-# The tool that defines it ----------------------------------------------------------------------
+# The reference tool ----------------------------------------------------------------------------
 
 
 def write_recording(folder: Path, frames: list[RangeFrame], poses: Float64) -> Path:
@@ -357,7 +357,7 @@ def by_tool(shared_data: Path, recording: Path, trajectory: Path, frames: int) -
     return done.stdout.strip()
 
 
-def in_its_words(found: Consistency) -> str:
+def tool_format(found: Consistency) -> str:
     return f"rms {found.rms_m:.5f} m, inliers {found.inlier_ratio:.4f}, pairs {found.pairs}"
 
 
@@ -371,7 +371,7 @@ def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_it_prints_what_the_tool_prints(shared_data: Path, tmp_path: Path, kind: str) -> None:
+def test_output_matches_reference_tool(shared_data: Path, tmp_path: Path, kind: str) -> None:
     camera = Pinhole(322, 60, 200.0, 201.0, 160.2, 30.1)  # every second pixel
     poses = path(7)
     frames = look(camera, poses)
@@ -380,12 +380,12 @@ def test_it_prints_what_the_tool_prints(shared_data: Path, tmp_path: Path, kind:
     bent = poses @ se3.exp(0.005 * np.random.default_rng(3).standard_normal((7, 6)))
     trajectory = write_recording(tmp_path / "rec", frames, bent)
     expected = by_tool(shared_data, tmp_path / "rec", trajectory, 5)
-    assert in_its_words(ours(tmp_path / "rec", trajectory, 5)) == expected
+    assert tool_format(ours(tmp_path / "rec", trajectory, 5)) == expected
     assert int(re.findall(r"\d+$", expected)[0]) > 5
 
 
-def test_it_prints_what_the_tool_prints_on_a_real_loop(shared_data: Path) -> None:
+def test_output_matches_reference_tool_on_real_loop(shared_data: Path) -> None:
     recording = shared_data / "kinectv2_loop" / "recording"
     trajectory = recording / "reference_poses.txt"
     expected = by_tool(shared_data, recording, trajectory, 9)
-    assert in_its_words(ours(recording, trajectory, 9)) == expected
+    assert tool_format(ours(recording, trajectory, 9)) == expected

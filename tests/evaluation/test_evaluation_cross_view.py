@@ -21,7 +21,7 @@ CENTRE = np.array([0.0, 0.0, 1.5])
 
 
 def ball(T: np.ndarray, index: int, radius: float = 0.4, noise: float = 0.001) -> RangeFrame:
-    """A ball before nothing, as a camera at T (4, 4) sees it."""
+    """A ball without background, seen by a camera at T (4, 4)."""
     v, u = np.mgrid[:60, :80]
     rays = np.stack([(u - 39.5) / 90, (v - 29.5) / 90, np.ones((60, 80))], -1)
     c = (se3.inverse(T) @ np.append(CENTRE, 1))[:3]
@@ -32,7 +32,7 @@ def ball(T: np.ndarray, index: int, radius: float = 0.4, noise: float = 0.001) -
     return RangeFrame(index, 0.1 * index, CAMERA, z.astype(np.float32))
 
 
-def round_it(count: int) -> np.ndarray:
+def orbit(count: int) -> np.ndarray:
     """(count, 4, 4) poses on a circle around the ball, facing it."""
     about, back = np.eye(4), np.eye(4)
     about[:3, 3], back[:3, 3] = CENTRE, -CENTRE
@@ -42,22 +42,22 @@ def round_it(count: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def turned():
-    poses = round_it(12)
+    poses = orbit(12)
     return [ball(T, k) for k, T in enumerate(poses)], poses
 
 
-def test_the_far_side_of_a_turned_object_is_no_contradiction(turned) -> None:
+def test_opposite_views_of_object_are_consistent(turned) -> None:
     frames, poses = turned
     found = cross_view_consistency(frames, poses)
     assert found.frames == tuple(range(12))
     assert found.support() > 0.99
     assert found.rms_m() < 0.004
-    # Views that look against each other see no surface of the same side.
+    # Opposite views share no side of the surface.
     assert all(min(p.j - p.i, 12 - p.j + p.i) <= 3 for p in found.pairs)
     assert {(k, k + 1) for k in range(11)} <= {(p.i, p.j) for p in found.pairs}
 
 
-def test_a_wrong_pose_is_seen_through(turned) -> None:
+def test_wrong_pose_lowers_support(turned) -> None:
     frames, poses = turned
     wrong = poses.copy()
     wrong[6] = poses[6] @ se3.exp(np.array([0.25, 0, 0, 0, 0, 0]))
@@ -65,14 +65,14 @@ def test_a_wrong_pose_is_seen_through(turned) -> None:
     assert np.argmin(shares) == 6
     assert shares[6] < 0.75
     assert (np.delete(shares, [4, 5, 6, 7, 8]) > 0.95).all()
-    # All of them: the ball falls apart.
+    # With drift in all poses the ball falls apart.
     drift = np.stack(
         [T @ se3.exp(np.array([0, 0, 0.06 * k, 0, 0, 0])) for k, T in enumerate(poses)]
     )
     assert cross_view_consistency(frames, drift).support() < 0.8
 
 
-def test_the_same_for_any_number_of_threads_and_any_world(turned) -> None:
+def test_result_is_independent_of_threads_and_world_frame(turned) -> None:
     frames, poses = turned
     with threads(1):
         one = cross_view_consistency(frames, poses)
@@ -82,7 +82,7 @@ def test_the_same_for_any_number_of_threads_and_any_world(turned) -> None:
     assert moved.support() == pytest.approx(one.support(), abs=1e-3)
 
 
-def test_frames_without_a_pose_do_not_count(turned) -> None:
+def test_lost_frames_are_ignored(turned) -> None:
     frames, poses = turned
     some = poses.copy()
     some[3] = np.nan
@@ -91,7 +91,7 @@ def test_frames_without_a_pose_do_not_count(turned) -> None:
     assert np.isnan(CrossViewConsistency((0, 1), (PairConsistency(0, 1, 0.0, 10.0, 0.0),)).rms_m())
 
 
-def test_filters_that_thin_leave_the_image_whole_but_cuts_stand(turned) -> None:
+def test_restore_thinned_undoes_subsampling_but_not_cropping(turned) -> None:
     (frame, *_), _ = turned
     rng = np.random.default_rng(5)
     left = np.zeros(frame.depth.shape, bool)

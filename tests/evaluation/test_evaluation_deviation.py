@@ -26,7 +26,7 @@ def around(count=24):
 
 
 def measured(poses, *, seed=0, noise=1.0, reach=4, stated=SIGMA):
-    """A graph of pairs up to `reach` apart, `noise` times as wrong as they state."""
+    """A graph of pairs up to `reach` apart, with `noise` times the errors that they state."""
     rng = np.random.default_rng(seed)
     edges = []
     for i in range(len(poses)):
@@ -60,7 +60,7 @@ def fit(truth):
     return fitted(measured(truth), DEPTH_M)
 
 
-def test_right_poses_are_consistent(truth) -> None:
+def test_correct_poses_are_consistent(truth) -> None:
     for seed in range(5):
         found = deviation(fitted(measured(truth, seed=seed), DEPTH_M), truth)
         assert found.consistent
@@ -70,7 +70,7 @@ def test_right_poses_are_consistent(truth) -> None:
         assert not found.of_views_m.any()
 
 
-def test_a_rigid_motion_of_all_poses_changes_nothing(fit, truth) -> None:
+def test_deviation_is_invariant_to_rigid_motion(fit, truth) -> None:
     wrong = jumped(truth, [0.05, 0, 0, 0, 0.02, 0])
     a, b = deviation(fit, wrong), deviation(fit, RIGID @ wrong)
     assert b.at_least_m == pytest.approx(a.at_least_m, rel=1e-2)
@@ -79,7 +79,7 @@ def test_a_rigid_motion_of_all_poses_changes_nothing(fit, truth) -> None:
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 3.0])
-def test_wrong_poses_are_off_by_what_is_said(fit, truth, size) -> None:
+def test_true_error_is_within_bounds(fit, truth, size) -> None:
     drift = se3.exp(size * np.array([0.002, 0.001, 0.0, 0.0, 0.002, 0.001]))
     drifting = [truth[0]]
     for a, b in pairwise(truth):
@@ -100,7 +100,7 @@ def test_wrong_poses_are_off_by_what_is_said(fit, truth, size) -> None:
             assert found.estimate_m > 0.7 * true
 
 
-def test_a_jump_is_found_where_it_is(fit, truth) -> None:
+def test_jump_is_localized(fit, truth) -> None:
     found = deviation(fit, jumped(truth, [0.06, 0, 0, 0, 0.03, 0]))
     half = len(truth) // 2
     assert [half - 1, half] in found.steps.tolist()
@@ -108,8 +108,8 @@ def test_a_jump_is_found_where_it_is(fit, truth) -> None:
     assert found.to_dict()["inconsistent_steps"] == [[half - 1, half]]
 
 
-def test_errors_are_compared_with_those_of_this_recording(truth) -> None:
-    """What contradicts sharp registrations is chance among noisy ones that state the same."""
+def test_significance_scales_with_registration_noise(truth) -> None:
+    """An error that precise registrations reveal is insignificant among noisy ones."""
     wrong = jumped(truth, [0.015, 0, 0, 0, 0.005, 0])
     for noise, consistent in ((0.2, False), (4.0, True)):
         fit = fitted(measured(truth, noise=noise), DEPTH_M)
@@ -118,15 +118,15 @@ def test_errors_are_compared_with_those_of_this_recording(truth) -> None:
         assert deviation(fit, truth).consistent
 
 
-def test_a_chain_has_nothing_but_what_it_states(truth) -> None:
-    """Without redundant pairs no residual shows the size of errors."""
+def test_chain_relies_on_stated_covariance(truth) -> None:
+    """Without redundant pairs there are no residuals to estimate the size of errors."""
     fit = fitted(measured(truth, reach=1), DEPTH_M)
     assert fit.scale == pytest.approx(1.0)
     assert deviation(fit, truth).consistent
     assert not deviation(fit, jumped(truth, [0.3, 0, 0, 0, 0.2, 0])).consistent
 
 
-def test_wrong_registrations_decide_nothing(truth) -> None:
+def test_deviation_is_robust_to_outlier_registrations(truth) -> None:
     graph = measured(truth)
     rng = np.random.default_rng(5)
     Z = graph.measurements.copy()
@@ -137,8 +137,8 @@ def test_wrong_registrations_decide_nothing(truth) -> None:
     assert not deviation(fit, jumped(truth, [0.08, 0, 0, 0, 0.04, 0])).consistent
 
 
-def test_what_nothing_measures_costs_nothing(truth) -> None:
-    """Along one direction of every camera pairs know nothing: there poses may be anywhere."""
+def test_unconstrained_directions_are_free(truth) -> None:
+    """One direction is unconstrained in every pair: poses may be anywhere along it."""
     row = np.tile(np.eye(4), (12, 1, 1))
     row[:, 0, 3] = np.linspace(0, 1, 12)
     stated = SIGMA.copy()
@@ -156,21 +156,21 @@ def test_what_nothing_measures_costs_nothing(truth) -> None:
     assert 0 < found.at_least_m < 0.04
 
 
-def test_what_measures_nothing_is_refused(truth) -> None:
+def test_uninformative_graph_is_rejected(truth) -> None:
     fit = fitted(measured(truth, stated=np.full(6, 1e3)), DEPTH_M)
     assert fit.unknowns == 0
     with pytest.raises(ValueError, match="nothing was measured"):
         deviation(fit, truth)
 
 
-def test_the_correction_is_the_smallest(fit, truth) -> None:
-    """The same by dense linear algebra: in the eigenvectors of both forms."""
+def test_correction_is_minimal(fit, truth) -> None:
+    """Compared with dense linear algebra, in the generalized eigenvectors of both forms."""
     problem = _Corrections(fit.graph, DEPTH_M)
     n = len(truth)
     rng = np.random.default_rng(2)
     x = 0.02 * rng.standard_normal((n, 6))
     unit = np.eye(6 * n).reshape(-1, n, 6)
-    # The form of a sum of two is known from those of each.
+    # Polarization: the form of a sum of two vectors, and those of each.
     single = np.array([problem.product(u) for u in unit])
     S = np.array(
         [
@@ -198,7 +198,7 @@ def test_the_correction_is_the_smallest(fit, truth) -> None:
 
 
 def dense(graph):
-    """The information of all poses."""
+    """The information matrix of all poses."""
     n = len(graph.ids)
     H = np.zeros((6 * n, 6 * n))
     for (i, j), W in zip(graph.edges, graph.information, strict=True):

@@ -26,7 +26,7 @@ def slow_distance(p, a, b, c):
     return np.linalg.norm(a + u * (b - a) + v * (c - a) - p, axis=1).min()
 
 
-def test_distances_to_triangles_are_those_of_a_slow_search() -> None:
+def test_triangle_distances_match_slow_search() -> None:
     rng = np.random.default_rng(0)
     mesh = Surface(rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3))
     points = rng.normal(size=(40, 3))
@@ -36,7 +36,7 @@ def test_distances_to_triangles_are_those_of_a_slow_search() -> None:
     np.testing.assert_allclose(distances(points, Surface(points[:7]))[:7], 0, atol=1e-12)
 
 
-def test_a_shifted_square_is_as_far_off_as_it_was_shifted() -> None:
+def test_shifted_square_has_distance_of_shift() -> None:
     found = compare_surfaces(shifted(SQUARE, [0, 0, 0.004]), SQUARE, samples=20_000)
     for value in (found.accuracy_m, found.accuracy_median_m, found.completeness_m):
         assert value == pytest.approx(0.004, rel=1e-3)
@@ -45,7 +45,7 @@ def test_a_shifted_square_is_as_far_off_as_it_was_shifted() -> None:
     assert (far.precision, far.recall, far.fscore, far.outliers) == (0, 0, 0, 1)
 
 
-def test_a_missing_half_is_incomplete_but_accurate() -> None:
+def test_missing_half_is_accurate_but_incomplete() -> None:
     half = Surface(SQUARE.points * [0.5, 1, 1], SQUARE.faces)
     found = compare_surfaces(half, SQUARE, samples=20_000)
     assert found.accuracy_m == pytest.approx(0, abs=1e-5)
@@ -59,7 +59,7 @@ def test_a_missing_half_is_incomplete_but_accurate() -> None:
     assert back.accuracy_p95_m == pytest.approx(0.45, abs=0.01)
 
 
-def test_samples_lie_evenly_on_the_faces() -> None:
+def test_samples_are_uniform_on_faces() -> None:
     points, face = SQUARE.samples(10_000)
     assert SQUARE.area == pytest.approx(1)
     assert np.abs(points[:, 2]).max() == 0
@@ -77,7 +77,7 @@ def test_clouds_are_compared_by_their_points() -> None:
     assert 0.002 < found.completeness_m < 0.02  # the spacing of 5000 points
 
 
-def test_what_can_t_be_compared_is_refused() -> None:
+def test_invalid_surfaces_are_rejected() -> None:
     with pytest.raises(InputError, match="model"):
         compare_surfaces(Surface(np.zeros((0, 3))), SQUARE)
     with pytest.raises(InputError, match="finite"):

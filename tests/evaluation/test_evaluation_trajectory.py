@@ -46,7 +46,7 @@ def horn(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     return R, y.mean(0) - R @ x.mean(0)
 
 
-def test_the_same_path_in_another_world_has_no_error() -> None:
+def test_error_is_zero_up_to_rigid_motion() -> None:
     reference = walk(80)
     estimate = se3.exp([5, -3, 2, 0.4, -2.0, 1.0]) @ reference
     times = np.arange(80) / 30
@@ -59,7 +59,7 @@ def test_the_same_path_in_another_world_has_no_error() -> None:
     assert result.T_reference_estimate @ estimate == pytest.approx(reference, abs=1e-9)
 
 
-def test_ate_is_that_of_horn_s_closed_form() -> None:
+def test_ate_matches_horn_closed_form() -> None:
     rng = np.random.default_rng(1)
     reference, estimate = walk(50), walk(50)
     estimate[:, :3, 3] += 0.05 * rng.standard_normal((50, 3))
@@ -72,7 +72,7 @@ def test_ate_is_that_of_horn_s_closed_form() -> None:
     assert np.linalg.norm(result.position_errors, axis=1) == pytest.approx(distances, rel=1e-5)
 
 
-def test_scale_is_not_aligned_away() -> None:
+def test_scale_is_not_aligned() -> None:
     x = np.array([-1.0, 0, 1, 0])
     reference = np.tile(np.eye(4), (4, 1, 1))
     reference[:, 0, 3], reference[:, 1, 3] = x, np.roll(x, 1)
@@ -82,7 +82,7 @@ def test_scale_is_not_aligned_away() -> None:
     assert result.ate_rms_m == pytest.approx(0.1)
 
 
-def test_alignment_never_mirrors() -> None:
+def test_alignment_is_never_a_reflection() -> None:
     rng = np.random.default_rng(2)
     reference = np.tile(np.eye(4), (30, 1, 1))
     reference[:, :3, 3] = rng.normal(size=(30, 3))
@@ -92,7 +92,7 @@ def test_alignment_never_mirrors() -> None:
 
 
 @pytest.mark.parametrize("kind", ["rail", "spot", "two", "one"])
-def test_orientations_decide_what_positions_leave_open(kind: str) -> None:
+def test_orientations_resolve_degenerate_positions(kind: str) -> None:
     n = {"two": 2, "one": 1}.get(kind, 20)
     reference = walk(n, seed=3)
     if kind == "rail":
@@ -103,8 +103,8 @@ def test_orientations_decide_what_positions_leave_open(kind: str) -> None:
     assert align(estimate, reference) @ estimate == pytest.approx(reference, abs=1e-6)
 
 
-def test_rotation_error_of_a_camera_turning_on_the_spot() -> None:
-    """Positions are noise and say nothing of the rotation: it is judged by orientations."""
+def test_rotation_error_of_pure_rotation() -> None:
+    """Positions are noise and do not constrain the rotation: orientations do."""
     rng = np.random.default_rng(4)
     turn = np.zeros((60, 6))
     turn[:, 4] = np.linspace(0, 2 * np.pi, 60)
@@ -117,13 +117,13 @@ def test_rotation_error_of_a_camera_turning_on_the_spot() -> None:
     assert np.degrees(result.rotation_rms_rad) == pytest.approx(1.0, abs=0.01)
 
 
-def test_relative_errors_by_hand() -> None:
+def test_relative_errors_of_known_drift() -> None:
     n = 61
     reference = np.tile(np.eye(4), (n, 1, 1))
     reference[:, 2, 3] = 0.1 * np.arange(n)
     xi = np.zeros((n, 6))
-    xi[:, 2] = 0.11 * np.arange(n)  # 1 cm too far at every step
-    xi[:, 5] = math.radians(0.2) * np.arange(n)  # rolling 0.2 degrees at every step
+    xi[:, 2] = 0.11 * np.arange(n)  # 1 cm of drift per step
+    xi[:, 5] = math.radians(0.2) * np.arange(n)  # 0.2 degrees of roll per step
     estimate = se3.exp(xi)
     one, thirty = relative_error(estimate, reference, 1), relative_error(estimate, reference, 30)
     assert (one.pairs, thirty.pairs) == (60, 31)
@@ -133,7 +133,7 @@ def test_relative_errors_by_hand() -> None:
     assert math.degrees(thirty.rotation_rms_rad) == pytest.approx(6.0)
 
 
-def test_too_short_for_relative_errors() -> None:
+def test_short_trajectory_has_no_relative_error() -> None:
     T = walk(10)
     result = evaluate_trajectory(np.arange(10), T, np.arange(10), T)
     assert result.relative[1].pairs == 0
@@ -143,7 +143,7 @@ def test_too_short_for_relative_errors() -> None:
     json.dumps(plain, allow_nan=False)
 
 
-def test_lost_frames_lower_coverage_and_nothing_else() -> None:
+def test_lost_frames_reduce_coverage_only() -> None:
     T = walk(100)
     times = np.arange(100) / 10
     estimate = T.copy()
@@ -154,8 +154,8 @@ def test_lost_frames_lower_coverage_and_nothing_else() -> None:
     assert result.ate_rms_m < 1e-9
 
 
-def test_coverage_is_counted_over_frames_where_they_are_known() -> None:
-    """A reference sampled ten times as fast as the camera does not make frames of its own."""
+def test_coverage_counts_frames_if_known() -> None:
+    """A reference with ten times the camera's rate does not add frames."""
     fast = walk(300)
     reference_times = np.arange(300) / 100
     frames = np.concatenate([reference_times[::10], [50.0, 51.0]])  # two without a reference
@@ -178,7 +178,7 @@ def test_association_is_one_to_one_and_closest_first() -> None:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6))
-def test_association_by_brute_force(seed: int) -> None:
+def test_association_matches_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(0, 0.3, 12), rng.uniform(0, 0.3, 15)
     left = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b))
@@ -192,7 +192,7 @@ def test_association_by_brute_force(seed: int) -> None:
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6))
-def test_figures_do_not_depend_on_either_world(seed: int) -> None:
+def test_errors_are_invariant_to_world_frames(seed: int) -> None:
     rng = np.random.default_rng(seed)
     reference = walk(40, seed)
     estimate = reference @ se3.exp(0.02 * rng.standard_normal((40, 6)))
@@ -205,7 +205,7 @@ def test_figures_do_not_depend_on_either_world(seed: int) -> None:
     assert two.relative[0].translation_rms_m == pytest.approx(one.relative[0].translation_rms_m)
 
 
-def test_nothing_to_compare() -> None:
+def test_unmatched_trajectories_are_rejected() -> None:
     T = walk(3)
     with pytest.raises(InputError, match=r"no pose is within 0.02 s"):
         evaluate_trajectory([0, 1, 2], T, [100, 101, 102], T)

@@ -10,7 +10,7 @@ from tofuse.errors import OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
 
 
-def test_file_appears_whole_and_nothing_else_stays(tmp_path: Path) -> None:
+def test_file_is_replaced_atomically(tmp_path: Path) -> None:
     with replacing(tmp_path / "a.png") as beside:
         assert beside.parent == tmp_path
         assert beside.suffix == ".png"
@@ -20,7 +20,7 @@ def test_file_appears_whole_and_nothing_else_stays(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.png"]
 
 
-def test_failure_leaves_the_earlier_file(tmp_path: Path) -> None:
+def test_failure_keeps_earlier_file(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "old")
 
     def interrupted() -> None:
@@ -38,7 +38,7 @@ def test_failure_leaves_the_earlier_file(tmp_path: Path) -> None:
     ("number", "words"),
     [(errno.ENOSPC, "free some space"), (errno.EACCES, "may write to"), (errno.EROFS, "may write")],
 )
-def test_trouble_becomes_one_line_with_a_remedy(
+def test_write_errors_state_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, words: str
 ) -> None:
     def fail(*_args: object) -> None:
@@ -51,7 +51,7 @@ def test_trouble_becomes_one_line_with_a_remedy(
     assert "\n" not in str(caught.value)
 
 
-def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_uncreatable_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
         make_folder(tmp_path / "file" / "inside")
@@ -59,6 +59,6 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
         write_text(tmp_path / "missing" / "a.txt", "x")
 
 
-def test_line_feeds_on_every_system(tmp_path: Path) -> None:
+def test_line_endings_are_line_feeds(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "a\nb\n")
     assert (tmp_path / "a.txt").read_bytes() == b"a\nb\n"

@@ -35,7 +35,7 @@ FACE = np.array([[0, 1, 2]], np.int32)
         write_usdz,
     ],
 )
-def test_every_writer_checks_the_shapes(tmp_path, write) -> None:
+def test_every_writer_checks_shapes(tmp_path, write) -> None:
     for record, words in (
         (GeometryRecord(POINTS[:, :2]), "points of shape"),
         (GeometryRecord(POINTS, FACE + 1), "faces of shape"),
@@ -51,7 +51,7 @@ def test_every_writer_checks_the_shapes(tmp_path, write) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_amplitude_has_several_names() -> None:
+def test_amplitude_column_aliases() -> None:
     column = np.arange(3, dtype=np.uint16)
     for name in ("amplitude", "intensity", "scalar_Intensity"):
         amplitude = GeometryRecord(POINTS, scalars={"views": column + 1, name: column}).amplitude

@@ -13,7 +13,7 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import unlit_glb, write_glb
 
 
-def test_a_mesh_comes_back(tmp_path) -> None:
+def test_mesh_round_trips(tmp_path) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(7, 3)).astype(np.float32)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def test_a_mesh_comes_back(tmp_path) -> None:
     assert primitive["material"] == 0
 
 
-def test_a_mesh_without_faces_is_an_empty_scene(tmp_path) -> None:
+def test_mesh_without_faces_is_empty_scene(tmp_path) -> None:
     path = tmp_path / "m.glb"
     write_glb(path, GeometryRecord(np.zeros((0, 3)), np.zeros((0, 3), int)))
     document, arrays = parse(path)
@@ -50,7 +50,7 @@ def test_a_mesh_without_faces_is_an_empty_scene(tmp_path) -> None:
     assert document["scenes"] == [{}]
 
 
-def test_what_does_not_fit_is_refused(tmp_path) -> None:
+def test_inconsistent_arrays_are_rejected(tmp_path) -> None:
     points, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
     for problem in (
         {"points": points, "faces": faces + 1},
@@ -63,7 +63,7 @@ def test_what_does_not_fit_is_refused(tmp_path) -> None:
     assert not (tmp_path / "m.glb").exists()
 
 
-def test_a_node_places_the_mesh_in_the_scene(tmp_path) -> None:
+def test_node_transform_places_mesh(tmp_path) -> None:
     trimesh = pytest.importorskip("trimesh")
     rng = np.random.default_rng(4)
     points, faces = rng.normal(0, 1, (9, 3)).astype(np.float32), np.arange(9).reshape(3, 3)
@@ -72,12 +72,12 @@ def test_a_node_places_the_mesh_in_the_scene(tmp_path) -> None:
     write_glb(tmp_path / "m.glb", GeometryRecord(points, faces), T_scene_node=T)
     scene = trimesh.load_scene(tmp_path / "m.glb", process=False, maintain_order=True)
     (mesh,) = scene.geometry.values()
-    np.testing.assert_array_equal(mesh.vertices, points)  # in their own frame
+    np.testing.assert_array_equal(mesh.vertices, points)  # in the node's frame
     found, _ = scene.graph[scene.graph.nodes_geometry[0]]
     np.testing.assert_allclose(found, T, atol=1e-12)
 
 
-def test_an_unlit_mesh_says_so() -> None:
+def test_unlit_mesh_declares_extension() -> None:
     points, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]])
     data = unlit_glb(points, faces, np.float32([[1.5, -0.1, 0], [0, 1, 0], [0, 0, 1]]))
     length = int.from_bytes(data[12:16], "little")

@@ -16,7 +16,7 @@ def _depth(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 65536, (48, 64), np.uint16)
 
 
-def test_round_trip_keeps_every_count(tmp_path: Path) -> None:
+def test_png_round_trips(tmp_path: Path) -> None:
     image = _depth(np.random.default_rng(1))
     write_png(tmp_path / "a.png", image)
     back = read_image(tmp_path / "a.png", size=(64, 48), dtype="uint16")
@@ -35,13 +35,13 @@ def test_color_is_rgb(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "a.png"))[0, 0].tolist() == [0, 0, 200]
 
 
-def test_grey_is_repeated_as_color(tmp_path: Path) -> None:
+def test_grey_is_expanded_to_rgb(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", np.full((4, 6), 7, np.uint8))
     assert (read_color(tmp_path / "a.png") == 7).all()
     assert read_color(tmp_path / "a.png").shape == (4, 6, 3)
 
 
-def test_jpeg_size_without_decoding(tmp_path: Path) -> None:
+def test_jpeg_size_is_read_from_header(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.jpg"), np.full((30, 50, 3), 90, np.uint8))
     header = read_header(tmp_path / "a.jpg")
     assert (header.width, header.height, header.channels, header.bits) == (50, 30, 3, 8)
@@ -50,7 +50,7 @@ def test_jpeg_size_without_decoding(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_truncated_images_are_refused(tmp_path: Path, share: float, suffix: str) -> None:
+def test_truncated_images_are_rejected(tmp_path: Path, share: float, suffix: str) -> None:
     rng = np.random.default_rng(2)
     cv2.imwrite(str(tmp_path / f"a{suffix}"), rng.integers(0, 256, (48, 64, 3), np.uint8))
     data = (tmp_path / f"a{suffix}").read_bytes()
@@ -59,7 +59,7 @@ def test_truncated_images_are_refused(tmp_path: Path, share: float, suffix: str)
         read_image(tmp_path / f"a{suffix}")
 
 
-def test_flipped_bit_in_a_png_is_noticed(tmp_path: Path) -> None:
+def test_flipped_bit_in_png_is_detected(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", _depth(np.random.default_rng(3)))
     data = bytearray((tmp_path / "a.png").read_bytes())
     data[len(data) // 2] ^= 16
@@ -100,13 +100,13 @@ def test_claimed_size_is_limited_before_decoding(
         (np.zeros((40, 64), np.uint16), "64 x 40 pixels, the camera 64 x 48"),
     ],
 )
-def test_wrong_type_or_size(tmp_path: Path, image: np.ndarray, words: str) -> None:
+def test_wrong_type_or_size_is_rejected(tmp_path: Path, image: np.ndarray, words: str) -> None:
     write_png(tmp_path / "a.png", image)
     with pytest.raises(InputError, match=words):
         read_image(tmp_path / "a.png", size=(64, 48), dtype="uint16")
 
 
-def test_other_things_are_no_images(tmp_path: Path) -> None:
+def test_other_files_are_rejected_as_images(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text("hello")
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
@@ -115,6 +115,6 @@ def test_other_things_are_no_images(tmp_path: Path) -> None:
             read_image(tmp_path / name)
 
 
-def test_float_images_cannot_be_written(tmp_path: Path) -> None:
+def test_float_images_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="float64"):
         write_png(tmp_path / "a.png", np.zeros((4, 4)))

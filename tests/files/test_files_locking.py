@@ -14,7 +14,7 @@ from tofuse.files.locking import locked
 from tofuse.files.stamps import stamp, stamps_in
 
 
-def test_one_at_a_time(tmp_path: Path) -> None:
+def test_lock_is_exclusive(tmp_path: Path) -> None:
     inside, most = 0, 0
 
     def work() -> None:
@@ -33,8 +33,8 @@ def test_one_at_a_time(tmp_path: Path) -> None:
     assert (inside, most) == (0, 1)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="locks of other systems")
-def test_a_process_that_inherits_a_lock_holds_it(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX locks")
+def test_inherited_lock_is_held(tmp_path: Path) -> None:
     with locked(tmp_path / "lock") as handle:
         child = subprocess.Popen(
             [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=(handle,)
@@ -53,12 +53,12 @@ def test_a_process_that_inherits_a_lock_holds_it(tmp_path: Path) -> None:
     thread.join()
 
 
-def test_a_lock_that_can_not_be_made_is_told(tmp_path: Path) -> None:
+def test_uncreatable_lock_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="create its folder first"), locked(tmp_path / "a" / "b"):
         pass
 
 
-def test_stamps_tell_files_apart(tmp_path: Path) -> None:
+def test_stamps_change_with_files(tmp_path: Path) -> None:
     for name in ("b/2", "b/1", "a", "out/c"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name)

@@ -11,7 +11,7 @@ from made_phones import lzfse_raw
 from tofuse.errors import InputError
 from tofuse.files.lzfse import lzfse_decompress
 
-# What Apple's reference encoder makes of `CONTENT`.
+# `CONTENT` compressed by Apple's reference encoder.
 STREAM = base64.b64decode(
     "YnZ4MigjAABEADACAD0AMBck8YUjPAAgnAAAADu08A/8CQACAAAgAAAg8AbwCPDkDAAAAAAAAAAAAAAAAAAAAHgS"
     "3gAA4Cv4CgCAJ+FJAAAAAPgKvgIAAAAAAAAAAHgSXhAA4Cv4CgAAAAAAAAAA4El4EgAAAACehCcBAPgKvgIAAAAA"
@@ -22,16 +22,16 @@ _K = np.arange(9000)
 CONTENT = ((_K // 300) ** 2 % 17 * 9 + (_K % 300 > 280)).astype(np.uint8).tobytes()
 
 
-def test_a_stream_of_the_reference_encoder() -> None:
+def test_reference_stream_is_decompressed() -> None:
     assert lzfse_decompress(STREAM, len(CONTENT), "x") == CONTENT
 
 
-def test_blocks_follow_each_other_and_may_be_stored() -> None:
+def test_concatenated_and_stored_blocks_are_decompressed() -> None:
     joined = lzfse_raw(b"abc")[:-4] + STREAM
     assert lzfse_decompress(joined, 3 + len(CONTENT), "x") == b"abc" + CONTENT
 
 
-def test_another_size_or_kind_is_refused() -> None:
+def test_wrong_size_or_kind_is_rejected() -> None:
     with pytest.raises(InputError, match="decompresses to 9000 bytes, not 9001"):
         lzfse_decompress(STREAM, 9001, "x")
     with pytest.raises(InputError, match="damaged or cut off"):
@@ -40,7 +40,7 @@ def test_another_size_or_kind_is_refused() -> None:
         lzfse_decompress(b"bvxn" + bytes(8), 10, "x")
 
 
-def test_damage_is_refused_or_harmless() -> None:
+def test_damaged_streams_are_rejected_or_keep_size() -> None:
     for size in range(len(STREAM)):
         with pytest.raises(InputError):
             lzfse_decompress(STREAM[:size], len(CONTENT), "x")

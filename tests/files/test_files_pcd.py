@@ -13,7 +13,7 @@ from tofuse.kernels.lzf import lzf_decompress
 
 
 def lzf_twin(source: bytes) -> bytes:
-    """Decompress, as liblzf's description reads."""
+    """Decompress according to the description of liblzf."""
     out = bytearray()
     i = 0
     while i < len(source):
@@ -70,7 +70,7 @@ def lzf_compress(data: bytes) -> bytes:
     return bytes(out)
 
 
-def test_lzf_kernel_agrees_with_its_twin() -> None:
+def test_lzf_kernel_matches_twin() -> None:
     rng = np.random.default_rng(5)
     data = (
         bytes(rng.integers(0, 256, 500, np.uint8)) + bytes(400) + b"abcab" * 90 + bytes([7, 7, 7])
@@ -82,7 +82,7 @@ def test_lzf_kernel_agrees_with_its_twin() -> None:
     assert bytes(out) == data == lzf_twin(packed)
 
 
-def test_lzf_kernel_never_leaves_its_arrays() -> None:
+def test_lzf_kernel_stays_in_bounds() -> None:
     rng = np.random.default_rng(6)
     for _ in range(300):
         packed = rng.integers(0, 256, rng.integers(0, 40), np.uint8)
@@ -136,7 +136,7 @@ def _compressed(rows: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
-def test_all_kinds_hold_the_same(tmp_path: Path, kind: str) -> None:
+def test_all_encodings_are_equivalent(tmp_path: Path, kind: str) -> None:
     rows = _rows()
     body = {"ascii": _ascii, "binary": lambda r: r.tobytes(), "binary_compressed": _compressed}
     (tmp_path / "a.pcd").write_bytes(_header(kind) + body[kind](rows))
@@ -155,7 +155,7 @@ def test_all_kinds_hold_the_same(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(pcd.viewpoint, [1, 2, 3, 1, 0, 0, 0])
 
 
-def test_color_packed_as_float(tmp_path: Path) -> None:
+def test_float_packed_color_is_read(tmp_path: Path) -> None:
     rows = _rows()
     (tmp_path / "a.pcd").write_bytes(_header("binary", rgb_type="F") + rows.tobytes())
     color = read_pcd(tmp_path / "a.pcd").cloud.color
@@ -177,7 +177,7 @@ def test_color_packed_as_float(tmp_path: Path) -> None:
         (b"COUNT 1 1 1 1 1 1 3", b"COUNT 1 1 1 1 1 1 -3", "declares"),
     ],
 )
-def test_bad_headers(tmp_path: Path, old: bytes, new: bytes, words: str) -> None:
+def test_bad_headers_are_rejected(tmp_path: Path, old: bytes, new: bytes, words: str) -> None:
     data = _header("binary") + _rows().tobytes()
     assert old in data
     (tmp_path / "a.pcd").write_bytes(data.replace(old, new, 1))
@@ -185,7 +185,7 @@ def test_bad_headers(tmp_path: Path, old: bytes, new: bytes, words: str) -> None
         read_pcd(tmp_path / "a.pcd")
 
 
-def test_sizes_that_the_file_cannot_hold(tmp_path: Path) -> None:
+def test_oversized_headers_are_rejected(tmp_path: Path) -> None:
     huge = _header("binary").replace(b"WIDTH 4\nHEIGHT 3", b"WIDTH 4000\nHEIGHT 3000")
     huge = huge.replace(b"POINTS 12", b"POINTS 12000000")
     for kind in (b"binary", b"binary_compressed", b"ascii"):
@@ -196,7 +196,7 @@ def test_sizes_that_the_file_cannot_hold(tmp_path: Path) -> None:
             read_pcd(tmp_path / "a.pcd")
 
 
-def test_damaged_compressed_data(tmp_path: Path) -> None:
+def test_damaged_compressed_data_is_rejected(tmp_path: Path) -> None:
     body = bytearray(_compressed(_rows()))
     body[8] = 255  # a reference before the beginning
     (tmp_path / "a.pcd").write_bytes(_header("binary_compressed") + bytes(body))

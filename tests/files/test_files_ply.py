@@ -38,7 +38,7 @@ end_header
 """
 
 
-def test_ascii_with_polygons_and_other_elements(tmp_path: Path) -> None:
+def test_ascii_with_polygons_and_other_elements_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_text(CUBE)
     ply = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(ply.points, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5]])
@@ -50,7 +50,7 @@ def test_ascii_with_polygons_and_other_elements(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_binary_of_both_orders_and_mixed_types(tmp_path: Path, order: str) -> None:
+def test_both_byte_orders_and_mixed_types_are_read(tmp_path: Path, order: str) -> None:
     name = {"<": "little", ">": "big"}[order]
     header = (
         f"ply\r\nformat binary_{name}_endian 1.0\r\nelement camera 1\r\nproperty short a\r\n"
@@ -68,7 +68,7 @@ def test_binary_of_both_orders_and_mixed_types(tmp_path: Path, order: str) -> No
     assert ply.faces.tolist() == [[0, 1, 0], [0, 0, 1], [1, 0, 1]]
 
 
-def test_round_trip_of_everything(tmp_path: Path) -> None:
+def test_all_attributes_round_trip(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     points = rng.normal(size=(100, 3)).astype(np.float32)
     normals = rng.normal(size=(100, 3)).astype(np.float32)
@@ -107,7 +107,7 @@ def test_round_trip_of_everything(tmp_path: Path) -> None:
     assert (tmp_path / "a.ply").read_bytes() == first
 
 
-def test_header_is_what_other_programs_expect(tmp_path: Path) -> None:
+def test_header_layout(tmp_path: Path) -> None:
     write_ply(
         tmp_path / "a.ply", GeometryRecord(np.zeros((2, 3)), color=np.zeros((2, 3), np.uint8))
     )
@@ -137,14 +137,14 @@ def test_header_is_what_other_programs_expect(tmp_path: Path) -> None:
         ("1 1 0 0 0 255", "1 1 zero 0 0 255", "damaged"),
     ],
 )
-def test_bad_files_say_what_is_wrong(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_bad_files_are_rejected(tmp_path: Path, old: str, new: str, words: str) -> None:
     (tmp_path / "a.ply").write_text(CUBE.replace(old, new, 1))
     with pytest.raises(InputError, match=words) as caught:
         read_ply(tmp_path / "a.ply")
     assert "a.ply" in str(caught.value)
 
 
-def test_truncated_binary(tmp_path: Path) -> None:
+def test_truncated_binary_is_rejected(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((10, 3)), faces=np.zeros((4, 3), int)))
     data = (tmp_path / "a.ply").read_bytes()
     for cut in (1, 60, len(data) - 100):
@@ -153,13 +153,13 @@ def test_truncated_binary(tmp_path: Path) -> None:
             read_ply(tmp_path / "a.ply")
 
 
-def test_shapes_are_checked_when_writing(tmp_path: Path) -> None:
+def test_writer_checks_shapes(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="normals"):
         write_ply(tmp_path / "a.ply", GeometryRecord(np.zeros((2, 3)), normals=np.zeros((3, 3))))
     assert not (tmp_path / "a.ply").exists()
 
 
-def test_written_in_parts_it_has_the_same_bytes(tmp_path: Path, monkeypatch) -> None:
+def test_blockwise_writing_gives_same_bytes(tmp_path: Path, monkeypatch) -> None:
     rng = np.random.default_rng(0)
     points, faces = rng.normal(size=(23, 3)), rng.integers(0, 23, (41, 3))
     more = {"color": rng.integers(0, 256, (23, 3)), "scalars": {"views": np.arange(23)}}

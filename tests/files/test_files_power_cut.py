@@ -37,14 +37,14 @@ def power(monkeypatch):
 
 @pytest.fixture
 def memory(tmp_path):
-    """A folder where forcing to the disk takes no time, if there is one."""
+    """A folder where fsync takes no time, if there is one."""
     shared = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=shared if shared.is_dir() else tmp_path) as folder:
         yield Path(folder)
 
 
 def shown(folder: Path) -> dict[str, bytes]:
-    """What people see of a folder."""
+    """The visible files of a folder."""
     found = contents(folder)
     return {name: data for name, data in found.items() if not name.startswith(".tofuse-")}
 
@@ -60,7 +60,7 @@ def with_mine(folder: Path, *, old: bool) -> None:
 
 @pytest.mark.parametrize("old", [True, False], ids=["over an old one", "a first one"])
 @pytest.mark.parametrize("reader_first", [True, False])
-def test_a_result_is_the_old_or_the_new_one(memory, power, old, reader_first) -> None:
+def test_result_is_old_or_new_after_power_cut(memory, power, old, reader_first) -> None:
     numbers = itertools.count()
 
     def prepare() -> Path:
@@ -83,7 +83,7 @@ def test_a_result_is_the_old_or_the_new_one(memory, power, old, reader_first) ->
         stopped = is_interrupted(folder / STAGING)
         if not stopped:
             assert shown(folder) in (before, after), calls
-        else:  # nobody takes it for whole
+        else:  # it does not pass as a complete result
             assert shown(folder) in (before, after) or not is_result(folder), calls
         if reader_first:
             finish_interrupted(folder)
@@ -99,12 +99,12 @@ def test_a_result_is_the_old_or_the_new_one(memory, power, old, reader_first) ->
 
 
 @pytest.mark.parametrize("way", ["forward", "back"])
-def test_what_goes_on_may_be_cut_off_again(memory, power, monkeypatch, way) -> None:
+def test_recovery_survives_another_power_cut(memory, power, monkeypatch, way) -> None:
     numbers = itertools.count()
     move = os.replace
 
     def prepare() -> Path:
-        """Moves that were cut off in the middle, or while they were undone."""
+        """Moves that were interrupted halfway, or while they were undone."""
         folder = memory / f"folder-{next(numbers):06}"
         folder.mkdir()
         with_mine(folder, old=True)
@@ -179,7 +179,7 @@ def _state(folder: Path, number: int) -> None:
 
 
 @pytest.mark.parametrize("write", [_batch, _rig, _text, _folder, _state])
-def test_other_files_are_old_or_new_as_well(memory, power, write) -> None:
+def test_other_files_are_old_or_new_after_power_cut(memory, power, write) -> None:
     numbers = itertools.count()
 
     def prepare() -> Path:
@@ -189,7 +189,7 @@ def test_other_files_are_old_or_new_as_well(memory, power, write) -> None:
         return folder
 
     def known(folder: Path) -> dict[str, bytes]:
-        """Each file, but for what was being written, and what names the folder itself."""
+        """All files without temporary ones, and without the name of the folder itself."""
         found = {n: d for n, d in contents(folder).items() if ".part" not in n}
         return {
             n: d.replace(str(folder).encode(), b"").replace(folder.name.encode(), b"")
@@ -211,7 +211,7 @@ def test_other_files_are_old_or_new_as_well(memory, power, write) -> None:
         if write is _state:
             notes: list[str] = []
             kept = Checkpoints(folder, "key", notes.append).load("tracking")
-            # It is not waited for, as it is only worth time: its sum says that it is cut off.
+            # States are not synced, as they only save time; a checksum detects truncation.
             assert "damaged, and not used" in notes[0] if kept is None else kept["number"] in (0, 1)
         assert set(before) <= set(found)
         write(folder, 1)
@@ -220,8 +220,8 @@ def test_other_files_are_old_or_new_as_well(memory, power, write) -> None:
     assert power.cut_everywhere(prepare, lambda folder: write(folder, 1), check) >= 4
 
 
-def test_the_cut_loses_what_was_not_forced(tmp_path, power) -> None:
-    """The test itself: without fsync a file that was moved into place is a half."""
+def test_power_cut_loses_unsynced_data(tmp_path, power) -> None:
+    """Checks the simulation: without fsync a file that was moved into place is truncated."""
     cut = power.Power(2)
     (tmp_path / "a").mkdir()
     with cut.connected():

@@ -43,27 +43,27 @@ def same(a: Item, b: Item) -> bool:
 
 
 @pytest.mark.parametrize("budget", [0, 3000, 10**9])
-def test_everything_comes_back_whatever_the_budget(tmp_path: Path, budget: int) -> None:
+def test_items_round_trip_for_any_budget(tmp_path: Path, budget: int) -> None:
     spill: Spill[Item] = Spill(budget, tmp_path)
     assert [spill.put(made(k)) for k in range(30)] == list(range(30))
     order = np.random.default_rng(0).permutation(30)
     for k in [*order, *order[::-1]]:
         got = spill.get(int(k))
         assert same(got, made(int(k)))
-        assert got.image.flags.writeable  # kernels are compiled for arrays that are
-        assert spill.resident_bytes <= max(budget, 2000)  # the newest stays
+        assert got.image.flags.writeable  # kernels are compiled for writable arrays
+        assert spill.resident_bytes <= max(budget, 2000)  # the newest item stays resident
     assert (spill.spilled_bytes > 0) == (budget < 10**9)
     assert spill.nbytes > 30 * 800
     assert len(spill) == 30
 
 
-def test_in_memory_it_is_the_same_object() -> None:
+def test_resident_item_is_same_object() -> None:
     spill: Spill[Item] = Spill(10**6)
     item = made(1)
     assert spill.get(spill.put(item)) is item
 
 
-def test_what_all_items_share_stays_shared(tmp_path: Path) -> None:
+def test_shared_arrays_stay_shared(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(0, tmp_path)
     for k in range(4):
         spill.put(made(k))
@@ -71,7 +71,7 @@ def test_what_all_items_share_stays_shared(tmp_path: Path) -> None:
     assert spill.nbytes < 4 * 900 + _RAYS.nbytes  # counted once
 
 
-def test_least_recently_used_goes_first(tmp_path: Path) -> None:
+def test_least_recently_used_item_is_spilled_first(tmp_path: Path) -> None:
     size = made(0).image.nbytes
     spill: Spill[Item] = Spill(2 * size + 1000, tmp_path)
     items = [Item(k, _RAYS, np.full((20, 10), k, np.float32)) for k in range(3)]
@@ -83,7 +83,7 @@ def test_least_recently_used_goes_first(tmp_path: Path) -> None:
     assert spill.get(1) is not items[1]
 
 
-def test_layout_is_lost_at_once_and_not_with_the_budget() -> None:
+def test_arrays_are_made_contiguous_on_put() -> None:
     spill: Spill[Item] = Spill(10**9)
     whole = np.arange(600.0).reshape(20, 30)
     number = spill.put(Item(0, _RAYS, whole[:, ::3], whole.T))
@@ -94,7 +94,7 @@ def test_layout_is_lost_at_once_and_not_with_the_budget() -> None:
     assert np.array_equal(got.image, whole[:, ::3])
 
 
-def test_no_file_stays_nor_shows(tmp_path: Path) -> None:
+def test_no_file_remains_or_is_visible(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(0, tmp_path)
     for k in range(3):
         spill.put(made(k))
@@ -105,7 +105,7 @@ def test_no_file_stays_nor_shows(tmp_path: Path) -> None:
         spill.get(0)
 
 
-def test_dropped_items_are_gone(tmp_path: Path) -> None:
+def test_dropped_items_are_removed(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(1000, tmp_path)
     for k in range(5):
         spill.put(made(k))
@@ -118,7 +118,7 @@ def test_dropped_items_are_gone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("budget", [0, 3000, 10**9])
-def test_pickled_and_back(tmp_path: Path, budget: int) -> None:
+def test_spill_survives_pickling(tmp_path: Path, budget: int) -> None:
     spill: Spill[Item] = Spill(budget, tmp_path)
     for k in range(10):
         spill.put(made(k))
@@ -128,7 +128,7 @@ def test_pickled_and_back(tmp_path: Path, budget: int) -> None:
     assert all(same(copy.get(k), made(k)) for k in range(11))
 
 
-def test_many_threads(tmp_path: Path) -> None:
+def test_concurrent_reads(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(3000, tmp_path)
     for k in range(20):
         spill.put(made(k))
@@ -146,7 +146,7 @@ def test_many_threads(tmp_path: Path) -> None:
     assert wrong == []
 
 
-def test_full_disk_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Full:
         def seek(self, offset: int) -> None: ...
 
@@ -163,7 +163,7 @@ def test_full_disk_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert "\n" not in str(caught.value)
 
 
-def test_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_folder_is_reported(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(0, tmp_path / "missing")
     spill.put(made(0))
     with pytest.raises(OutputError, match="missing"):

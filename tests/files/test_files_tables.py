@@ -10,13 +10,13 @@ from tofuse.files.reading import files_with, list_folder, read_text
 from tofuse.files.tables import read_columns, read_numbers, write_columns
 
 
-def test_numbers_with_any_separator(tmp_path: Path) -> None:
+def test_numbers_are_read_with_any_separator(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(b"# x y\n1, 2;3\n\n4\t5 6 # end\r\n")
     np.testing.assert_array_equal(read_numbers(tmp_path / "a.txt"), [[1, 2, 3], [4, 5, 6]])
 
 
 @pytest.mark.parametrize("text", ["1 2\n3\n", "1 b\n", "1 2\n3 4 5\n", "\0\0\0\0"])
-def test_bad_numbers(tmp_path: Path, text: str) -> None:
+def test_bad_numbers_are_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(InputError, match=r"a\.txt"):
         read_numbers(tmp_path / "a.txt")
@@ -37,20 +37,20 @@ def test_columns_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "a,a\n1,2\n", "a,b\n1\n", "a,b\n1,x\n"])
-def test_bad_columns(tmp_path: Path, text: str) -> None:
+def test_bad_columns_are_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=r"a\.csv"):
         read_columns(tmp_path / "a.csv")
 
 
-def test_name_order_counts(tmp_path: Path) -> None:
+def test_files_are_in_natural_order(tmp_path: Path) -> None:
     for name in ("f10.png", "f9.png", "f1.PNG", ".hidden.png", "a.txt"):
         (tmp_path / name).touch()
     assert [p.name for p in files_with(tmp_path, ".png")] == ["f1.PNG", "f9.png", "f10.png"]
     assert len(list_folder(tmp_path)) == 4
 
 
-def test_what_is_no_text(tmp_path: Path) -> None:
+def test_non_text_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(b"abc\xff\xfe\xff")
     with pytest.raises(InputError, match="byte 3"):
         read_text(tmp_path / "a.txt")

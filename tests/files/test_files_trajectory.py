@@ -24,7 +24,7 @@ def test_round_trip_in_full_precision(tmp_path: Path) -> None:
     np.testing.assert_allclose(back, poses, atol=1e-15)
 
 
-def test_order_of_numbers() -> None:
+def test_column_order() -> None:
     half = np.sqrt(0.5)
     T = np.eye(4)
     T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # 90 degrees about z
@@ -33,14 +33,14 @@ def test_order_of_numbers() -> None:
     np.testing.assert_allclose(numbers, [4.5, 1, 2, 3, 0, 0, half, half])
 
 
-def test_same_trajectory_same_bytes() -> None:
+def test_negative_zero_is_normalized() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[0, 0, 3] = -0.0
     text = tum_text([0, 1], poses)
     assert text == "0.0 0.0 0.0 0.0 0.0 0.0 0.0 1.0\n1.0 0.0 0.0 0.0 0.0 0.0 0.0 1.0\n"
 
 
-def test_poses_that_are_not_known_are_left_out(tmp_path: Path) -> None:
+def test_unknown_poses_are_skipped(tmp_path: Path) -> None:
     poses = _poses(3)
     poses[1] = np.nan
     write_tum(tmp_path / "t.txt", [0, 1, 2], poses)
@@ -50,7 +50,7 @@ def test_poses_that_are_not_known_are_left_out(tmp_path: Path) -> None:
     assert read_tum(tmp_path / "t.txt")[1].shape == (0, 4, 4)
 
 
-def test_comments_blank_lines_and_scaled_quaternions(tmp_path: Path) -> None:
+def test_comments_blank_lines_and_scaled_quaternions_are_accepted(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("# head\n\n1 0 0 0 0 0 0 1.001 # tail\r\n")
     times, poses = read_tum(tmp_path / "t.txt")
     assert times.tolist() == [1]
@@ -68,27 +68,27 @@ def test_comments_blank_lines_and_scaled_quaternions(tmp_path: Path) -> None:
         ("1 0 0 0 3 0 0 1", "not of unit length"),
     ],
 )
-def test_bad_lines_are_named(tmp_path: Path, line: str, words: str) -> None:
+def test_bad_lines_are_reported(tmp_path: Path, line: str, words: str) -> None:
     (tmp_path / "t.txt").write_text(f"# x\n0 0 0 0 0 0 0 1\n{line}\n")
     with pytest.raises(InputError, match=words) as caught:
         read_tum(tmp_path / "t.txt")
     assert "t.txt, line 3" in str(caught.value)
 
 
-def test_association_takes_the_nearest_within_the_limit() -> None:
-    others = [1.0, 0.0, 2.0]  # in no order
+def test_association_is_nearest_within_limit() -> None:
+    others = [1.0, 0.0, 2.0]  # unsorted
     assert associate([0.019, 0.981, 1.5, 2.02], others).tolist() == [1, 0, -1, 2]
     assert associate([0.0211], [0.0]).tolist() == [-1]
     assert associate([], others).tolist() == []
     assert associate([1.0], []).tolist() == [-1]
 
 
-def test_an_entry_is_given_once() -> None:
+def test_association_is_exclusive_by_default() -> None:
     assert associate([0.99, 1.005, 1.01], [1.0]).tolist() == [-1, 0, -1]
     assert associate([0.99, 1.005, 1.01], [1.0], exclusive=False).tolist() == [0, 0, 0]
 
 
-def test_association_agrees_with_a_slow_search() -> None:
+def test_association_matches_slow_search() -> None:
     rng = np.random.default_rng(9)
     times, others = np.arange(60) / 30, np.sort(rng.uniform(0, 2, 40))
     found = associate(times, others)
@@ -102,7 +102,7 @@ def test_association_agrees_with_a_slow_search() -> None:
             assert gaps.min() > 0.02 or nearest in found
 
 
-def test_poses_at_timestamps() -> None:
+def test_poses_are_associated_with_timestamps() -> None:
     poses = _poses(2)
     out = associated_poses([0.0, 5.0, 1.01], [1.0, 0.01], poses)
     np.testing.assert_array_equal(out[0], poses[1])

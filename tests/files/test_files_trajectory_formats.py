@@ -67,7 +67,7 @@ TIMED = ("a.txt", "data.csv")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_gives_the_same_poses(name: str, tmp_path: Path) -> None:
+def test_all_formats_give_same_poses(name: str, tmp_path: Path) -> None:
     FORMATS[name](tmp_path / name)
     found = read_poses(tmp_path / name)
     assert (found.timestamps is not None) == (name in TIMED)
@@ -78,12 +78,12 @@ def test_every_format_gives_the_same_poses(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["images.txt", "transforms.json", "trajectory.log"])
-def test_a_folder_gives_the_file_in_it(name: str, tmp_path: Path) -> None:
+def test_poses_are_read_from_folder(name: str, tmp_path: Path) -> None:
     FORMATS[name](tmp_path / name)
     assert len(read_poses(tmp_path).poses) == 5
 
 
-def test_poses_by_number_go_to_the_frames_of_a_selection(tmp_path: Path) -> None:
+def test_numbered_poses_are_assigned_to_selected_frames(tmp_path: Path) -> None:
     transforms(tmp_path / "transforms.json")
     found = read_poses(tmp_path / "transforms.json")
     some = found.of_frames(TIMES[:3], np.array([2, 9, 4]))
@@ -91,13 +91,13 @@ def test_poses_by_number_go_to_the_frames_of_a_selection(tmp_path: Path) -> None
     assert np.isnan(some[1]).all()
 
 
-def test_as_many_poses_as_selected_frames_are_in_their_order(tmp_path: Path) -> None:
+def test_equal_count_assigns_poses_in_order(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", POSES)
     found = read_poses(tmp_path / "p.npy").of_frames(TIMES, np.arange(10, 60, 10))
     np.testing.assert_allclose(found, POSES, atol=1e-12)
 
 
-def test_lost_frames_are_left_out(tmp_path: Path) -> None:
+def test_lost_frames_are_skipped(tmp_path: Path) -> None:
     lost = POSES.copy()
     lost[2] = np.nan
     np.save(tmp_path / "p.npy", lost)
@@ -137,7 +137,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_gives_one_clear_error(name: str, tmp_path: Path) -> None:
+def test_bad_file_is_rejected(name: str, tmp_path: Path) -> None:
     content, words = BAD[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
@@ -147,13 +147,13 @@ def test_a_bad_file_gives_one_clear_error(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (3, 2, 4), (0,)])
-def test_an_array_of_another_shape_is_refused(shape, tmp_path: Path) -> None:
+def test_wrong_array_shape_is_rejected(shape, tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.zeros(shape))
     with pytest.raises(InputError, match="shape"):
         read_poses(tmp_path / "p.npy")
 
 
-def test_objects_in_an_array_are_not_unpickled(tmp_path: Path) -> None:
+def test_object_arrays_are_not_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="not an array"):
         read_poses(tmp_path / "p.npy")
@@ -177,7 +177,9 @@ def test_damaged_files_never_crash(tmp_path: Path) -> None:
             assert np.isfinite(found.poses).all()
 
 
-def test_evaluate_takes_poses_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_accepts_poses_by_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     moved = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3])) @ POSES
     np.save(tmp_path / "a.npy", POSES)
     write_kitti(tmp_path / "b.txt", moved)
@@ -195,7 +197,7 @@ def test_evaluate_takes_poses_by_frame(tmp_path: Path, capsys: pytest.CaptureFix
     assert "true ATE within" in capsys.readouterr().out
 
 
-def test_the_true_error_is_within_the_interval() -> None:
+def test_true_error_is_within_interval() -> None:
     rng = np.random.default_rng(1)
     truth = np.tile(np.eye(4), (50, 1, 1))
     truth[:, :3, 3] = np.cumsum(rng.normal(0, 0.1, (50, 3)), axis=0)
@@ -215,7 +217,7 @@ def test_the_true_error_is_within_the_interval() -> None:
         assert low <= ate(estimate, truth).ate_rms_m <= high
 
 
-def test_evaluate_needs_the_times_of_frames(
+def test_evaluate_needs_frame_timestamps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], room_recording: Path
 ) -> None:
     reference = room_recording / "groundtruth.txt"

@@ -26,7 +26,7 @@ from tofuse.recordings.native import corrected_depth
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 
 
-# What takes longest to simulate.
+# The slowest effects to simulate.
 SLOW = ("multipath", "gloss")
 
 
@@ -34,7 +34,7 @@ SLOW = ("multipath", "gloss")
 class Shown:
     frames: tuple[RangeFrame, ...]
     masks: tuple[np.ndarray, ...]  # which pixels show the object
-    stands: tuple[np.ndarray, ...]  # and which its stand, which turns and does not change
+    stands: tuple[np.ndarray, ...]  # and which its rotating stand, whose depth does not change
 
 
 @cache
@@ -63,7 +63,7 @@ def shown(scene: str, camera: str = "sr4000", count: int = 7, off: tuple[str, ..
 
 
 def check(case: Shown, least: float) -> None:
-    """Overlap of what is kept with the truth; a lens blurs a pixel at the outline."""
+    """Intersection over union of the kept pixels; the lens blurs the outline by a pixel."""
     found = Background().fit(case.frames)
     for frame, mask, stand in zip(case.frames, case.masks, case.stands, strict=True):
         counted = frame.valid & ~(cv2.dilate(stand.astype(np.uint8), np.ones((5, 5))) > 0)
@@ -75,16 +75,16 @@ def check(case: Shown, least: float) -> None:
         assert (keep & ~outer).sum() < 0.03 * true.sum()
 
 
-def test_a_person_is_told_from_the_room() -> None:
+def test_person_is_segmented() -> None:
     check(shown("torso"), 0.93)
 
 
-def test_a_box_is_told_from_the_room() -> None:
+def test_box_is_segmented() -> None:
     check(shown("box"), 0.85)
 
 
 @pytest.mark.parametrize(("distance", "size"), [(0.8, (0.3, 0.3, 0.4)), (1.3, (0.16, 0.2, 0.25))])
-def test_boxes_of_other_distances_and_sizes(
+def test_other_box_distances_and_sizes_are_segmented(
     distance: float, size: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(box, "DISTANCE", distance)
@@ -93,18 +93,18 @@ def test_boxes_of_other_distances_and_sizes(
     check(shown.__wrapped__("box", off=SLOW), 0.82)
 
 
-def test_another_camera() -> None:
+def test_box_is_segmented_with_other_camera() -> None:
     check(shown("box", camera="ifm-o3r", off=SLOW), 0.85)
 
 
-def test_a_camera_in_motion_is_refused_and_says_what_to_do() -> None:
+def test_moving_camera_is_rejected() -> None:
     made = plan("rail", every=35, effects=Effects.none(shot_noise=True))
     frames = [rendered.frame for rendered in made.frames(None)]
     with pytest.raises(InputError, match="leave it out if the camera moves"):
         Background().fit(frames)
 
 
-def test_the_filter_must_be_fitted_and_keeps_its_options() -> None:
+def test_filter_needs_fit_and_keeps_options() -> None:
     filter_ = Background(sigmas=5.0)
     case = shown("box")
     with pytest.raises(InputError, match="is not fitted"):
@@ -129,8 +129,8 @@ def test_the_filter_must_be_fitted_and_keeps_its_options() -> None:
         found.mask(small, ())
 
 
-def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
-    """It learns what the simulator scatters, though the shape of its blur is another one."""
+def test_lens_scattering_is_estimated_and_corrected() -> None:
+    """The estimate matches the simulated scattering, although the shape of its blur differs."""
     case, clean = shown("box"), shown("box", off=("scatter",))
     learnt = LensScattering().fit(case.frames)
     assert learnt.fractions is not None
@@ -142,7 +142,7 @@ def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
     corrector = learnt.start()
     for k in (0, 4):
         before, after, truth = case.frames[k], corrector.apply(case.frames[k]), clean.frames[k]
-        # Around the object, where the light that it scatters is strongest.
+        # Around the object, where its scattered light is strongest.
         mask = case.masks[k].astype(np.uint8)
         ring = cv2.dilate(mask, np.ones((9, 9))) != cv2.dilate(mask, np.ones((31, 31)))
         bias = abs(float((before.z - truth.z)[ring].mean()))
@@ -152,7 +152,7 @@ def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
         assert (after.valid == before.valid).all()
 
 
-def test_scattering_that_is_given_needs_no_recording_and_light_is_needed() -> None:
+def test_given_scattering_needs_no_fit_and_requires_amplitude() -> None:
     frame = shown("box").frames[0]
     given = LensScattering(fractions=(0.01, 0.0, 0.01))
     assert not given.needs_fit
@@ -165,7 +165,7 @@ def test_scattering_that_is_given_needs_no_recording_and_light_is_needed() -> No
             LensScattering(**options)
 
 
-def test_a_mask_is_an_image(tmp_path) -> None:
+def test_mask_is_read_from_image(tmp_path) -> None:
     frame = shown("box").frames[0]
     image = np.zeros(frame.depth.shape, np.uint8)
     image[30:40, 50:60] = 1

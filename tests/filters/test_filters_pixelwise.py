@@ -26,7 +26,7 @@ def frame(z: Any, **images: Any) -> RangeFrame:
     return RangeFrame(0, 0.0, camera, z, **images)
 
 
-def test_confidence_keeps_its_level_and_above() -> None:
+def test_confidence_keeps_minimum_and_above() -> None:
     levels = np.array([[0, 3, 6], [7, 7, 255]], np.uint8)
     f = frame(np.ones((2, 3)), confidence_image=levels)
     assert np.array_equal(Confidence(7).mask(f, ()), levels >= 7)
@@ -35,13 +35,13 @@ def test_confidence_keeps_its_level_and_above() -> None:
 
 
 @pytest.mark.parametrize(("highest", "level"), [(7, 5), (2, 2), (255, 183), (1, 1)])
-def test_confidence_on_another_scale_is_as_strict(highest: int, level: int) -> None:
+def test_confidence_level_is_rescaled(highest: int, level: int) -> None:
     assert Confidence(5).on_scale(highest) == Confidence(level, highest)
     assert Confidence(7).on_scale(highest).minimum == highest
     assert Confidence(0).on_scale(highest).minimum == 0
 
 
-def test_views_without_the_measurement_are_kept_whole() -> None:
+def test_views_without_channel_are_kept() -> None:
     f = frame(np.ones((2, 3)))
     cloud = CloudFrame.of(np.ones((5, 3)))
     for item in (Confidence(7), Amplitude(100.0, 200.0)):
@@ -64,7 +64,7 @@ def test_amplitude_of_a_cloud() -> None:
     assert Amplitude(2).mask(cloud, ()).tolist() == [False, True, False]
 
 
-def test_distance_tells_z_from_range() -> None:
+def test_distance_distinguishes_z_and_range() -> None:
     # 3-4-5: the second pixel looks along (0.75, 0, 1), so z = 4 lies at a range of 5.
     camera = Pinhole(2, 2, 1 / 0.75, 1.0, 0.0, 0.0)
     f = RangeFrame(0, 0.0, camera, np.float32([[4, 4], [0, 9]]))
@@ -74,12 +74,12 @@ def test_distance_tells_z_from_range() -> None:
     assert Distance(5.0).mask(f, ())[1, 1]
 
 
-def test_distance_of_a_cloud_is_from_its_origin() -> None:
+def test_cloud_distance_is_from_origin() -> None:
     cloud = CloudFrame(0, 0.0, np.float32([[0, 0, -5], [10, 0, 0]]), origin=np.array([9.0, 0, 0]))
     assert Distance(0.0, 2.0).mask(cloud, ()).tolist() == [False, True]
 
 
-def test_box_keeps_or_cuts() -> None:
+def test_box_keeps_or_removes_inside() -> None:
     points = np.float32([[0, 0, 1], [1, 1, 2], [1.001, 1, 2], [0, 0, 3]])
     cloud = CloudFrame.of(points)
     box = Box((-1.0, -1.0, 1.0), (1.0, 1.0, 2.0))
@@ -91,7 +91,7 @@ def test_box_keeps_or_cuts() -> None:
     assert wide.mask(f, ()).all()
 
 
-def test_foreground_finds_the_gap_before_the_background() -> None:
+def test_foreground_is_separated_at_gap() -> None:
     rng = np.random.default_rng(0)
     z = np.full((40, 40), 3.0) + 0.05 * rng.standard_normal((40, 40))
     z[10:30, 12:24] = 1.0 + 0.05 * rng.standard_normal((20, 12))
@@ -102,7 +102,7 @@ def test_foreground_finds_the_gap_before_the_background() -> None:
     assert np.array_equal(keep & (z > 0), expected)
 
 
-def test_foreground_keeps_what_is_one_thing() -> None:
+def test_foreground_keeps_unimodal_depths() -> None:
     rng = np.random.default_rng(1)
     even = frame(rng.uniform(1, 2, (60, 60)))
     bell = frame(2 + 0.1 * rng.standard_normal((60, 60)))
@@ -116,7 +116,7 @@ def test_foreground_keeps_what_is_one_thing() -> None:
     ]
 
 
-def test_otsu_maximises_the_variance_between_classes() -> None:
+def test_otsu_maximises_between_class_variance() -> None:
     rng = np.random.default_rng(2)
     values = np.concatenate([rng.normal(1, 0.1, 300), rng.normal(2, 0.2, 900)]).astype(np.float32)
     limit, eta = otsu(values)
@@ -154,12 +154,12 @@ def test_otsu_maximises_the_variance_between_classes() -> None:
         (Foreground, {"separability": 1.5}),
     ],
 )
-def test_nonsense_options_are_refused(cls: type, options: dict[str, Any]) -> None:
+def test_invalid_options_are_rejected(cls: type, options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"must|lower"):
         cls(**options)
 
 
-def test_options_from_a_file_name_the_field() -> None:
+def test_option_errors_name_field() -> None:
     parts.discover("tofuse.filters")
     data = {"part": "distance", "minimum": 2, "maximum": 1}
     with pytest.raises(InputError, match=r"my.toml: filters\[0\].*maximum must be above 2"):
@@ -169,7 +169,7 @@ def test_options_from_a_file_name_the_field() -> None:
     assert parts.to_dict(built) == {"part": "confidence", "minimum": 5, "highest": 7}
 
 
-def test_each_filter_sees_what_the_ones_before_left() -> None:
+def test_filters_are_applied_in_sequence() -> None:
     z = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 0.0]])
     left, removals = apply_filters([Distance(2.0), Distance(0.0, 4.0)], frame(z))
     assert removals == [Removal("distance", 5, 1), Removal("distance", 4, 1)]

@@ -1,4 +1,4 @@
-"""Filters on frames of the thesis's own camera."""
+"""Filters on frames of the camera of the thesis."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def still(request: pytest.FixtureRequest, shared_data: Path) -> list[RangeFrame]
     return [frame for frame in frames if isinstance(frame, RangeFrame)]
 
 
-def test_each_level_of_confidence_lowers_the_temporal_noise(still: list[RangeFrame]) -> None:
+def test_temporal_noise_falls_with_confidence(still: list[RangeFrame]) -> None:
     levels = [noise(still, [Confidence(level)] if level else []) for level in range(8)]
     medians, rms = np.array(levels).T
     assert (np.diff(medians) < 0).all()
@@ -38,7 +38,7 @@ def test_each_level_of_confidence_lowers_the_temporal_noise(still: list[RangeFra
     assert rms[7] < rms[0] / 10
 
 
-def test_temporal_filter_keeps_the_quiet_pixels_of_the_thesis(still: list[RangeFrame]) -> None:
+def test_temporal_filter_keeps_stable_pixels(still: list[RangeFrame]) -> None:
     left, removal = apply_filters([TemporalDeviation(0.025, 4)], still[-1], still[:-1])
     deviation = z_deviation([f.z for f in still])
     assert np.nanmax(deviation[left.valid]) <= 0.025

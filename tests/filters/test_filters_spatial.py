@@ -41,7 +41,7 @@ def line(z: Any, focal: float = 1.0) -> RangeFrame:
 # Neighbourhood angle -------------------------------------------------------------------------
 
 
-def test_angle_of_triangles_solved_by_hand() -> None:
+def test_angle_of_known_triangles() -> None:
     # Camera at O, p = (0, 0, 1), n = (1, 0, 1): at p a right angle, at n 45 degrees.
     angle = neighbourhood_angle(line([1, 1]))
     assert angle[0] == pytest.approx([math.pi / 2, math.pi / 4], abs=1e-6)
@@ -52,7 +52,7 @@ def test_angle_of_triangles_solved_by_hand() -> None:
     assert angle[0, 1] == pytest.approx(math.atan2(2, 1) - math.pi / 4, abs=1e-6)
 
 
-def test_angle_is_that_of_equation_2_6_where_an_arcsine_can_give_it() -> None:
+def test_angle_agrees_with_equation_2_6() -> None:
     rng = np.random.default_rng(0)
     for _ in range(200):
         z = rng.uniform(0.5, 5, 2)
@@ -66,22 +66,22 @@ def test_angle_is_that_of_equation_2_6_where_an_arcsine_can_give_it() -> None:
         assert (xi > math.pi / 2) == (n @ p > p @ p)
 
 
-def test_angle_finds_jump_edges_and_believes_slopes() -> None:
-    """May et al.: points between foreground and background go, tilted surfaces stay."""
+def test_angle_removes_jump_edges_and_keeps_slopes() -> None:
+    """May et al.: points between foreground and background are removed, tilted surfaces kept."""
     step = np.full((20, 30), 2.0)
     step[:, 15:] = 4.0
     step[:, 14] = 2.7  # a mixed pixel
     keep = NeighbourhoodAngle().mask(frame(step), ())
     assert not keep[:, 13:15].any()  # the rim and the mixed pixels
     assert keep[:, :13].all()
-    assert keep[:, 15:].all()  # the background, which only sees something before it
-    # A wall seen at 15 degrees stays, at 5 degrees it goes.
-    for grazing, believed in ((15, True), (5, False)):
+    assert keep[:, 15:].all()  # the background, which only has nearer neighbours
+    # A wall seen at 15 degrees is kept, at 5 degrees it is removed.
+    for grazing, kept in ((15, True), (5, False)):
         u = (np.arange(30) - 14.5) / 230
         z = 2 / (1 - u / math.tan(math.radians(grazing)))
         inside = NeighbourhoodAngle().mask(frame(np.tile(z, (20, 1))), ())[1:-1, 1:-1]
-        assert inside.all() == believed
-        assert inside.any() == believed
+        assert inside.all() == kept
+        assert inside.any() == kept
 
 
 def test_angle_ignores_invalid_neighbours() -> None:
@@ -104,7 +104,7 @@ def median_twin(z: np.ndarray, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [3, 5, 7])
-def test_local_median_is_that_of_the_valid_pixels(size: int) -> None:
+def test_local_median_uses_valid_pixels(size: int) -> None:
     rng = np.random.default_rng(size)
     z = rng.uniform(0.5, 3, (17, 23)).astype(np.float32)
     z[rng.random(z.shape) < 0.4] = 0
@@ -136,7 +136,7 @@ def cloud_of(seed: int, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("k", [1, 3, 8])
-def test_mean_neighbour_distance_by_brute_force(k: int) -> None:
+def test_mean_neighbour_distance_matches_brute_force(k: int) -> None:
     points = cloud_of(k, 300)
     points[10] = points[11] = points[12]
     assert mean_neighbour_distance(points, k) == pytest.approx(distance_twin(points, k), abs=1e-12)
@@ -148,13 +148,13 @@ def test_mean_neighbour_distance_of_few_points() -> None:
     assert mean_neighbour_distance(np.float32([[0, 0, 0], [0, 3, 4]]), 3).tolist() == [5, 5]
 
 
-def test_neighbour_distance_removes_the_far_ones() -> None:
+def test_neighbour_distance_removes_outliers() -> None:
     points = np.float32([[0, 0, 1], [0.01, 0, 1], [0, 0.01, 1], [0.01, 0.01, 1], [1, 1, 1]])
     keep = NeighbourDistance(0.05, 3).mask(CloudFrame.of(points), ())
     assert keep.tolist() == [True] * 4 + [False]
 
 
-def test_neighbour_share_removes_the_most_distant() -> None:
+def test_neighbour_fraction_removes_most_distant() -> None:
     points = cloud_of(0, 401)
     f = CloudFrame.of(points)
     keep = NeighbourFraction(0.5, 3).mask(f, ())
@@ -166,7 +166,7 @@ def test_neighbour_share_removes_the_most_distant() -> None:
     assert NeighbourFraction(0.29).mask(CloudFrame.of(cloud_of(1, 100)), ()).sum() == 71
 
 
-def test_neighbour_share_decides_ties_by_order() -> None:
+def test_neighbour_fraction_breaks_ties_by_order() -> None:
     # On a regular grid all inner points have the same distance.
     x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))
     points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
@@ -176,7 +176,7 @@ def test_neighbour_share_decides_ties_by_order() -> None:
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), n=st.integers(2, 80), k=st.integers(1, 6))
-def test_neighbours_don_t_care_about_order_or_frame(seed: int, n: int, k: int) -> None:
+def test_neighbour_distance_is_invariant_to_order_and_frame(seed: int, n: int, k: int) -> None:
     points = cloud_of(seed, n)
     rng = np.random.default_rng([seed, 1])
     order = rng.permutation(n)
@@ -191,7 +191,7 @@ def test_neighbours_don_t_care_about_order_or_frame(seed: int, n: int, k: int) -
         assert np.array_equal(share.mask(CloudFrame.of(points[order]), ()), keep[order])
 
 
-def test_masks_of_images_lie_where_the_points_are() -> None:
+def test_image_masks_follow_pixels() -> None:
     z = np.full((12, 12), 1.0)
     z[0, :] = 0
     z[6, 6] = 2.0
@@ -204,7 +204,7 @@ def test_masks_of_images_lie_where_the_points_are() -> None:
 # Time ----------------------------------------------------------------------------------------
 
 
-def test_temporal_deviation_is_the_sample_deviation_of_z() -> None:
+def test_temporal_deviation_is_sample_deviation_of_z() -> None:
     z = np.zeros((3, 2, 2), np.float32)
     z[:, 0, 0] = [1.0, 1.02, 1.04]  # 20 mm
     z[:, 0, 1] = [1.0, 0, 1.06]  # 42 mm over the two that are valid
@@ -217,7 +217,7 @@ def test_temporal_deviation_is_the_sample_deviation_of_z() -> None:
 
 
 def test_temporal_uses_z_not_range() -> None:
-    camera = Pinhole(2, 2, 0.1, 0.1, 0.0, 0.0)  # z is a tenth of the range beside the axis
+    camera = Pinhole(2, 2, 0.1, 0.1, 0.0, 0.0)  # off the axis z is a tenth of the range
     frames = [
         RangeFrame(0, 0.0, camera, np.full((2, 2), r, np.float32), "range") for r in (1.0, 1.1)
     ]
@@ -232,7 +232,7 @@ def test_temporal_without_history_keeps_all() -> None:
     assert TemporalDeviation().mask(f, [other_size]).all()
 
 
-def test_history_is_cut_to_the_window() -> None:
+def test_history_is_limited_to_window() -> None:
     frames = [frame(np.full((3, 3), z)) for z in (9.0, 1.0, 1.0)]
     left, _ = apply_filters([TemporalDeviation(0.025, 2)], frames[2], frames[:2])
     assert left.valid.all()
@@ -241,14 +241,14 @@ def test_history_is_cut_to_the_window() -> None:
     assert removals[0].removed == 9
 
 
-def test_temporal_removes_edges_and_keeps_faces() -> None:
-    """What the thesis saw (figure 3.2 c): edges go, surfaces facing the camera stay."""
+def test_temporal_removes_edges_and_keeps_surfaces() -> None:
+    """As in the thesis (figure 3.2 c): edges are removed, surfaces facing the camera kept."""
     rng = np.random.default_rng(3)
     frames = []
     for _ in range(6):
         z = np.full((30, 30), 3.0) + 0.01 * rng.standard_normal((30, 30))
         z[8:22, 8:22] = 1.5 + 0.01 * rng.standard_normal((14, 14))
-        share = rng.random(14)  # what a pixel on the edge gets of either side, each time anew
+        share = rng.random(14)  # the mixture in a pixel on the edge, random in each frame
         z[8:22, 22] = 1.5 * share + 3.0 * (1 - share)
         frames.append(frame(z))
     keep = TemporalDeviation(0.025, 6).mask(frames[-1], frames[:-1])
@@ -264,7 +264,7 @@ def every_filter() -> list[Filter]:
     parts.discover("tofuse.filters")
     box = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 3.0))
     known = parts.known("filter")
-    # An image file, and what is learnt from a recording, have tests of their own.
+    # Filters with a file or with a fit to a recording have tests of their own.
     others = {"mask", "background"}
     return [box if name == "box" else cls() for name, cls in known.items() if name not in others]
 
@@ -294,7 +294,7 @@ def test_no_filter_adds_or_moves_points(seed: int, size: tuple[int, int]) -> Non
 
 
 @pytest.mark.parametrize("z", [np.zeros((4, 4)), np.eye(4)[:1].repeat(2, 0) * [[1], [0]]])
-def test_empty_and_one_pixel_frames(z: np.ndarray) -> None:
+def test_empty_and_single_pixel_frames_are_filtered(z: np.ndarray) -> None:
     f = frame(z)
     for item in every_filter():
         left, _ = apply_filters([item], f, [f])
@@ -329,6 +329,6 @@ def test_masks_do_not_depend_on_threads() -> None:
         (TemporalDeviation, {"threshold": -0.025}),
     ],
 )
-def test_nonsense_options_are_refused(cls: type, options: dict[str, Any]) -> None:
+def test_invalid_options_are_rejected(cls: type, options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="must"):
         cls(**options)

@@ -15,7 +15,7 @@ CAMERA = Pinhole(176, 144, 229.0, 229.0, 87.5, 71.5)
 
 
 def image(radial: np.ndarray, albedo: np.ndarray | float) -> RangeFrame:
-    """What a camera of this period measures of surfaces at these ranges (H, W)."""
+    """Measurement of surfaces at these ranges (H, W) by a camera with this period."""
     light = 3000.0 * albedo / radial**2
     return RangeFrame(
         0,
@@ -37,7 +37,7 @@ def corridor(length: float) -> np.ndarray:
     return np.minimum(z, length) * np.sqrt(1 + x * x + y * y)
 
 
-def test_what_is_beyond_the_period_is_left_out() -> None:
+def test_wrapped_pixels_are_removed() -> None:
     radial = corridor(6.2)
     rng = np.random.default_rng(1)
     noisy = radial + rng.normal(0, 0.01, radial.shape)
@@ -48,7 +48,7 @@ def test_what_is_beyond_the_period_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("albedo", [0.04, 0.08])
-def test_dark_surfaces_within_the_period_stay(albedo: float) -> None:
+def test_dark_surfaces_within_period_are_kept(albedo: float) -> None:
     radial = corridor(4.5)
     albedos = np.full(radial.shape, 0.6)
     albedos[80:] = albedo  # a dark floor
@@ -56,7 +56,7 @@ def test_dark_surfaces_within_the_period_stay(albedo: float) -> None:
     assert Wrapped().mask(image(radial, albedos), ()).all()
 
 
-def test_without_amplitude_or_a_period_all_stays() -> None:
+def test_all_is_kept_without_amplitude_or_period() -> None:
     frame = image(corridor(6.2), 0.5)
     plain = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", ambiguity_m=PERIOD)
     endless = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", frame.amplitude_image)
@@ -64,13 +64,13 @@ def test_without_amplitude_or_a_period_all_stays() -> None:
     assert Wrapped().mask(endless, ()).all()
 
 
-def test_the_default_method_leaves_it_out_of_the_model_alone() -> None:
+def test_default_method_filters_only_the_model() -> None:
     config = default("range")
     assert any(isinstance(part, Wrapped) for part in config.model_filters)
     assert not any(isinstance(part, Wrapped) for part in config.filters)
 
 
 @pytest.mark.parametrize("wrong", [{"min_albedo": -0.1}, {"min_albedo": 2.0}])
-def test_options_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
+def test_invalid_options_are_rejected(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Wrapped(**wrong)

@@ -36,7 +36,7 @@ def plane(rng, n=2000, z=2.0):
     return points
 
 
-def test_a_voxel_averages_views_and_each_view_has_one_vote() -> None:
+def test_voxel_averages_views_with_equal_weight() -> None:
     first = view([[0.01, 0.02, 1.01], [0.03, 0.02, 1.03], [0.55, 0.05, 1.05]])
     second = view([[0.06, 0.06, 1.06]], 1)
     found = fuse([first, second])
@@ -48,7 +48,7 @@ def test_a_voxel_averages_views_and_each_view_has_one_vote() -> None:
     assert found.points.dtype == np.float32
 
 
-def test_black_is_no_colour() -> None:
+def test_black_is_ignored_as_colour() -> None:
     points = np.array([[0.05, 0.05, 1.05], [0.55, 0.05, 1.05]], np.float32)
     seen = view(points, color=np.array([[10, 20, 30], [0, 0, 0]], np.uint8))
     dark = view(points, 1, color=np.zeros((2, 3), np.uint8))
@@ -57,12 +57,12 @@ def test_black_is_no_colour() -> None:
     np.testing.assert_array_equal(found.color, [[10, 20, 30], [128, 128, 128]])
 
 
-def test_voxels_below_zero_are_as_large_as_others() -> None:
+def test_voxels_at_negative_coordinates_have_same_size() -> None:
     found = fuse([view([[-0.01, 0.05, 1.05], [0.01, 0.05, 1.05], [-0.09, 0.05, 1.05]])])
     np.testing.assert_allclose(sorted(found.points[:, 0]), [-0.05, 0.01], atol=1e-6)
 
 
-def test_poses_move_the_points() -> None:
+def test_poses_transform_points() -> None:
     T = se3.exp(np.array([0.5, -0.2, 0.1, 0.2, -0.4, 0.3]))
     points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 2.0], [0.0, 0.5, 3.0]])
     found = fuse([view(points)], poses=[T], voxel=0.001)
@@ -72,7 +72,7 @@ def test_poses_move_the_points() -> None:
     np.testing.assert_allclose(got, expected[order], atol=1e-6)
 
 
-def test_the_order_of_views_does_not_matter() -> None:
+def test_cloud_is_independent_of_view_order() -> None:
     rng = np.random.default_rng(1)
     views = [
         view(rng.uniform(0, 1, (500, 3)), k, amplitude=rng.uniform(1, 9, 500).astype(np.float32))
@@ -84,7 +84,7 @@ def test_the_order_of_views_does_not_matter() -> None:
     assert np.abs(one.color.astype(int) - other.color).max() <= 1
 
 
-def test_the_number_of_threads_changes_no_byte() -> None:
+def test_cloud_is_independent_of_threads() -> None:
     rng = np.random.default_rng(2)
     views = [view(plane(rng), k) for k in range(3)]
     found = []
@@ -95,25 +95,25 @@ def test_the_number_of_threads_changes_no_byte() -> None:
     assert len(set(found)) == 1
 
 
-def test_points_of_few_views_are_left_out() -> None:
+def test_points_of_few_views_are_removed() -> None:
     both, once = [0.05, 0.05, 1.05], [0.55, 0.05, 1.05]
     views = [view([both, once]), view([both], 1)]
     np.testing.assert_allclose(fuse(views, min_views=2).points, [both], atol=1e-6)
     assert len(fuse(views, min_views=3)) == 0
 
 
-def test_nothing_gives_an_empty_cloud() -> None:
+def test_no_points_give_empty_cloud() -> None:
     for found in (fuse([]), fuse([view(np.zeros((0, 3)))])):
         assert len(found) == 0
         assert found.points.shape == (0, 3)
         assert found.normals is None
 
 
-def test_normals_look_at_the_camera() -> None:
+def test_normals_face_camera() -> None:
     points = plane(np.random.default_rng(3))
     found = fuse([view(points)], voxel=0.02)
     np.testing.assert_allclose(found.normals, np.tile([0, 0, -1], (len(found), 1)), atol=1e-5)
-    # Seen from behind, the same plane looks the other way.
+    # Seen from behind, the same plane has opposite normals.
     T_behind = se3.exp(np.array([0, 0, 0, 0, np.pi, 0.0]))
     T_behind[:3, 3] = [0, 0, 4]
     behind = fuse([view(se3.transform(se3.inverse(T_behind), points))], poses=[T_behind])
@@ -124,7 +124,7 @@ def test_too_few_points_for_a_plane_have_no_normals() -> None:
     assert fuse([view([[0, 0, 1.0], [1, 0, 1.0]])]).normals is None
 
 
-def test_amplitude_becomes_grey_whatever_the_distance() -> None:
+def test_amplitude_is_range_compensated_to_grey() -> None:
     # One albedo at 1 m and 3 m: the amplitude falls with the square, the grey must not.
     z = np.repeat([1.0, 3.0], 50)
     albedo = np.tile(np.repeat([0.2, 0.8], 25), 2)
@@ -141,7 +141,7 @@ def test_amplitude_becomes_grey_whatever_the_distance() -> None:
 
 
 @pytest.mark.parametrize("thinned", [False, True])
-def test_amplitude_that_the_camera_compensated_is_not_compensated_again(thinned) -> None:
+def test_compensated_amplitude_is_not_compensated_again(thinned) -> None:
     camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
     depth = np.full((80, 100), 1.0, np.float32)
     depth[:, 50:] = 3.0
@@ -159,7 +159,7 @@ def test_amplitude_that_the_camera_compensated_is_not_compensated_again(thinned)
     assert np.abs(found[0].color.astype(int) - found[1].color).max() <= 1
 
 
-def test_colour_is_averaged_and_goes_before_amplitude() -> None:
+def test_colour_is_averaged_and_preferred_to_amplitude() -> None:
     point = [[0.05, 0.05, 1.05]]
     views = [
         view(point, 0, color=np.array([[10, 20, 30]], np.uint8)),
@@ -172,7 +172,7 @@ def test_colour_is_averaged_and_goes_before_amplitude() -> None:
     assert fuse([view(point)]).color is None
 
 
-def test_memory_does_not_grow_with_the_number_of_views(monkeypatch) -> None:
+def test_memory_is_bounded_for_many_views(monkeypatch) -> None:
     monkeypatch.setattr(fusion, "_BUFFER_ROWS", 20_000)
     item = view(plane(np.random.default_rng(4)))
     builder = CloudBuilder(Fusion(), 0.01)
@@ -185,7 +185,7 @@ def test_memory_does_not_grow_with_the_number_of_views(monkeypatch) -> None:
     assert set(found.views.tolist()) == {50}
 
 
-def test_a_voxel_fits_the_spacing_of_a_cloud() -> None:
+def test_voxel_size_follows_point_spacing() -> None:
     square = np.mgrid[0:50, 0:50, 0:1].reshape(3, -1).T * 0.02
     assert choose_voxel(view(square)) == pytest.approx(0.02, rel=0.1)
     assert choose_voxel(view(square / 1000)) == 0.002
@@ -193,7 +193,7 @@ def test_a_voxel_fits_the_spacing_of_a_cloud() -> None:
     assert choose_voxel(view(np.zeros((0, 3)))) > 0
 
 
-def test_thinning_keeps_every_channel_together() -> None:
+def test_thinning_keeps_channels_aligned() -> None:
     n = 1003
     item = view(
         np.arange(3 * n).reshape(n, 3),
@@ -218,6 +218,6 @@ def test_thinning_keeps_every_channel_together() -> None:
         {"min_views": 0},
     ],
 )
-def test_options_that_make_no_sense(options) -> None:
+def test_invalid_options_are_rejected(options) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         Fusion(**options)

@@ -79,7 +79,7 @@ def turned_away(whole: Mesh, small: Mesh) -> float:
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-def test_it_stays_nearer_to_the_surface_than_clustering(scale: float) -> None:
+def test_edge_collapse_is_more_accurate_than_clustering(scale: float) -> None:
     whole = hills()
     whole = replace(whole, vertices=(scale * whole.vertices).astype(np.float32))
     by_edges, by_cells = whole.decimated(1500), whole.clustered(1500)
@@ -90,7 +90,7 @@ def test_it_stays_nearer_to_the_surface_than_clustering(scale: float) -> None:
     np.testing.assert_array_equal(by_edges.offset, whole.offset)
 
 
-def test_attributes_are_means_of_the_vertices_merged() -> None:
+def test_attributes_are_means_of_merged_vertices() -> None:
     whole = hills()
     small = whole.decimated(1500)
     nearest = KdTree(whole.vertices).neighbours(small.vertices, 1)[0][:, 0]
@@ -105,15 +105,15 @@ def test_attributes_are_means_of_the_vertices_merged() -> None:
         given, kept = getattr(whole, name), getattr(small, name)
         assert (kept.min(0) >= given.min(0)).all()
         assert (kept.max(0) <= given.max(0)).all()
-    # What has no colour darkens nothing.
+    # Vertices without colour do not darken their neighbours.
     half = np.where(whole.vertices[:, :1] > 0, 0, [200, 100, 50]).astype(np.uint8)
     colors = np.unique(replace(whole, color=half).decimated(1500).color, axis=0)
     np.testing.assert_array_equal(colors, [[0, 0, 0], [200, 100, 50]])
     assert replace(whole, color=None).decimated(1500).color is None
 
 
-def test_groups_are_the_collapsed_vertices() -> None:
-    """The library's own triangles are those between the groups."""
+def test_groups_match_library_triangles() -> None:
+    """The library's triangles connect the same groups."""
     from fast_simplification import simplify
 
     whole = hills(60)
@@ -127,7 +127,7 @@ def test_groups_are_the_collapsed_vertices() -> None:
     np.testing.assert_allclose(places[found], moved[left] * unit + middle, atol=1e-9)
 
 
-def test_it_is_the_same_in_another_process() -> None:
+def test_result_is_same_in_another_process() -> None:
     code = (
         "import hashlib, sys; sys.path.insert(0, sys.argv[1])\n"
         "from test_fusion_decimation import digest, hills\n"
@@ -152,8 +152,8 @@ def test_small_and_empty_meshes_are_unchanged() -> None:
     assert empty.decimated(10) is empty
 
 
-def test_several_pieces() -> None:
-    """Each is reduced; single triangles, which can't be reduced, leave the limit in force."""
+def test_meshes_of_several_pieces_are_decimated() -> None:
+    """Each is reduced; the limit also holds for single triangles, which can't be collapsed."""
     left, right = hills(40), hills(40, seed=1)
     right = replace(right, vertices=(right.vertices + np.array([3, 0, 0])).astype(np.float32))
     small = together(left, right).decimated(600)
@@ -172,7 +172,7 @@ def test_several_pieces() -> None:
     assert len(scraps.decimated(100).faces) <= 100
 
 
-def test_where_edges_are_not_enough_vertices_are_clustered(monkeypatch) -> None:
+def test_failed_collapse_falls_back_to_clustering(monkeypatch) -> None:
     whole = hills(30)
     monkeypatch.setattr(
         mesh_module,
@@ -199,7 +199,7 @@ def test_large_meshes_are_clustered_first(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_mesh_is_too_irregular(seed: int) -> None:
+def test_irregular_meshes_are_decimated(seed: int) -> None:
     """Soups with non-manifold edges, duplicates, coincident and infinite vertices."""
     rng = np.random.default_rng(seed)
     n = 200

@@ -38,7 +38,7 @@ def covariance(position_m: float, rotation_rad: float = 0.0):
     return np.diag([position_m**2] * 3 + [rotation_rad**2] * 3)
 
 
-def test_the_variance_is_that_of_draws() -> None:
+def test_variance_matches_monte_carlo() -> None:
     rng = np.random.default_rng(2)
     root = rng.normal(0, 1e-3, (6, 6))
     C = root @ root.T
@@ -50,7 +50,7 @@ def test_the_variance_is_that_of_draws() -> None:
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0, 0), (10.0, -5, 2)])
-def test_errors_of_the_pose_add_to_the_noise(offset) -> None:
+def test_pose_errors_add_to_noise(offset) -> None:
     points = wall().points
     T = np.eye(4)
     T[:3, 3] = offset
@@ -60,7 +60,7 @@ def test_errors_of_the_pose_add_to_the_noise(offset) -> None:
     np.testing.assert_allclose(found, np.hypot(SIGMA, 0.02), rtol=1e-4)
 
 
-def test_a_turn_moves_what_is_far_away() -> None:
+def test_rotation_error_scales_with_distance() -> None:
     points = wall().points
     found = with_pose_errors(
         model_of(points), [wall()], np.eye(4)[None], covariance(0, 0.01)[None]
@@ -70,36 +70,36 @@ def test_a_turn_moves_what_is_far_away() -> None:
     assert found[middle] == pytest.approx(expected, rel=0.02)
 
 
-def test_the_view_that_knows_a_place_best_decides() -> None:
+def test_most_accurate_view_determines_sigma() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     both = np.stack([covariance(0.05), covariance(0.01)])
     found = with_pose_errors(model_of(wall().points), [wall(), wall()], poses, both).cloud.sigma
     np.testing.assert_allclose(found, np.hypot(SIGMA, 0.01), rtol=1e-4)
 
 
-def test_a_view_says_nothing_of_what_it_does_not_see() -> None:
+def test_occluded_views_are_ignored() -> None:
     behind = wall(4.0).points
     poses = np.stack([np.eye(4), np.eye(4)])
-    frames = [wall(2.0), wall(4.0)]  # the first sees something before it
+    frames = [wall(2.0), wall(4.0)]  # in the first, a nearer surface occludes it
     both = np.stack([covariance(0.001), covariance(0.05)])
     found = with_pose_errors(model_of(behind), frames, poses, both).cloud.sigma
     np.testing.assert_allclose(found, np.hypot(SIGMA, 0.05), rtol=1e-4)
 
 
-def test_a_pose_that_is_not_constrained_leaves_the_surface_unknown() -> None:
+def test_unconstrained_pose_gives_large_sigma() -> None:
     nothing = np.full((1, 6, 6), np.nan)
     found = with_pose_errors(model_of(wall().points), [wall()], np.eye(4)[None], nothing)
     assert (found.cloud.sigma > 1).all()
 
 
-def test_what_no_view_sees_leaves_the_model_as_it_is() -> None:
+def test_unseen_model_is_unchanged() -> None:
     model = model_of(-wall().points)
     same = with_pose_errors(model, [wall()], np.eye(4)[None], covariance(0.1)[None])
     assert same is model
     assert with_pose_errors(model, [], np.zeros((0, 4, 4)), np.zeros((0, 6, 6))) is model
 
 
-def test_the_pose_of_the_camera_counts() -> None:
+def test_camera_pose_is_applied() -> None:
     T = se3.exp(np.array([1.0, 2, 3, 0.1, 0.5, -0.2]))
     points = se3.transform(T, wall().points.astype(float))
     found = with_pose_errors(model_of(points), [wall()], T[None], covariance(0.03)[None])
@@ -107,7 +107,7 @@ def test_the_pose_of_the_camera_counts() -> None:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_the_vertices_of_the_surface_have_it_too(same) -> None:
+def test_mesh_vertices_include_pose_errors(same) -> None:
     points = wall().points
     model = model_of(points)
     vertices = points if same else points[::2]

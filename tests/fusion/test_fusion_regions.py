@@ -44,7 +44,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize(("memory_mb", "least"), [(8, 2), (3, 5), (1, 30)])
-def test_regions_make_the_same_surface_to_the_byte(room, memory_mb, least) -> None:
+def test_regions_give_same_bytes(room, memory_mb, least) -> None:
     views, poses = room
     options = Fusion(voxel_m=0.03, island=60)
     whole = fuse_surface(views, poses, options)
@@ -56,7 +56,7 @@ def test_regions_make_the_same_surface_to_the_byte(room, memory_mb, least) -> No
         same(fuse_surface(views, poses, small), whole)
 
 
-def test_turns_colours_and_views_of_two_cameras_make_no_seam() -> None:
+def test_round_robin_colours_and_two_cameras_make_no_seam() -> None:
     """Round-robin depends on the numbers of blocks and views, not on how they are grouped."""
     frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
     rng = np.random.default_rng(4)
@@ -74,7 +74,7 @@ def test_turns_colours_and_views_of_two_cameras_make_no_seam() -> None:
         )
 
 
-def test_voxels_don_t_grow_where_memory_is_short(room) -> None:
+def test_memory_limit_keeps_voxel_size(room) -> None:
     views, poses = room
     layout = Layout.of(views, poses, 0.03)
     assert layout.voxel_m == 0.03
@@ -84,7 +84,7 @@ def test_voxels_don_t_grow_where_memory_is_short(room) -> None:
         assert sum(a.nbytes for a in arrays) <= 1e6
 
 
-def test_each_block_is_of_one_region_and_has_its_neighbours_around(room) -> None:
+def test_each_block_has_one_region_with_its_neighbours(room) -> None:
     views, poses = room
     layout = Layout.of(views, poses, 0.03)
     place = {block_of(int(key)): k for k, key in enumerate(layout.keys)}
@@ -103,47 +103,47 @@ def test_each_block_is_of_one_region_and_has_its_neighbours_around(room) -> None
             assert held.issuperset(n for n in near if n is not None)
             assert (region.low < [i, j, k]).all()
             assert (region.high > [i + 1, j + 1, k + 1]).all()
-    # Halves of halves: no region is much smaller than the others.
+    # Recursive halving: no region is much smaller than the others.
     sizes = [region.own for region in regions]
     assert min(sizes) > max(sizes) / 5
-    assert len(layout.regions(1)) == len(layout.keys)  # no further than to single blocks
+    assert len(layout.regions(1)) == len(layout.keys)  # regions are at least single blocks
     assert len(layout.regions(len(layout.keys))) == 1
 
 
 @pytest.mark.parametrize("which", ["room", "ball", "grazing"])
-def test_views_that_are_passed_over_would_have_told_nothing(room, which) -> None:
+def test_skipped_views_contribute_nothing(room, which) -> None:
     if which == "room":
         views, poses = room
     elif which == "ball":
         frames, poses = around_a_ball(20, noise=np.random.default_rng(7))
         views = [RangeView.of(f) for f in frames]
-    else:  # noisy pixels, and planes along the line of sight, speak of what is far behind them
+    else:  # noisy pixels and grazing planes carve free space far behind them
         poses = np.array([look([0.4 * k, 0, 0], [0.4 * k + 1.5, 0.3, 2]) for k in range(6)])
         floor = [plane_range(T, np.array([0, 1.0, 0]), 0.4) for T in poses]
         near = [np.where(f < 6, f, np.inf) for f in floor]
         views = [RangeView.of(frame_of(f, k, sigma=0.03)) for k, f in enumerate(near)]
     layout = Layout.of(views, poses, 0.01 if which == "ball" else 0.03)
     frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
-    passed = 0
+    skipped = 0
     for region in layout.regions(40):
         edge = EDGE * layout.voxel_m
         touching = frusta.touching(edge * (region.low - 1.0), edge * (region.high + 1.0))
-        passed += (~touching).sum()
+        skipped += (~touching).sum()
         volume = Volume.of(layout, region)
         volume.add(views, poses, touching=~touching)
         assert not volume.weight.any()
         assert not volume.free.any()
         assert not volume.seen.any()
-    assert passed > len(views)
+    assert skipped > len(views)
 
 
-def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
-    """Blocks also in free space, which is integrated up to the camera."""
+def test_contributing_views_touch_block() -> None:
+    """Including blocks in free space, which is integrated up to the camera."""
     rng = np.random.default_rng(11)
     T = look([0.2, -0.1, 0.3], [0.6, 0.2, 2.3])
     view = RangeView.of(frame_of(rng.uniform(0.8, 2.0, (72, 88)), sigma=0.01))
     frusta = Frusta.of([view], T[None], _free_space_limits(0.05))
-    told = 0
+    contributing = 0
     for _ in range(200):
         i, j, k = (int(n) for n in rng.integers(-14, 15, 3))
         keys = np.array([block_key(i, j, k + 4)], np.int64)
@@ -152,20 +152,20 @@ def test_a_box_anywhere_is_told_of_by_those_who_see_it() -> None:
         volume.add([view], T[None])
         low = 0.16 * np.array([i, j, k + 4])
         something = bool(volume.weight.any() or volume.free.any())
-        told += something
+        contributing += something
         assert frusta.touching(low, low + 0.16)[0] or not something
-    assert 3 < told < 100
+    assert 3 < contributing < 100
 
 
-def test_a_view_that_shows_nothing_touches_nothing() -> None:
+def test_empty_view_touches_nothing() -> None:
     empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
     frusta = Frusta.of([empty], EYE[None], _free_space_limits(0.05))
     assert not frusta.touching(np.full(3, -9.0), np.full(3, 9.0)).any()
     assert fuse_surface([empty], EYE[None], Fusion(memory_mb=1)).faces.shape == (0, 3)
 
 
-def test_an_island_is_told_by_all_its_parts() -> None:
-    """A strip over several regions is larger than an island; in each of them it is smaller."""
+def test_islands_are_measured_across_regions() -> None:
+    """A strip across several regions exceeds the island size, but not in any single region."""
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     ranges[:34] = np.inf
     ranges[40:] = np.inf
@@ -185,14 +185,14 @@ def test_an_island_is_told_by_all_its_parts() -> None:
     assert len(stitch(pieces, len(layout.keys), 2 * len(mesh))) == 0
 
 
-def test_progress_is_told_for_each_view_once(room) -> None:
+def test_progress_advances_once_per_view(room) -> None:
     views, poses = room
     calls = []
     fuse_surface(views, poses, Fusion(voxel_m=0.03, memory_mb=1), lambda: calls.append(1))
     assert len(calls) == len(views)
 
 
-def test_counts_stop_at_what_they_hold() -> None:
+def test_view_counts_saturate() -> None:
     view = RangeView.of(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)))
     volume = Volume.around([view], EYE[None], 0.05, Fusion())
     volume.add([view], EYE[None])
@@ -203,7 +203,7 @@ def test_counts_stop_at_what_they_hold() -> None:
 
 
 @pytest.mark.parametrize("memory_mb", [1, 600])
-def test_what_is_on_disk_comes_back_with_a_state_of_the_run(room, memory_mb) -> None:
+def test_spilled_views_are_restored_with_state(room, memory_mb) -> None:
     _, poses = room
     builder = ModelBuilder(Fusion(voxel_m=0.05, memory_mb=memory_mb))
     for k, T in enumerate(poses):

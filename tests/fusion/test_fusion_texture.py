@@ -61,7 +61,7 @@ def pattern(points: np.ndarray) -> np.ndarray:
 
 
 def look(T: np.ndarray, gain: float, *, hidden: float | None = None, lamp: bool = False):
-    """An image of the wall at z = 2 m; nearer by 0.5 m where its x is beyond `hidden`."""
+    """An image of the wall at z = 2 m; occluded 0.5 m nearer where its x exceeds `hidden`."""
     rays = np.concatenate([CAMERA.rays(), np.ones((60, 80, 1))], -1)
     away = rays @ T[:3, :3].T
     z = (2.0 - T[2, 3]) / away[..., 2]
@@ -83,7 +83,7 @@ POSES = np.stack(
 )
 
 
-def test_triangles_are_drawn_where_they_are() -> None:
+def test_triangles_are_rasterized_in_place() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)
     owner = np.full((30, 30), UNOWNED, np.int32)
@@ -111,7 +111,7 @@ def test_triangles_are_drawn_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("plain", [False, True])
-def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
+def test_atlas_holds_every_triangle_once(plain: bool, monkeypatch) -> None:
     mesh = sheet(9, 7, 0.1)
     if plain:
         monkeypatch.setitem(sys.modules, "xatlas", None)
@@ -122,7 +122,7 @@ def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
         np.sort(np.sort(atlas.vertices[atlas.faces], 1), 0),
         np.sort(np.sort(mesh.faces, 1), 0),
     )
-    # In the same direction, so that outside stays outside.
+    # With the same winding, so that the outside stays outside.
     np.testing.assert_array_equal(
         {tuple(np.roll(f, -np.argmin(f))) for f in atlas.vertices[atlas.faces].tolist()},
         {tuple(np.roll(f, -np.argmin(f))) for f in mesh.faces.tolist()},
@@ -149,7 +149,7 @@ def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
         assert atlas_module.plain_atlas(mesh, 64).size < atlas.size
 
 
-def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
+def test_texture_has_uniform_exposure() -> None:
     mesh = sheet(25, 17, 0.05)
     gains = np.array([1.0, 1.3, 0.8])
     views = [TextureView.of(look(T, g)) for T, g in zip(POSES, gains, strict=True)]
@@ -170,11 +170,11 @@ def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
     error = np.abs(made.image[inside] - truth)
     assert error.mean() < 1.0
     assert np.quantile(error, 0.99) < 4.0
-    # As exposures were, the best view alone would be off by 20 % and more.
+    # With the original exposures, the best view alone would be off by 20 % and more.
     assert np.abs(pattern(at) * 1.3 - truth).mean() > 20
 
 
-def test_amplitude_is_made_albedo_and_then_grey() -> None:
+def test_amplitude_becomes_albedo_and_grey() -> None:
     mesh = sheet(25, 17, 0.05)
     views = [TextureView.of(look(T, g, lamp=True)) for T, g in zip(POSES, (1, 2, 1), strict=True)]
     found = exposures(mesh, views, POSES)
@@ -184,7 +184,7 @@ def test_amplitude_is_made_albedo_and_then_grey() -> None:
     assert np.ptp(made.image) > 200
 
 
-def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
+def test_occluded_surface_is_not_painted_by_occluder() -> None:
     mesh = sheet(25, 17, 0.05)
     view = TextureView.of(look(np.eye(4), 1.0, hidden=0.2))
     made = textured(mesh, [view], POSES[:1], 256)
@@ -194,16 +194,16 @@ def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
     assert (shown[x > 0.3] == 9).all()  # the vertices' own colour
     assert (shown[x < 0.05] > 60).all()
     assert (shown != 255).any(1).all()
-    # From behind, nothing is seen.
+    # From behind, the surface is not seen.
     turned = mesh_of(mesh.vertices, mesh.faces[:, ::-1], -mesh.normals)
     assert textured(turned, [view], POSES[:1], 256).seen == 0
 
 
-def test_frames_without_light_give_no_view() -> None:
+def test_frames_without_channel_give_no_view() -> None:
     assert TextureView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
 
 
-def test_what_has_no_colour_darkens_nothing(tmp_path) -> None:
+def test_missing_colour_does_not_darken(tmp_path) -> None:
     wall = sheet(40, 40, 0.05)
     dark = wall.vertices[:, 0] > 0
     wall = replace(wall, color=np.where(dark[:, None], 0, [180, 180, 180]).astype(np.uint8))
@@ -217,7 +217,7 @@ def test_what_has_no_colour_darkens_nothing(tmp_path) -> None:
     assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
 
 
-def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
+def test_batched_atlas_holds_every_triangle_once(monkeypatch) -> None:
     pytest.importorskip("xatlas")
     monkeypatch.setattr(atlas_module, "_BATCH", 100)
     wall = sheet(20, 20, 0.05)
@@ -230,10 +230,10 @@ def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
     b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     own = np.bincount(owner[owner != UNOWNED], minlength=len(p))
-    assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # nothing lies on anything else
+    assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # triangles do not overlap
 
 
-def test_textures_come_back_from_files(tmp_path: Path) -> None:
+def test_textures_round_trip(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     mesh = sheet(5, 4, 0.2)
     made = textured(mesh, [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
@@ -247,13 +247,13 @@ def test_textures_come_back_from_files(tmp_path: Path) -> None:
         material = read.visual.material
         shown = material.baseColorTexture if name == "m.glb" else material.image
         np.testing.assert_array_equal(np.asarray(shown.convert("RGB")), made.image)
-        # Their v goes up from the lower edge.
+        # In the files v is measured upwards from the lower edge.
         uv = np.asarray(read.visual.uv)[read.faces] * [1, -1] + [0, 1]
         np.testing.assert_allclose(uv, atlas.uv[atlas.faces], atol=1e-5)
     assert {p.name for p in tmp_path.iterdir()} == {"m.glb", "m.obj", "m.mtl", "m.png"}
 
 
-def test_holes_are_closed_and_borders_are_not() -> None:
+def test_holes_are_filled_and_borders_kept() -> None:
     mesh = sheet(12, 10, 0.05)
     centre = mesh.vertices[mesh.faces].mean(1)
     small = np.linalg.norm(centre[:, :2] - [0.1, 0.05], axis=1) < 0.06
@@ -269,17 +269,17 @@ def test_holes_are_closed_and_borders_are_not() -> None:
     assert (patched.color[-1] == 9).all()
     a, b, c = np.moveaxis(patched.vertices[patched.faces].astype(float), 1, 0)
     across = 0.5 * np.cross(b - a, c - a)
-    assert (across[:, 2] < 0).all()  # all still face the camera
+    assert (across[:, 2] < 0).all()  # all triangles still face the camera
     removed = (0.05**2 / 2) * large.sum()
     np.testing.assert_allclose(-across[:, 2].sum(), 0.55 * 0.45 - removed, rtol=1e-5)
-    assert len(torn.without_holes(10.0)) == len(torn) + 2  # the outer border is no hole
+    assert len(torn.without_holes(10.0)) == len(torn) + 2  # the outer border is not a hole
     assert torn.without_holes(0.05) is torn
     np.testing.assert_array_equal(mesh.without_holes(10.0).faces, mesh.faces)
 
 
-def test_decimation_keeps_edges_sharp_and_sides_apart() -> None:
+def test_decimation_keeps_edges_sharp_and_sides_separate() -> None:
     front, top = sheet(41, 41, 0.01), sheet(41, 41, 0.01)
-    # A ledge: a wall, and from its upper edge a plane away from the camera; cells are cut anyhow.
+    # A ledge: a wall, and from its upper edge a plane away from the camera; not aligned with cells.
     upper = top.vertices[:, [0, 2, 1]] * [1, 0, 1] + [0, -0.2, 2.2]
     ledge = mesh_of(
         np.concatenate([front.vertices, upper]) + 0.0037,
@@ -292,7 +292,7 @@ def test_decimation_keeps_edges_sharp_and_sides_apart() -> None:
     off = np.minimum(np.abs(p[:, 2] - 2.0), np.abs(p[:, 1] + 0.2))
     assert off.max() < 0.002
     assert ledge.decimated(10**6) is ledge
-    # A board of 1 cm, seen from both sides: cells of 5 cm do not make it one.
+    # A board 1 cm thick, seen from both sides: cells of 5 cm do not merge its sides.
     back = sheet(41, 41, 0.01, 2.01)
     board = mesh_of(
         np.concatenate([front.vertices, back.vertices]),
@@ -305,12 +305,12 @@ def test_decimation_keeps_edges_sharp_and_sides_apart() -> None:
     np.testing.assert_array_equal(z > 2.005, thin.normals[:, 2] > 0)
 
 
-def test_plain_cells_get_smaller_with_more_triangles() -> None:
+def test_plain_atlas_cells_shrink_with_more_triangles() -> None:
     many = plain_atlas(sheet(60, 60, 0.01), 256)
     assert 256 < many.size <= 60 * 6
 
 
-def test_a_run_with_a_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr(
         run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
@@ -327,7 +327,7 @@ def test_a_run_with_a_texture(room_recording: Path, tmp_path: Path, capsys, monk
     (mesh,) = trimesh.load_scene(a / "mesh.glb", process=False).geometry.values()
     image = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
     assert np.ptp(image) > 100
-    # Without one, what was there goes away.
+    # A run without a texture removes the earlier one.
     assert main([*words, str(a), "--overwrite"]) == 0
     assert not (a / "mesh.obj").exists()
     assert not (a / "mesh.png").exists()

@@ -45,7 +45,7 @@ def edges_of(faces):
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def test_the_zero_of_exact_distances_is_closed_across_blocks() -> None:
+def test_exact_zero_level_is_closed_across_blocks() -> None:
     frames, poses = around_a_ball()
     volume = Volume.around([RangeView.of(f) for f in frames], poses, 0.012, Fusion())
     r = np.linalg.norm(voxels_of(volume), axis=-1)
@@ -55,7 +55,7 @@ def test_the_zero_of_exact_distances_is_closed_across_blocks() -> None:
     mesh = volume.surface()
     edges = edges_of(mesh.faces)
     there, count = np.unique(edges, axis=0, return_counts=True)
-    assert (count == 1).all()  # a directed edge is of one face: all turn the same way
+    assert (count == 1).all()  # a directed edge is of one face: orientation is consistent
     np.testing.assert_array_equal(there, np.unique(edges[:, ::-1], axis=0))  # no border
     # Euler: V - E + F = 2 for a ball.
     assert len(mesh) - len(edges) // 2 + len(mesh.faces) == 2
@@ -65,16 +65,16 @@ def test_the_zero_of_exact_distances_is_closed_across_blocks() -> None:
     np.testing.assert_allclose(mesh.sigma, 1e-3)
 
 
-def test_noise_never_opens_the_surface(ball) -> None:
+def test_noisy_surface_is_closed(ball) -> None:
     edges = edges_of(ball[2].faces)
     there, count = np.unique(edges, axis=0, return_counts=True)
     back, count_back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
     np.testing.assert_array_equal(there, back)
     np.testing.assert_array_equal(count, count_back)
-    assert (count > 1).mean() < 0.001  # where it touches itself
+    assert (count > 1).mean() < 0.001  # where the surface touches itself
 
 
-def test_a_noisy_ball_has_its_radius_and_normals_outwards(ball) -> None:
+def test_noisy_ball_has_correct_radius_and_normals(ball) -> None:
     _, _, mesh = ball
     p = mesh.vertices.astype(float)
     r = np.linalg.norm(p, axis=1)
@@ -91,7 +91,7 @@ def test_a_noisy_ball_has_its_radius_and_normals_outwards(ball) -> None:
     assert 0.0005 < np.median(mesh.sigma) < 0.005
 
 
-def test_threads_change_no_byte(ball) -> None:
+def test_surface_is_independent_of_threads(ball) -> None:
     views, poses, mesh = ball
     for count in (1, 3):
         with threads(count):
@@ -109,7 +109,7 @@ def pixels_of(view):
 
 
 def voxels_of(volume):
-    """(B, 512, 3) where the voxels are, in m."""
+    """(B, 512, 3) positions of the voxels, in m."""
     ijk = np.array([block_of(int(key)) for key in volume.keys])
     inside = np.array([voxel_of(v) for v in range(512)])
     return (8 * ijk[:, None] + inside[None]) * volume.voxel_m
@@ -141,8 +141,8 @@ def slow_distances(volume, views, poses):
     return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
 
 
-def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
-    # A ball before a wall, gone after two views: it is seen through, hides, and makes jumps.
+def test_distances_match_slow_sum_over_views() -> None:
+    # A ball in front of a wall, gone after two views: free-space violations, occlusion and jumps.
     rng = np.random.default_rng(2)
     poses = np.array([look([x, 0.1 * x, 0], [0.2 * x, 0, 2]) for x in np.linspace(-1.2, 1.2, 5)])
     views = []
@@ -153,13 +153,13 @@ def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
     volume = Volume.around(views, poses, 0.01, Fusion())
     volume.add(views, poses)
     assert (volume.free > 0).sum() > 10
-    volume.surface()  # settles what was seen through
+    volume.surface()  # applies free-space violations
     distance, weight, seen, margin = slow_distances(volume, views, poses)
     near = (seen > 0) & (margin > 0.05)
     assert near.sum() > 10_000
-    assert (volume.seen[near] != seen[near]).mean() < 1e-3  # at the cut, by rounding
-    # Blocks that were seen through count the least weight of what lies behind them.
-    assert (volume.weight[near] > weight[near] * (1 + 1e-5)).mean() < 1e-3  # at the cut again
+    assert (volume.seen[near] != seen[near]).mean() < 1e-3  # at the truncation, by rounding
+    # Blocks with free-space violations use the least weight of the pixels behind them.
+    assert (volume.weight[near] > weight[near] * (1 + 1e-5)).mean() < 1e-3  # truncation again
     exact = near & np.isclose(volume.weight, weight, rtol=1e-4) & (volume.seen == seen)
     assert exact.sum() > 0.6 * near.sum()
     np.testing.assert_allclose(volume.distance[exact], distance[exact], atol=2e-5)
@@ -167,7 +167,7 @@ def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
     assert np.abs(volume.distance - distance)[near].mean() < 0.01 * volume.reach_m
 
 
-def test_blocks_lie_near_surfaces_only_and_don_t_grow_with_views(ball) -> None:
+def test_blocks_lie_near_surfaces_for_any_number_of_views(ball) -> None:
     views, poses, _ = ball
     once = Volume.around(views, poses, 0.012, Fusion())
     twice = Volume.around([*views, *views], np.concatenate([poses, poses]), 0.012, Fusion())
@@ -179,12 +179,12 @@ def test_blocks_lie_near_surfaces_only_and_don_t_grow_with_views(ball) -> None:
     assert off.max() < once.reach_m + 0.02 + np.sqrt(3) * 4 * 0.012
 
 
-def test_free_space_carves_away_what_one_view_made_up() -> None:
+def test_free_space_removes_ghost_of_one_view() -> None:
     wall = [plane_range(look([x, 0, 0], [x, 0, 2]), np.array([0, 0, 1.0]), 2.0) for x in (0, 0.1)]
     poses = np.array([look([x, 0, 0], [x, 0, 2]) for x in (0, 0.1)] * 4)
     frames = [frame_of(wall[k % 2], k) for k in range(8)]
     ghost = wall[0].copy()
-    ghost[26:48, 30:56] = 1.4  # large enough to be no island
+    ghost[26:48, 30:56] = 1.4  # too large for an island
     views = [RangeView.of(f) for f in frames]
     options = Fusion(voxel_m=0.02, island=10)
     alone = fuse_surface([RangeView.of(frame_of(ghost, 0))], poses[:1], options)
@@ -196,7 +196,7 @@ def test_free_space_carves_away_what_one_view_made_up() -> None:
 
 
 def test_noisy_views_make_one_surface_not_several() -> None:
-    """Behind its surface a view knows nothing only from where on it is surely behind."""
+    """A view ignores what is behind its surface only where that is significant."""
     code = 137
     assert 1 / np.sqrt(DECODED[code]) == pytest.approx(0.05, rel=0.1)
     views = []
@@ -212,17 +212,17 @@ def test_noisy_views_make_one_surface_not_several() -> None:
     z = volume.surface().vertices[:, 2]
     assert len(z) > 1000
     assert np.abs(z - 3).max() < 0.05
-    # What is surely behind stays: a precise view says nothing of it.
+    # What is significantly behind is kept: precise views do not measure it.
     sure = [replace(v, strength=np.where(v.strength > 0, 200, 0).astype(np.uint8)) for v in views]
     volume = Volume.around(sure, poses, 0.03, Fusion())
     volume.add(sure, poses)
     assert (np.abs(volume.surface().vertices[:, 2] - 3.13) < 0.01).sum() > 500
 
 
-def test_at_a_jump_surfaces_end_with_the_pixels_that_measured_them() -> None:
+def test_surfaces_end_at_depth_jumps() -> None:
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     ranges[:, 40:] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, 40:]
-    ranges[:, 40] = 1.5  # mixes both
+    ranges[:, 40] = 1.5  # a mixed pixel
     view = RangeView.of(frame_of(ranges, noise=np.random.default_rng(4)))
     weight = DECODED[view.strength[10:60]]
     assert (weight[:, 40] == 0).all()
@@ -230,7 +230,7 @@ def test_at_a_jump_surfaces_end_with_the_pixels_that_measured_them() -> None:
     for beside, wall in ((39, 2.0), (41, 1.0)):
         assert (weight[:, beside] > 0).mean() > 0.9
         assert (weight[:, beside] < 0.5 * middle).all()
-        # Drawn to the plane, as the others are: the noise was 5 mm.
+        # Denoised by the plane fit, as the others are: the noise was 5 mm.
         assert np.std(view.z[10:60, beside] * view.unit - wall) < 0.0035
     assert (weight[:, 10:36] > 0.5 * middle).mean() > 0.98
     mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0))
@@ -254,7 +254,7 @@ def test_weights_follow_noise_and_incidence() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.002, 0.01, 0.03])
-def test_weights_say_what_noise_is_left(sigma) -> None:
+def test_weights_reflect_residual_noise(sigma) -> None:
     straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     rng = np.random.default_rng(6)
     view = RangeView.of(frame_of(straight, sigma=sigma, noise=rng))
@@ -266,11 +266,11 @@ def test_weights_say_what_noise_is_left(sigma) -> None:
     fitted = pixels[..., 4] > 0
     assert fitted.mean() > 0.9
     ratio = off[fitted].std() / np.median(said[fitted])
-    assert 0.2 < ratio < 1.6  # what relief could be there is not noise, but not known
+    assert 0.2 < ratio < 1.6  # possible relief counts as uncertainty, but not as noise
     assert off[fitted].std() < sigma
 
 
-def test_islands_go_and_large_pieces_stay() -> None:
+def test_islands_are_removed_and_large_pieces_kept() -> None:
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     ranges[28:40, 28:40] = 1.0 * ray_lengths(CAMERA)[28:40, 28:40]
     view = RangeView.of(frame_of(ranges))
@@ -282,7 +282,7 @@ def test_islands_go_and_large_pieces_stay() -> None:
     assert large.faces.max() == len(large) - 1
 
 
-def test_colour_is_the_mean_of_what_the_views_saw() -> None:
+def test_colour_is_mean_of_views() -> None:
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     red = np.zeros((72, 88, 3), np.uint8)
     red[..., 0] = 200
@@ -317,7 +317,7 @@ def test_albedo_is_grey_and_does_not_fall_with_range() -> None:
     assert mesh.color.min() < 60
 
 
-def test_min_views_leaves_out_what_few_saw() -> None:
+def test_min_views_removes_rarely_seen_surface() -> None:
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     side = se3.exp(np.array([0.8, 0, 0, 0, 0, 0]))
     views = [RangeView.of(frame_of(ranges, k)) for k in range(2)]
@@ -328,7 +328,7 @@ def test_min_views_leaves_out_what_few_saw() -> None:
     assert (both.views == 2).all()
 
 
-def test_a_voxel_fits_the_sensor() -> None:
+def test_voxel_size_follows_sensor() -> None:
     camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
 
     def views(z):
@@ -341,7 +341,7 @@ def test_a_voxel_fits_the_sensor() -> None:
     assert fitting_voxel([]) > 0
 
 
-def test_large_images_are_kept_at_half_their_size() -> None:
+def test_large_images_are_stored_at_half_resolution() -> None:
     camera = Pinhole(640, 480, 580.0, 580.0, 320.0, 240.0)
     depth = np.full((480, 640), 2.0, np.float32)
     depth[200:, 300:] = 0
@@ -356,14 +356,14 @@ def test_large_images_are_kept_at_half_their_size() -> None:
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
 
 
-def test_views_that_show_nothing_make_an_empty_mesh() -> None:
+def test_empty_views_make_empty_mesh() -> None:
     empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
     mesh = fuse_surface([empty], EYE[None])
     assert (len(mesh), len(mesh.faces)) == (0, 0)
     assert mesh.cloud().points.shape == (0, 3)
 
 
-def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
+def test_builder_keeps_views_within_memory_limit() -> None:
     frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
     posed = dict(enumerate(poses))
     models = []
@@ -386,7 +386,7 @@ def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
         assert len(advanced) == 60
         assert (spill.spilled_bytes > 0) == (options.memory_mb == 1)
         assert spill.resident_bytes <= options.memory_mb * 500_000
-        assert len(spill) == 60  # what was corrected is forgotten
+        assert len(spill) == 60  # corrected copies are dropped
         assert len(builder.sketch(posed)) > 500
     for large, small in zip(*models, strict=True):
         for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
@@ -395,7 +395,7 @@ def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
     assert models[0][0].mesh.views.max() > 20
 
 
-def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
+def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     rng = np.random.default_rng(5)
     frame = frame_of(rng.uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
@@ -404,7 +404,7 @@ def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
     assert found[0].projection is found[1].projection
-    # Points still land on the pixels that measured them.
+    # Points still project onto the pixels that measured them.
     p = found[0].projection
     x, y = p.rays[20, 30]
     node = (x - p.frame[0]) * p.frame[2], (y - p.frame[1]) * p.frame[3]
@@ -419,7 +419,7 @@ def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
     np.testing.assert_allclose(z, 2.1, atol=0.003)
 
 
-def test_a_builder_keeps_all_clouds_in_so_much_memory() -> None:
+def test_builder_keeps_clouds_within_memory_limit() -> None:
     rng = np.random.default_rng(4)
     clouds = [replace(CloudFrame.of(rng.normal(size=(4000, 3))), index=k) for k in range(30)]
     poses = {k: se3.exp(0.1 * rng.normal(size=6)) for k in range(0, 30, 2)}
@@ -438,7 +438,7 @@ def test_a_builder_keeps_all_clouds_in_so_much_memory() -> None:
     assert made[0].views.max() > 1
 
 
-def test_clouds_have_no_surface_and_hopeless_images_still_a_cloud() -> None:
+def test_clouds_give_no_mesh_and_sparse_images_give_cloud() -> None:
     rng = np.random.default_rng(4)
     builder = ModelBuilder(Fusion())
     builder.add(CloudFrame.of(rng.normal(size=(500, 3))), None, 1000)
@@ -455,7 +455,7 @@ def test_clouds_have_no_surface_and_hopeless_images_still_a_cloud() -> None:
     assert len(model.cloud) == 1
 
 
-def test_simplifying_keeps_the_shape_with_fewer_faces(ball) -> None:
+def test_simplified_mesh_keeps_shape(ball) -> None:
     _, _, mesh = ball
     small = mesh.simplified(0.036)
     assert len(small.faces) < len(mesh.faces) / 5
@@ -466,7 +466,7 @@ def test_simplifying_keeps_the_shape_with_fewer_faces(ball) -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
-def test_up_is_the_floor_s_normal_or_what_walls_are_plumb_to(tilt) -> None:
+def test_up_follows_floor_or_walls(tilt) -> None:
     # The camera looks down by `tilt`, at a floor 1 m below and a wall 3 m ahead.
     T = se3.exp(np.array([0, 0, 0, -tilt, 0, 0]))
     floor = plane_range(T, np.array([0, 1.0, 0]), 1.0)
@@ -481,15 +481,15 @@ def test_up_is_the_floor_s_normal_or_what_walls_are_plumb_to(tilt) -> None:
     if (np.minimum(floor, wall) == floor).mean() > 0.15:
         np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
     wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
-    # A wall is plumb, however the camera is tilted before it.
+    # A wall is vertical, however the camera is tilted.
     np.testing.assert_allclose(upright(wall_only, EYE[None]) @ down, [0, -1, 0], atol=0.03)
-    # Without a floor, what an accelerometer measured counts before the cameras' own up.
+    # Without a floor, measured gravity takes precedence over the cameras' up direction.
     against_gravity = np.array([0.6, -0.8, 0.0])
     R = upright(wall_only, EYE[None], against_gravity)
     np.testing.assert_allclose(R @ against_gravity, [0, 1, 0], atol=1e-12)
 
 
-def test_depths_drawn_to_planes_and_jumps_against_slow_twins() -> None:
+def test_plane_shrinkage_and_jumps_match_slow_twins() -> None:
     rng = np.random.default_rng(12)
     shape = (19, 23)
     z = np.where(rng.random(shape) < 0.1, 0, rng.choice([1.0, 1.04, 1.5], shape))
@@ -527,7 +527,7 @@ def test_depths_drawn_to_planes_and_jumps_against_slow_twins() -> None:
     assert 0.1 < measured.mean() < 0.9
 
 
-def test_packed_views_against_a_slow_twin() -> None:
+def test_packed_views_match_slow_twin() -> None:
     rng = np.random.default_rng(5)
     shape = (6, 7)
     rays = rng.uniform(-0.8, 0.8, (*shape, 2)).astype(np.float32)
@@ -570,19 +570,19 @@ def half_dark(rng):
     return RangeFrame(0, 0.0, CAMERA, depth, "range", sigma_image=sigma)
 
 
-def test_a_dark_wall_gets_planes_and_weights_of_its_own_noise() -> None:
+def test_noisy_wall_has_planes_and_weights_of_its_noise() -> None:
     frame = half_dark(np.random.default_rng(7))
     view = RangeView.of(frame)
     dark, bright = np.s_[6:-6, 56:-6], np.s_[6:-6, 6:44]
     off = view.z * view.unit - 2.0
-    assert np.abs(off[dark]).mean() < 0.02  # a pixel alone is off by 0.048
+    assert np.abs(off[dark]).mean() < 0.02  # the mean error of a single pixel is 0.048
     assert (view.strength[dark] > 0).mean() > 0.95
     weight = DECODED[view.strength]
     ratio = np.median(weight[bright]) / np.median(weight[dark])
     assert 10 < ratio < 1000
 
 
-def test_filters_that_thin_out_are_overruled_on_planes_but_not_those_that_cut_off() -> None:
+def test_thinned_planes_are_restored_but_cropped_ones_are_not() -> None:
     rng = np.random.default_rng(8)
     frame = half_dark(rng)
     mask = rng.random(frame.valid.shape) < 0.4
@@ -592,9 +592,9 @@ def test_filters_that_thin_out_are_overruled_on_planes_but_not_those_that_cut_of
     assert not view.strength[:, :18].any()
 
 
-def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
+def test_round_robin_views_make_nearly_same_surface(monkeypatch) -> None:
     frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
-    # Each also sees one pixel in front of the ball, which the others see through.
+    # Each also has one false pixel in front of the ball, where the others measure free space.
     for k, frame in enumerate(frames):
         frame.depth[30 + k % 12, 40 + k % 7] = 0.6
     views = [RangeView.of(f) for f in frames]
@@ -605,7 +605,7 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
     monkeypatch.setattr(layout, "_MAX_STRIDE", 1)
     full = Volume.around(views, poses, 0.012, options)
     assert full.free_space_stride == 1
-    assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over
+    assert len(turned.keys) > 0.97 * len(full.keys)  # isolated pixels may be skipped
     assert np.isin(turned.keys, full.keys).all()
     expected = fuse_surface(views, poses, options)
     for mesh in (found, expected):
@@ -613,7 +613,7 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
         assert np.abs(r - 0.3).mean() < 0.0015
         assert np.abs(r - 0.3).max() < 0.03
     assert abs(len(found) - len(expected)) < 0.01 * len(expected)
-    # The same weights in the mean, both where the surface is and where there is none.
+    # The same mean weights, both near the surface and elsewhere.
     for volume in (turned, full):
         volume.add(views, poses)
         volume.surface()
@@ -628,7 +628,7 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
+def test_near_cubes_match_slow_twin(stride) -> None:
     rng = np.random.default_rng(9)
     view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
     T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
@@ -646,7 +646,7 @@ def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
                 expected.add(block_key(*(int(n) for n in np.floor(q / 0.05))))
     assert len(expected) > 200
     both = expected & set(keys.tolist())
-    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # but for rounding
+    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # except for rounding
     marks = np.zeros(2, np.uint8)
     parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
     mark_eighths(keys, *index_of(parents), marks)
@@ -655,7 +655,7 @@ def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
         assert mark == sum(1 << e for e in eighths)
 
 
-def test_a_sparse_image_has_a_surface() -> None:
+def test_sparse_image_has_surface() -> None:
     """Four pixels in five are missing, scattered: a block of the halved image has a few."""
     camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
     depth = np.full((240, 320), 1.5, np.float32)

@@ -72,30 +72,30 @@ def cameras(yaws: np.ndarray, down: float, roll: float, wobble: float = 3.0) -> 
     ],
 )
 @pytest.mark.parametrize("kind", ["floor", "all", "walls"])
-def test_up_is_found_however_the_camera_is_held(yaws, down, roll, kind) -> None:
+def test_up_is_found_for_any_camera_orientation(yaws, down, roll, kind) -> None:
     if kind != "floor" and down > 60:
-        pytest.skip("who looks straight down sees a floor and no ceiling")
+        pytest.skip("a camera that looks straight down sees a floor and no ceiling")
     model = {"floor": room(), "all": room(ceiling=700), "walls": room(floor=0)}[kind]
     poses = cameras(yaws, down, roll)
     assert likely_up(model, poses) @ UP > np.cos(np.radians(4))
-    # Whatever the world's axes are.
+    # For any axes of the world.
     T = se3.exp(np.array([0, 0, 0, 0.7, -1.9, 0.4]))
     there = surface(model.vertices @ T[:3, :3].T, model.normals @ T[:3, :3].T)
     assert likely_up(there, T @ poses) @ (T[:3, :3] @ UP) > np.cos(np.radians(4))
 
 
-def test_the_floor_is_flat_and_gravity_decides_where_it_is_known() -> None:
+def test_floor_is_levelled_and_gravity_takes_precedence() -> None:
     poses = cameras(np.linspace(0, 40, 20), 80.0, 0.0)
     R = upright(room(), poses)
     np.testing.assert_allclose(R[1], UP, atol=0.01)
     assert np.linalg.det(R) == pytest.approx(1)
-    # A slope is no floor, nor is a wall.
+    # Measured gravity takes precedence over the floor.
     tilted = se3.exp(np.array([0, 0, 0, np.radians(40), 0, 0]))[:3, :3] @ UP
     np.testing.assert_allclose(upright(room(), poses, tilted)[1], tilted)
 
 
 @pytest.mark.parametrize("mesh", [None, room(floor=0, walls=0)])
-def test_without_a_surface_the_cameras_say_it(mesh) -> None:
+def test_up_follows_cameras_without_surface(mesh) -> None:
     poses = cameras(np.linspace(0, 300, 40), 30.0, 0.0)
     assert likely_up(mesh, poses) @ UP > np.cos(np.radians(5))
     np.testing.assert_allclose(likely_up(mesh, np.eye(4)[None]), UP, atol=1e-9)
@@ -104,7 +104,7 @@ def test_without_a_surface_the_cameras_say_it(mesh) -> None:
 
 
 @pytest.mark.parametrize("name", ["iphone_chair_3dscannerapp", "iphone_stray", "iphone_record3d"])
-def test_up_of_a_phone_is_that_of_its_gravity(shared_data: Path, name: str) -> None:
+def test_up_of_phone_recording_matches_gravity(shared_data: Path, name: str) -> None:
     """ARKit's world has y up."""
     recording = open_recording(shared_data / name)
     assert recording.reference is not None

@@ -38,7 +38,7 @@ CAMERAS: list[Camera] = [PINHOLE, BROWN, RATIONAL, FISHEYE, table(PINHOLE), tabl
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{type(c).__name__}-{c.width}")
-def test_projection_of_the_rays_gives_the_pixels(camera: Camera) -> None:
+def test_projected_rays_give_pixels(camera: Camera) -> None:
     rays = camera.rays()
     assert rays.shape == (camera.height, camera.width, 2)
     assert rays.dtype == np.float32
@@ -51,14 +51,14 @@ def test_projection_of_the_rays_gives_the_pixels(camera: Camera) -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{type(c).__name__}-{c.width}")
-def test_points_behind_the_camera_land_nowhere(camera: Camera) -> None:
+def test_points_behind_camera_project_to_nan(camera: Camera) -> None:
     uv = camera.project([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert np.isnan(uv[:2]).all()
     assert np.isfinite(uv[2]).all()
 
 
 @pytest.mark.parametrize("camera", [BROWN, RATIONAL])
-def test_distortion_is_opencvs(camera: BrownConrady) -> None:
+def test_distortion_matches_opencv(camera: BrownConrady) -> None:
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     names = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
     coefficients = np.array([getattr(camera, n, 0.0) for n in names])
@@ -67,7 +67,7 @@ def test_distortion_is_opencvs(camera: BrownConrady) -> None:
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-6)
 
 
-def test_fisheye_is_opencvs() -> None:
+def test_fisheye_matches_opencv() -> None:
     K = np.array([[FISHEYE.fx, 0, FISHEYE.cx], [0, FISHEYE.fy, FISHEYE.cy], [0, 0, 1]])
     D = np.array([FISHEYE.k1, FISHEYE.k2, FISHEYE.k3, FISHEYE.k4])
     points = np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 1.5], (200, 3))
@@ -75,15 +75,15 @@ def test_fisheye_is_opencvs() -> None:
     np.testing.assert_allclose(FISHEYE.project(points), expected, atol=1e-6)
 
 
-def test_pixels_that_no_ray_reaches_are_nan() -> None:
-    # Strong barrel distortion folds over: the corners of the image see nothing.
+def test_unreachable_pixels_are_nan() -> None:
+    # Strong barrel distortion folds over: no ray reaches the corners of the image.
     camera = BrownConrady(176, 144, 100.0, 100.0, 87.5, 71.5, -0.5)
     rays = camera.rays()
     assert np.isnan(rays[0, 0]).all()
     np.testing.assert_allclose(rays[72, 88], [0.005, 0.005], rtol=1e-3)
 
 
-def test_equal_ray_tables_share_what_is_kept_for_a_camera() -> None:
+def test_equal_ray_tables_share_cache_entry() -> None:
     rays = np.array(PINHOLE.rays())
     rays[0, 0], rays[3, 3] = np.nan, 0.0
     other = rays.copy()
@@ -110,7 +110,7 @@ def test_eqs_2_3_to_2_5(radial_range: float, column: int, row: int) -> None:
     assert np.count_nonzero(z) == 1
 
 
-def test_a_ray_table_keeps_the_rays_exactly_and_tolerates_holes() -> None:
+def test_ray_table_keeps_rays_and_tolerates_holes() -> None:
     rays = BROWN.rays().copy()
     rays[10:12, 20:30] = np.nan
     camera = RayTable(rays)
@@ -120,7 +120,7 @@ def test_a_ray_table_keeps_the_rays_exactly_and_tolerates_holes() -> None:
     assert abs(camera.fit.fx - BROWN.fx) < 10
 
 
-def test_scaling_keeps_the_rays_of_block_centres() -> None:
+def test_scaling_keeps_rays_of_block_centres() -> None:
     half = scaled(PINHOLE, 88, 72)
     rays, full = half.rays(), PINHOLE.rays()
     blocks = full.reshape(72, 2, 88, 2, 2).mean((1, 3))
@@ -140,7 +140,7 @@ def test_scaling_keeps_the_rays_of_block_centres() -> None:
         {"fx": True},
     ],
 )
-def test_impossible_intrinsics_are_refused(change: dict[str, object]) -> None:
+def test_invalid_intrinsics_are_rejected(change: dict[str, object]) -> None:
     good: dict[str, object] = {
         "width": 176, "height": 144, "fx": 230.0, "fy": 230.0, "cx": 87.0, "cy": 71.0,
     }  # fmt: skip
@@ -149,25 +149,25 @@ def test_impossible_intrinsics_are_refused(change: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("shape", [(144, 176), (144, 176, 3), (1, 1, 2)])
-def test_ray_tables_of_the_wrong_shape_are_refused(shape: tuple[int, ...]) -> None:
+def test_ray_tables_of_wrong_shape_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match="rays"):
         RayTable(np.zeros(shape, np.float32))
 
 
-def test_ray_table_without_rays_is_refused() -> None:
+def test_ray_table_without_rays_is_rejected() -> None:
     with pytest.raises(InputError, match="no finite rays"):
         RayTable(np.full((10, 10, 2), np.nan, np.float32))
 
 
 @pytest.mark.parametrize("mirror", [(-1, 1), (1, -1)])
-def test_ray_tables_that_mirror_the_image_are_refused(mirror: tuple[int, int]) -> None:
+def test_mirrored_ray_tables_are_rejected(mirror: tuple[int, int]) -> None:
     rays = Pinhole(40, 30, 50.0, 50.0, 19.5, 14.5).rays() * np.array(mirror, np.float32)
     rays[:5] = np.nan
     with pytest.raises(InputError, match="mirror the image"):
         RayTable(rays)
 
 
-def test_a_ray_table_may_hold_holes_and_noise_and_a_camera_upside_down() -> None:
+def test_noisy_and_upside_down_ray_tables_are_accepted() -> None:
     rays = Pinhole(40, 30, 50.0, 50.0, 19.5, 14.5).rays()
     rng = np.random.default_rng(3)
     for sign in (1, -1):

@@ -31,7 +31,7 @@ def generator(xi: np.ndarray) -> np.ndarray:
 
 
 @given(st.one_of(twists, tiny))
-def test_exp_is_the_matrix_exponential(xi: np.ndarray) -> None:
+def test_exp_is_matrix_exponential(xi: np.ndarray) -> None:
     np.testing.assert_allclose(se3.exp(xi), expm(generator(xi)), atol=1e-12)
 
 
@@ -49,16 +49,14 @@ def test_group_axioms(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
 
 
 @given(twists, twists)
-def test_adjoint_moves_a_perturbation_to_the_other_side(a: np.ndarray, xi: np.ndarray) -> None:
+def test_adjoint_converts_right_to_left_perturbation(a: np.ndarray, xi: np.ndarray) -> None:
     T = se3.exp(a)
     left = se3.exp(se3.adjoint(T) @ (1e-2 * xi))
     np.testing.assert_allclose(left @ T, T @ se3.exp(1e-2 * xi), atol=1e-11)
 
 
 @given(twists, twists, st.floats(0, 1))
-def test_interpolation_is_a_screw_between_its_ends(
-    a: np.ndarray, b: np.ndarray, share: float
-) -> None:
+def test_interpolation_is_screw_motion(a: np.ndarray, b: np.ndarray, share: float) -> None:
     A, B = se3.exp(a), se3.exp(a) @ se3.exp(0.9 * b)
     np.testing.assert_allclose(se3.interpolate(A, B, 0.0), A, atol=1e-12)
     np.testing.assert_allclose(se3.interpolate(A, B, 1.0), B, atol=1e-9)
@@ -67,7 +65,7 @@ def test_interpolation_is_a_screw_between_its_ends(
 
 
 @given(arrays(float, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 0.1))
-def test_log_and_angle_are_exact_near_half_a_turn(axis: np.ndarray) -> None:
+def test_log_and_angle_are_exact_near_pi(axis: np.ndarray) -> None:
     axis = axis / np.linalg.norm(axis)
     for angle in (np.pi, np.pi - 1e-9, np.pi - 1e-5):
         R = Rotation.from_rotvec(axis * angle).as_matrix()
@@ -79,7 +77,7 @@ def test_log_and_angle_are_exact_near_half_a_turn(axis: np.ndarray) -> None:
         np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-7)
 
 
-def test_functions_work_on_stacks() -> None:
+def test_functions_broadcast_over_stacks() -> None:
     xi = np.random.default_rng(0).normal(size=(4, 5, 6))
     T = se3.exp(xi)
     assert T.shape == (4, 5, 4, 4)
@@ -88,7 +86,7 @@ def test_functions_work_on_stacks() -> None:
     assert se3.adjoint(T).shape == (4, 5, 6, 6)
 
 
-def test_transform_maps_points_of_b_into_a() -> None:
+def test_transform_maps_points_from_b_to_a() -> None:
     T_a_b = np.eye(4)
     T_a_b[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     T_a_b[:3, 3] = [10, 0, 0]
@@ -98,7 +96,7 @@ def test_transform_maps_points_of_b_into_a() -> None:
 
 
 @given(twists, arrays(float, (3, 3), elements=st.floats(-1e-3, 1e-3)))
-def test_orthonormalise_gives_the_nearest_rotation(xi: np.ndarray, noise: np.ndarray) -> None:
+def test_orthonormalise_gives_nearest_rotation(xi: np.ndarray, noise: np.ndarray) -> None:
     T = se3.exp(xi)
     bent = T.copy()
     bent[:3, :3] += noise
@@ -119,7 +117,7 @@ def test_orthonormalise_gives_the_nearest_rotation(xi: np.ndarray, noise: np.nda
         lambda T: T + np.array([[0] * 4] * 3 + [[1, 0, 0, 0]]),
     ],
 )
-def test_check_pose_refuses_what_is_no_rigid_motion(change) -> None:
+def test_check_pose_rejects_non_rigid_matrices(change) -> None:
     T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
     np.testing.assert_array_equal(se3.check_pose(T), T)
     with pytest.raises(InputError, match="pose"):
@@ -148,18 +146,18 @@ def test_from_matrix_inverts_to_matrix(q: np.ndarray) -> None:
 
 
 @given(unit_quaternions, unit_quaternions)
-def test_products_of_quaternions(a: np.ndarray, b: np.ndarray) -> None:
+def test_quaternion_product_matches_matrix_product(a: np.ndarray, b: np.ndarray) -> None:
     A, B = quaternion.to_matrix(a), quaternion.to_matrix(b)
     np.testing.assert_allclose(quaternion.to_matrix(quaternion.multiply(a, b)), A @ B, atol=1e-12)
 
 
-def test_quaternion_of_a_quarter_turn() -> None:
+def test_quaternion_of_quarter_turn() -> None:
     q = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
     np.testing.assert_allclose(quaternion.to_matrix(q) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.03, 0.0999, 0.1001, 1.0, 3.1])
-def test_jacobians_of_the_exponential_are_those_of_its_series(angle):
+def test_jacobian_matches_series(angle):
     """sum (-ad)^n / (n + 1)!, which converges for every twist; and the two are inverse."""
     rng = np.random.default_rng(11)
     xi = rng.normal(size=6)
@@ -175,7 +173,7 @@ def test_jacobians_of_the_exponential_are_those_of_its_series(angle):
     np.testing.assert_allclose(se3.jacobian_inverse(xi) @ series, np.eye(6), atol=1e-13)
 
 
-def test_inverse_jacobian_is_the_slope_of_the_logarithm():
+def test_inverse_jacobian_is_derivative_of_log():
     rng = np.random.default_rng(12)
     xi = rng.normal(size=(5, 6))
     numeric = np.zeros((5, 6, 6))

@@ -16,7 +16,7 @@ OPTIONS = RefineOptions()
 
 
 def path(count: int) -> np.ndarray:
-    """Poses that swing round in front of the corner and come back, the first the identity."""
+    """Poses on a closed path in front of the corner, the first the identity."""
     a = np.linspace(0, 2 * np.pi, count, endpoint=False)
     sine, rise = np.sin(a), 1 - np.cos(a)
     shift = [0.3 * sine, 0.2 * rise, 0.2 * np.sin(2 * a)]
@@ -35,7 +35,7 @@ def surfaces(poses, noise=0.0, **kwargs):
 
 
 def drifted(poses):
-    """Poses of an odometry that errs by the same little motion in every step."""
+    """Poses of an odometry with the same small error in every step."""
     step = se3.exp(np.array([0.004, -0.003, 0.002, 0.003, -0.002, 0.003]))
     out = [poses[0]]
     for a, b in itertools.pairwise(poses):
@@ -44,5 +44,5 @@ def drifted(poses):
 
 
 def away(found, truth) -> float:
-    """Largest distance of a camera from where it is, m."""
+    """Largest position error of the cameras, m."""
     return float(np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max())

@@ -23,9 +23,9 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
-# What a screenshot of WebGL makes the browser say.
+# A message that screenshots of WebGL cause.
 _OWN = "GPU stall due to ReadPixels"
-# When a frame of an animation was last asked for or drawn, or the page scrolled.
+# The time when an animation frame was last requested or drawn, or the page scrolled.
 _MOTION = """
   window.moved = performance.now();
   const moved = () => { window.moved = performance.now(); };
@@ -36,12 +36,12 @@ _MOTION = """
   };
   addEventListener("scroll", moved, { capture: true, passive: true });
 """
-_REST_MS = 350  # longer than the report waits before it draws what rests
+_REST_MS = 350  # longer than the report waits before it draws the scene at rest
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """Start one; the test is skipped where there is none."""
+    """Start Chromium; skip the test if there is none."""
     api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
     names = ("chromium", "chromium-browser", "google-chrome")
     path = next((found for found in map(shutil.which, names) if found), None)
@@ -55,7 +55,7 @@ def chromium() -> Iterator[Any]:
 
 @dataclass
 class Watched:
-    """A page, with what it complained about and what it asked of others."""
+    """A page with its errors and its external requests."""
 
     page: Any
     complaints: list[str] = field(default_factory=list)
@@ -68,19 +68,19 @@ class Watched:
             self.page.wait_for_timeout(ms)
 
     def pixels(self, selector: str) -> np.ndarray:
-        """What an element looks like, (H, W, 3)."""
+        """Screenshot of an element, (H, W, 3)."""
         data = np.frombuffer(self.page.locator(selector).screenshot(), np.uint8)
         return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)
 
     def check(self) -> None:
-        """Fail if there was any complaint, or any request to another place."""
+        """Fail if there was any error or external request."""
         assert self.complaints == []
         assert self.outside == []
 
 
 @contextmanager
 def watched(browser: Any, address: str, *, ours: str, **options: Any) -> Iterator[Watched]:
-    """Open a page; requests that do not begin with `ours` are refused and kept."""
+    """Open a page; requests that do not begin with `ours` are blocked and recorded."""
     context = browser.new_context(**options)
     if options.get("java_script_enabled", True):
         context.add_init_script(_MOTION)
@@ -96,7 +96,7 @@ def watched(browser: Any, address: str, *, ours: str, **options: Any) -> Iterato
 
     context.route("**/*", decide)
     out.page.on("pageerror", lambda error: out.complaints.append(str(error)))
-    out.page.on("console", lambda said: _hear(out, said))
+    out.page.on("console", lambda message: _record_error(out, message))
     try:
         out.page.goto(address)
         yield out
@@ -104,9 +104,9 @@ def watched(browser: Any, address: str, *, ours: str, **options: Any) -> Iterato
         context.close()
 
 
-def _hear(out: Watched, said: Any) -> None:
-    if said.type == "error" and _OWN not in said.text:
-        out.complaints.append(f"{said.text} ({said.location})")
+def _record_error(out: Watched, message: Any) -> None:
+    if message.type == "error" and _OWN not in message.text:
+        out.complaints.append(f"{message.text} ({message.location})")
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:

@@ -18,7 +18,7 @@ import made_tof
 from tofuse.errors import TofuseError
 from tofuse.recordings.open import open_recording
 
-# What makes a recording, the name of its file (None: a folder), and its format.
+# Function that writes a recording, name of its file (None: a folder), and its format.
 MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "3dscannerapp": (made_phones.make_scanner_app, None, "3dscannerapp"),
     "stray": (made_phones.make_stray, None, "stray"),
@@ -45,7 +45,7 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
 def read_through(
     path: Path, format_: str | None, camera: Path | None = None
 ) -> tuple[int, int, int]:
-    """Read every frame; return how many were whole, how many not, and whether all was refused."""
+    """Read every frame; return the numbers of readable and unreadable ones, and of rejections."""
     whole = unread = 0
     errors: list[TofuseError] = []
     try:

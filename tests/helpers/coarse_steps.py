@@ -13,7 +13,7 @@ from tofuse.recordings.recording import Recording
 def without_multipath(
     folder: Path, scene: str, camera: str, every: int, frames: int | None = None
 ) -> Recording:
-    """A scene seen from every `every`-th place of its path, with all errors but multipath."""
+    """A scene recorded at every `every`-th pose of its path, with all errors except multipath."""
     effects = Effects(multipath=False)
     out = folder / scene
     simulate(scene, out, camera=camera, seed=10, every=every, frames=frames, effects=effects)

@@ -12,12 +12,12 @@ from tofuse.registration.prepared_view import Smoothed, SurfaceOptions
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 
 
-# No plane bends round the edges of the corner, so that what fits, fits exactly.
+# No plane fit bridges the edges of the corner, so that the fits are exact.
 SHARP = SurfaceOptions(radii=(2,), flatness=1e-5, smoothed=Smoothed(noise=0))
 
 
 def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0) -> RangeFrame:
-    """A corner of three walls with a pattern, seen by a camera whose range lacks `offset`."""
+    """A corner of three walls with a pattern, seen by a camera whose range is short by `offset`."""
     rays = np.concatenate([CAMERA.rays(), np.ones((48, 60, 1))], -1)
     directions = rays @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3]

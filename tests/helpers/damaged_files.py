@@ -84,7 +84,7 @@ def damage(files: list[Path], rng: np.random.Generator) -> None:
                 if data:
                     data[at] ^= 1 << int(rng.integers(8))
             path.write_bytes(data)
-        case 2:  # within the header, where it hurts
+        case 2:  # within the header
             for at in rng.integers(0, max(1, min(len(data), 300)), 3):
                 if data:
                     data[at] = int(rng.integers(256))
@@ -97,7 +97,7 @@ def damage(files: list[Path], rng: np.random.Generator) -> None:
         case 4:
             path.unlink()
             path.mkdir()
-        case 5:  # a number of a text becomes another
+        case 5:  # a digit of a text file is replaced
             digits = [k for k, c in enumerate(data[:2000]) if 48 <= c < 58]
             if digits:
                 at = digits[rng.integers(len(digits))]

@@ -27,7 +27,7 @@ def infrared_counts(k: int) -> UInt16:
 
 
 class FakeRealSense(ModuleType):
-    """pyrealsense2: milliseconds, metres per count, RuntimeError where something is wrong."""
+    """pyrealsense2: milliseconds, metres per count, RuntimeError on failure."""
 
     stream = SimpleNamespace(depth="depth", infrared="infrared")
     format = SimpleNamespace(z16="z16", y8="y8")
@@ -94,7 +94,7 @@ class FakeRealSense(ModuleType):
 
 
 class FakeK4A(ModuleType):
-    """pyk4a: mm, microseconds, OpenCV's eight numbers of distortion."""
+    """pyk4a: mm, microseconds, OpenCV's eight distortion coefficients."""
 
     class K4AException(Exception):  # noqa: N818
         pass
@@ -133,7 +133,7 @@ class FakeK4A(ModuleType):
             self.left -= 1
             k = 5 - self.left
             return SimpleNamespace(
-                depth=None if k == 1 else depth_counts(k),  # now and then only infrared comes
+                depth=None if k == 1 else depth_counts(k),  # occasionally only infrared arrives
                 ir=infrared_counts(k),
                 depth_timestamp_usec=100_000 + 66_667 * k,
             )
@@ -147,7 +147,7 @@ class FakeK4A(ModuleType):
 
 
 class FakeOrbbec(ModuleType):
-    """pyorbbecsdk: mm per count, milliseconds, None where no frame came in time."""
+    """pyorbbecsdk: mm per count, milliseconds, None if no frame arrives in time."""
 
     class OBError(Exception):
         pass
@@ -211,7 +211,7 @@ class FakeOrbbec(ModuleType):
 
 
 def fake_ifm3d(frames: int = 5, *, converted: bool = True) -> dict[str, ModuleType]:
-    """ifm3dpy: futures, buffers by number; distances in m where the package has converted them."""
+    """ifm3dpy: futures, buffers by number; distances in m if the package has converted them."""
 
     class Error(Exception):
         pass

@@ -55,7 +55,7 @@ def depth_of(T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def config(version: int = 5, **changes: object) -> dict[str, object]:
-    """What cwipc writes; `changes` replace fields of the file."""
+    """The configuration that cwipc writes; `changes` replace its fields."""
     cameras = [
         {"disabled": False, "serial": serial, "trafo": T.tolist(), "type": "kinect_playback"}
         for serial, T in zip(SERIALS, TRAFOS, strict=True)
@@ -65,7 +65,7 @@ def config(version: int = 5, **changes: object) -> dict[str, object]:
 
 
 def make_cwipc(folder: Path, frames: int = 2) -> None:
-    """Two still Azure Kinects."""
+    """Two stationary Azure Kinects."""
     folder.mkdir(parents=True, exist_ok=True)
     for serial, T in zip(SERIALS, T_WORLD_DEPTH, strict=True):
         make_mkv(folder / f"{serial}.mkv", np.stack([depth_of(T)] * frames))

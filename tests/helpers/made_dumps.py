@@ -21,7 +21,7 @@ AMPLITUDE = np.arange(3 * HEIGHT * WIDTH, dtype=np.uint16).reshape(3, HEIGHT, WI
 
 
 def make_polycam(folder: Path, *, corrected: bool = True) -> None:
-    """Names are microseconds; ARKit's poses are a little off those that were optimised."""
+    """Names are microseconds; ARKit's poses differ slightly from the optimised ones."""
     keyframes = folder / "keyframes"
     for name in ("depth", "confidence", "images", "cameras", "corrected_cameras"):
         (keyframes / name).mkdir(parents=True)
@@ -43,7 +43,7 @@ def make_polycam(folder: Path, *, corrected: bool = True) -> None:
 
 
 def make_nerfstudio(folder: Path) -> None:
-    """As nerfstudio has it: millimetres, the lens for colour images eight times as wide."""
+    """As nerfstudio writes it: millimetres, intrinsics of colour images eight times as wide."""
     frames = []
     for name in ("images", "depth"):
         (folder / name).mkdir(parents=True)
@@ -76,7 +76,7 @@ def make_nerfstudio(folder: Path) -> None:
 
 
 def make_nerfcapture(folder: Path) -> None:
-    """As NeRFCapture's script has it: a lens for each frame, depth as large as colour."""
+    """As NeRFCapture's script writes it: intrinsics per frame, depth as large as colour."""
     frames = []
     (folder / "images").mkdir(parents=True)
     unit = 8 / 65535
@@ -109,7 +109,7 @@ def pgm_bytes(image: np.ndarray) -> bytes:
 
 
 def hololens_rays() -> np.ndarray:
-    """(H, W, 2) x/z and y/z; the lens has none in a corner."""
+    """(H, W, 2) x/z and y/z, undefined in a corner."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
     x, y = (u - 15.8) / 20, (v - 11.7) / 20
     r2 = x * x + y * y

@@ -21,7 +21,7 @@ BEHIND_M = 0.0135
 
 
 def depths(count: int = 3) -> np.ndarray:
-    """(N, H, W) z in m from where the rays meet, 0 where invalid."""
+    """(N, H, W) z in m from the projection centre, 0 where invalid."""
     rng = np.random.default_rng(300)
     u = np.linspace(0, 1, CAMERA.width)
     z = np.stack([1.0 + 0.4 * k + 0.8 * u + 0.3 * np.sin(3 * u + k) for k in range(count)])
@@ -81,7 +81,7 @@ def make_royale(folder: Path, count: int = 3) -> None:
 
 
 def make_tiff3d(folder: Path, count: int = 3) -> None:
-    """Radial range in mm as floats, amplitude in counts, and a configuration that none reads."""
+    """Radial range in mm as floats, amplitude in counts, and a configuration that is not read."""
     folder.mkdir(parents=True)
     for k, cloud in enumerate(points(depths(count))):
         distance = 1000 * np.linalg.norm(cloud, axis=-1).astype(np.float32)

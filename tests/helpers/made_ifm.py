@@ -43,7 +43,7 @@ def head_info(unit: float = UNIT, model: int = 0, numbers: tuple[float, ...] = B
     """Chunk 420: metadata of a frame."""
     info = struct.pack("<I2f3f6fI32f", 1, unit, 1e-8, 1, 1, 1, *([0.0] * 6), model,
                        *numbers, *([0.0] * 22))  # fmt: skip
-    return info + bytes(4 + 128)  # the lens the other way round, which isn't used
+    return info + bytes(4 + 128)  # the inverse distortion model, which isn't used
 
 
 def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
@@ -58,7 +58,7 @@ def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes
 
 
 def make_h5(path: Path, *, model: int = 0, heads: int = 1) -> None:
-    """As the maker's recorder has it: one record for each frame."""
+    """As the manufacturer's recorder writes it: one record per frame."""
     import h5py
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ import numpy as np
 from made_phones import jpeg
 
 RNG = np.random.default_rng(60)
-# Lens of a real device, whose numbers are shares of the whole image.
+# Intrinsics of a real device, relative to the size of the whole image.
 DEPTH_LENS = [
     0.51296979, 0.51692354, 0.49278089, 0.49290284, 0.54793977, -0.02097137, -0.00265223,
     0.88967907, 0.08613021, -0.01391038, 0, 0, -7.21041578e-5, 2.05575342e-5,
@@ -87,7 +87,7 @@ def make_mkv(
     unknown_sizes: bool = False,
     without: str = "",
 ) -> None:
-    """Write (N, H, W) depth in counts; the clusters hold one moment each."""
+    """Write (N, H, W) depth in counts, with one cluster per timestamp."""
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = depth.shape[1:]
     images: dict[str, list[bytes]] = {"DEPTH": [d.astype(">u2").tobytes() for d in depth]}

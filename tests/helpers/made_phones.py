@@ -16,7 +16,7 @@ from tofuse.files.images import write_png
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.geometry.se3 import exp
 
-WIDTH, HEIGHT = 32, 24  # as 1920 x 1440 is
+WIDTH, HEIGHT = 32, 24  # with the aspect ratio of 1920 x 1440
 FX, CX, CY = 1300.0, 961.5, 718.25
 RNG = np.random.default_rng(50)
 DEPTH = RNG.uniform(0.4, 4.0, (3, HEIGHT, WIDTH)).astype(np.float32)
@@ -31,7 +31,7 @@ def millimetres(depth: np.ndarray) -> np.ndarray:
 
 
 def color_image(k: int, width: int = 8 * WIDTH, height: int = 8 * HEIGHT) -> np.ndarray:
-    """Left half red by k, right half blue: a turned or mirrored image shows."""
+    """Left half red by k, right half blue: rotation and mirroring are visible."""
     image = np.zeros((height, width, 3), np.uint8)
     image[:, : width // 2, 0] = 100 + 40 * k
     image[:, width // 2 :, 2] = 200
@@ -85,7 +85,7 @@ def make_stray(folder: Path, *, lenses: bool = False) -> None:
 def exr_bytes(
     image: np.ndarray, compression: int = 3, kind: int = 1, name: str = "R", lines: int = 16
 ) -> bytes:
-    """Write a grey OpenEXR image by the layout that its authors publish."""
+    """Write a grey OpenEXR image in the published layout."""
 
     def attribute(name: str, kind: str, value: bytes) -> bytes:
         return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<I", len(value)) + value
@@ -119,7 +119,7 @@ def exr_bytes(
 
 
 def record3d_metadata() -> dict[str, object]:
-    """Portrait: the images are turned, 1440 x 1920 and 24 x 32."""
+    """Portrait: the images are rotated, 1440 x 1920 and 24 x 32."""
     poses = POSES @ ARKIT
     return {
         "w": 1440,

@@ -19,7 +19,7 @@ POSES = exp(RNG.normal(size=(3, 6)))
 
 
 def sr4000_text(z: np.ndarray, rays: np.ndarray, behind: float, time_ms: float) -> str:
-    """Write an export whose vectors meet `behind` metres behind the origin, x left and y up."""
+    """Write an export whose rays intersect `behind` metres behind the origin, x left and y up."""
     x, y = (-rays[..., k] * (z + behind) for k in (0, 1))
     confidence = np.full(z.shape, 5)
     amplitude = np.arange(z.size).reshape(z.shape)

@@ -57,7 +57,7 @@ def seen(
     noise: float = 0.004,
     rate: float = 10.0,
 ) -> RangeFrame:
-    """What a camera sees of walls and boxes with spots of another albedo; `scene` places these."""
+    """View of walls and boxes with spots of other albedo, whose places depend on `scene`."""
     rows, columns = CAMERA.height, CAMERA.width
     rays = np.dstack([CAMERA.rays(), np.ones((rows, columns))]).reshape(-1, 3)
     origin, d = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T

@@ -35,7 +35,7 @@ def make_sens(path: Path, *, depth: str = "zlib", color: str = "jpeg") -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     name = b"StructureSensor"
     place = np.eye(4)
-    place[0, 3] = BASELINE_M  # the colour camera stands to the right
+    place[0, 3] = BASELINE_M  # the colour camera is to the right
     data = struct.pack("<IQ", 4, len(name)) + name
     for matrix in (lens(70.0, 39.5, 29.5), place, lens(35.0, 19.5, 14.5), np.eye(4)):
         data += matrix.astype("<f4").tobytes()
@@ -53,4 +53,4 @@ def make_sens(path: Path, *, depth: str = "zlib", color: str = "jpeg") -> None:
         data += T.astype("<f4").tobytes()
         data += struct.pack("<4Q", 33_333 * k, 33_333 * k + 10, len(packed), len(counts))
         data += packed + counts
-    path.write_bytes(data + struct.pack("<Q", 0))  # no measurements of motion
+    path.write_bytes(data + struct.pack("<Q", 0))  # no IMU data

@@ -30,7 +30,7 @@ THERE = [
 
 
 def quick(config: Config | None = None) -> Config:
-    """Coarse and quick: it is about poses."""
+    """Coarse and quick: only the poses matter."""
     config = from_method("default") if config is None else config
     return replace(
         config,
@@ -53,7 +53,7 @@ def with_moved(which: int, by: Sequence[float]) -> tuple[Box, ...]:
 def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: object) -> Path:
     """Record a walk beside `folder`, and write the result of a run, without a report, into it.
 
-    `number` is for the noise, unlike that of other walks.
+    `number` selects the noise, different from that of other walks.
     """
     return made_result_of(folder, [seen(T, 100 * number + k, **scene) for k, T in enumerate(path)])
 
@@ -74,6 +74,6 @@ def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
     writer.finish()
     opening = Opening((recording,))
     result = reconstruct(opening.open(), quick(), threads=2)
-    told = {**result.recording, "opening": opening.to_dict()}
-    write_result(replace(result, recording=told), OutputFolder(folder))
+    about = {**result.recording, "opening": opening.to_dict()}
+    write_result(replace(result, recording=about), OutputFolder(folder))
     return folder

@@ -33,7 +33,7 @@ Plane = tuple[tuple[float, float, float], float]
 
 
 class Seen:
-    """Planes that enclose the camera, and the light that it gets from them, summed brute force.
+    """Planes that enclose the camera, and the light that it receives from them, by brute force.
 
     One bounce, between the pixels of the image alone; no shadows, as there are none in a convex
     room.

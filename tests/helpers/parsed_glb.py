@@ -14,7 +14,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def parse(path):
-    """Header, chunks and accessors by the words of the specification."""
+    """Header, chunks and accessors according to the specification."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))

@@ -11,7 +11,7 @@ from tofuse.recordings.recording import Recording
 
 
 def check_frames(recording: Recording, *, turned: bool = False, exact: float = 6e-4) -> None:
-    """Compare depth, confidence and poses with what was written; points with the lens by hand."""
+    """Compare depth, confidence, colour and poses with the written ones."""
     assert len(recording) == 3
     assert recording.reference is not None
     np.testing.assert_allclose(recording.reference, made.POSES, atol=1e-9)
@@ -34,7 +34,7 @@ def check_frames(recording: Recording, *, turned: bool = False, exact: float = 6
 
 
 def check_lens(frame: RangeFrame, fx: float, cx: float, cy: float) -> None:
-    """A pixel of depth is 60 pixels of the image that the lens is given for."""
+    """A pixel of depth is 60 pixels wide in the image of the intrinsics."""
     camera = frame.camera
     assert isinstance(camera, Pinhole)
     v, u = 7, 11

@@ -35,7 +35,7 @@ POSED = [0, 1, 3, 4]  # frame 2 is lost
 
 
 def plane(camera: Camera, k: int) -> np.ndarray:
-    """z (H, W) of a plane, a little further away in each frame; a corner shows nothing."""
+    """z (H, W) of a plane, a little further away in each frame; invalid in a corner."""
     z = (DISTANCE + 0.1 * k) / (camera.rays().astype(float) @ NORMAL[:2] + NORMAL[2])
     z[:4, :4] = 0
     return np.round(np.nan_to_num(z, nan=0.0), 3).astype(np.float32)

@@ -72,7 +72,7 @@ def relief_height(x, y):
 
 
 def relief(n, seed, low=-0.5, high=0.5, noise=0.002, outliers=0):
-    """A wavy sheet from x = low to high, and points anywhere about it."""
+    """A wavy sheet from x = low to high, and outliers around it."""
     r = rng(seed)
     x, y = r.uniform(low, high, n), r.uniform(-0.4, 0.4, n)
     sheet = np.column_stack([x, y, 2 + relief_height(x, y)]) + r.normal(0, noise, (n, 3))

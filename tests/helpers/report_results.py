@@ -148,7 +148,7 @@ def make_room(frames=24, width=64, height=48):
 
 
 def lonely(**changes):
-    """A result with one frame of a bare cloud, and nothing else."""
+    """A minimal result: one frame, and a cloud without attributes."""
     cloud = Cloud(
         np.array([[0, 0, 1], [0.1, 0, 1], [0, 0.2, 1.1]], np.float32),
         None,

@@ -1,4 +1,4 @@
-"""The room that a moving rig walks through."""
+"""The room that a rig moves through."""
 
 # A room: floor, three walls, and boards in front of these.
 ROOM = (

@@ -1,4 +1,4 @@
-"""A scene of boards and what a camera sees of it."""
+"""A scene of boards, and views of it."""
 
 import numpy as np
 

@@ -83,7 +83,7 @@ class Bag:
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
         turn = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
-        # The message arrives 5 ms after it was taken.
+        # The message is recorded 5 ms after its timestamp.
         stamp = round((time + 0.005) * 1e9)
         self.writer.write(self.connections[topic], stamp, turn(message, kind))
 
@@ -155,7 +155,7 @@ class Bag:
 
     def close(self) -> Path:
         self.writer.close()
-        # Its writer of MCAP leaves a file to the garbage collector.
+        # Its MCAP writer leaves a file open until garbage collection.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ResourceWarning)
             del self.writer
@@ -163,7 +163,7 @@ class Bag:
         return self.path
 
 
-# Colour beside depth: places of both from a reference, and an image that tells its pixels apart.
+# Colour with depth: poses of both cameras in a common frame, and an image with distinct pixels.
 T_DEPTH = exp([0.01, 0.02, -0.005, 0.02, -0.03, 0.01])
 
 
@@ -179,7 +179,7 @@ COLOR_V, COLOR_U = np.mgrid[:40, :48]
 COLORS = np.stack([5 * COLOR_U, 6 * COLOR_V, 0 * COLOR_U + 200], -1).astype(np.uint8)
 
 
-STEP = np.full((12, 16), 8000, np.uint16)  # a wall at 2 m, and a box at 1 m before it
+STEP = np.full((12, 16), 8000, np.uint16)  # a wall at 2 m, and a box at 1 m in front of it
 
 
 STEP[4:8, 6:10] = 4000
@@ -218,9 +218,9 @@ def real_sense(
                 COLOR_STREAM + "/camera_info", text, 1.0, bag.make(text, f"{lens}coeffs={coeffs}")
             )
             for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
-                told = "rotation=" + ",".join(map(str, T[:3, :3].T.ravel()))  # by columns
-                told += ";translation=" + ",".join(map(str, T[:3, 3]))
-                bag.write(f"{part}/tf/0", text, 1.0, bag.make(text, told))
+                extrinsics = "rotation=" + ",".join(map(str, T[:3, :3].T.ravel()))  # by columns
+                extrinsics += ";translation=" + ",".join(map(str, T[:3, 3]))
+                bag.write(f"{part}/tf/0", text, 1.0, bag.make(text, extrinsics))
         bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0,
                   bag.make(text, "0.000250"))  # fmt: skip
     pair = "diagnostic_msgs/msg/KeyValue"
@@ -265,7 +265,7 @@ def orbbec(
     color: str = "",
     R: np.ndarray | None = None,
 ) -> Path:
-    """A bag as Orbbec's SDK writes it: ROS's images with more fields behind, an own profile."""
+    """A bag as Orbbec's SDK writes it: ROS images with fields appended, and profiles of its own."""
     bag = Bag(folder, "ros1")
     header = struct.pack("<4I", 0, 10, 0, 3) + b"cam"
     R = np.eye(3) if R is None else R

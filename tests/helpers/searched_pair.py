@@ -56,7 +56,7 @@ def error(found, true):
     return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
 
 
-# Half a metre aside and 30 degrees about what is seen.
+# Moved sideways, and rotated by 30 degrees about the scene.
 A, B = camera(-0.2, 0.0, 0.0), camera(0.55, 0.2, -0.5)
 
 

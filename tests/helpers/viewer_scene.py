@@ -1,4 +1,4 @@
-"""What a viewer draws, read in a browser."""
+"""The picture of a viewer, read from a browser."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CANVAS = "canvas[data-engine]"
 
 
 def drawn(seen):
-    """The picture once it rests."""
+    """The picture after rendering has settled."""
     last = seen.pixels(CANVAS)
     for _ in range(40):
         seen.page.wait_for_timeout(250)

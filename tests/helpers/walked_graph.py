@@ -15,7 +15,7 @@ SIGMA = np.array([0.005, 0.01, 0.02, 0.002, 0.004, 0.003])  # of the edges: tx t
 def walk(
     n: int = 60, loops: int = 40, false: int = 0, seed: int = 0
 ) -> tuple[PoseGraph, Float64, Bool]:
-    """Two rounds of a path, loops between them, some of them false; the truth; which are false."""
+    """Graph of two rounds with loops, some of them false; the true poses; mask of false edges."""
     rng = np.random.default_rng([seed, n])
     k = np.arange(n)
     angle = 4 * np.pi * k / n

@@ -51,7 +51,7 @@ def copy(room_recording, tmp_path) -> Path:
     return shutil.copytree(room_recording, tmp_path / "rec")
 
 
-def test_facts_of_a_simulated_recording(room_recording) -> None:
+def test_facts_of_simulated_recording(room_recording) -> None:
     found = inspect_recording(tofuse.open(room_recording))
     facts = found.facts
     assert facts["recording"] == str(room_recording)
@@ -67,7 +67,7 @@ def test_facts_of_a_simulated_recording(room_recording) -> None:
     assert 0.3 < low < high < 8
 
 
-def test_numbers_of_a_made_recording() -> None:
+def test_facts_of_synthetic_frames() -> None:
     frames = [image(2.0, k, valid=600) for k in range(11)]
     facts = inspect_recording(of(frames)).facts
     assert facts["duration"] == "1.00 s, 10.0 frames per second"
@@ -80,7 +80,7 @@ def test_numbers_of_a_made_recording() -> None:
     assert (one["duration"], one["kind of depth"]) == ("a single frame", "radial range")
 
 
-def test_poses_that_are_known() -> None:
+def test_known_poses_are_counted() -> None:
     poses = np.stack([np.eye(4)] * 3)
     poses[1] = np.nan
     facts = inspect_recording(
@@ -103,7 +103,7 @@ def test_facts_of_clouds(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("z", [2000.0, 0.002])
-def test_a_wrong_unit_is_noticed(z) -> None:
+def test_wrong_unit_is_detected(z) -> None:
     for frame in (image(z), CloudFrame.of(image(z).points)):
         (warning,) = (
             str(f) for f in inspect_recording(of([frame])).findings if f.code == "depth_unit"
@@ -112,16 +112,16 @@ def test_a_wrong_unit_is_noticed(z) -> None:
         assert f"{z:.2g}"[:1] in warning
 
 
-def test_millimetres_read_as_metres(copy, capsys) -> None:
+def test_millimetres_read_as_metres_are_reported(copy, capsys) -> None:
     camera = json.loads((copy / "camera.json").read_text())
     (copy / "camera.json").write_text(json.dumps(camera | {"depth_unit_m": 1.0}))
     assert main(["inspect", str(copy)]) == 0
-    said = capsys.readouterr().out
-    assert "severe: depth_unit: The median depth is" in said
-    assert "Check depth_unit_m: it may be wrong by a factor of" in said
+    reported = capsys.readouterr().out
+    assert "severe: depth_unit: The median depth is" in reported
+    assert "Check depth_unit_m: it may be wrong by a factor of" in reported
 
 
-def test_few_and_no_valid_points_are_noticed() -> None:
+def test_few_and_no_valid_points_are_detected() -> None:
     (few,) = inspect_recording(of([image(2.0, valid=60)])).warnings
     assert few.startswith("Only 5.0% of the pixels are valid.")
     found = inspect_recording(of([image(0.0)]))
@@ -132,7 +132,7 @@ def test_few_and_no_valid_points_are_noticed() -> None:
     assert "no valid point" in empty
 
 
-def test_unreadable_frames_are_warned_of(copy) -> None:
+def test_unreadable_frames_give_warning(copy) -> None:
     (copy / "depth/000002.png").write_bytes(b"")
     found = inspect_recording(tofuse.open(copy))
     assert len(found.warnings) == 1
@@ -140,7 +140,7 @@ def test_unreadable_frames_are_warned_of(copy) -> None:
     assert found.facts["frames"] == "8"
 
 
-def test_what_the_reader_warns_of_is_passed_on(copy, capsys) -> None:
+def test_warnings_of_the_reader_are_reported(copy, capsys) -> None:
     camera = json.loads((copy / "camera.json").read_text())
     (copy / "camera.json").write_text(json.dumps(camera | {"colour[x]": "grey"}))
     assert main(["inspect", str(copy), "--json"]) == 0
@@ -148,25 +148,25 @@ def test_what_the_reader_warns_of_is_passed_on(copy, capsys) -> None:
     assert set(data) == {"facts", "findings", "warnings"}
     assert any("colour[x]" in w for w in data["warnings"])
     assert main(["inspect", str(copy)]) == 0
-    said = capsys.readouterr().out
-    assert "colour[x]" in said  # brackets are no markup
-    assert "\\" not in said
+    reported = capsys.readouterr().out
+    assert "colour[x]" in reported  # brackets are not interpreted as markup
+    assert "\\" not in reported
 
 
-def test_a_long_recording_is_only_sampled() -> None:
+def test_long_recording_is_sampled() -> None:
     class Counting(ArraySource):
         def read(self, index):
-            asked.append(index)
+            requested.append(index)
             return super().read(index)
 
-    asked: list[int] = []
+    requested: list[int] = []
     frames = [image(2.0, k) for k in range(1000)]
     inspect_recording(Recording.of(Counting(frames), "x", "frames"))
-    assert len(asked) <= 16
-    assert (asked[0], asked[-1]) == (0, 999)
+    assert len(requested) <= 16
+    assert (requested[0], requested[-1]) == (0, 999)
 
 
-def test_nothing_readable() -> None:
+def test_recording_without_readable_frames_is_rejected() -> None:
     class Broken(ArraySource):
         def read(self, index):
             raise tofuse.errors.UnreadableFrameError("is broken", where=f"file {index}")
@@ -259,7 +259,7 @@ def saturating(frames):
 
 
 def walking(frames):
-    """Something 1.2 m away goes from left to right."""
+    """An object 1.2 m away moves from left to right."""
     out = []
     for k, f in enumerate(frames):
         depth = f.depth.copy()
@@ -289,7 +289,7 @@ FAULTS = {
 }
 
 
-def test_nothing_is_wrong_with_a_good_recording(turn) -> None:
+def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()
     assert codes(colored(turn, 0)) == set()
     ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in turn]
@@ -297,7 +297,7 @@ def test_nothing_is_wrong_with_a_good_recording(turn) -> None:
 
 
 @pytest.mark.parametrize("code", FAULTS)
-def test_a_fault_is_named(code, turn) -> None:
+def test_faults_are_detected(code, turn) -> None:
     found = tofuse.inspect(of(FAULTS[code](turn)))
     (named,) = [f for f in found.findings if f.code == code]
     assert named.severity == CODES[code][0]
@@ -309,8 +309,8 @@ def test_a_fault_is_named(code, turn) -> None:
     assert str(named) in found.warnings
 
 
-def test_edges_of_different_things_are_not_mirrored() -> None:
-    """Many edges of depth to the left and of colour to the right correlate if mirrored."""
+def test_unrelated_edges_are_not_reported_as_mirrored() -> None:
+    """Many depth edges on the left and colour edges on the right correlate when mirrored."""
     camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
     rng = np.random.default_rng(5)
 
@@ -337,20 +337,20 @@ def _shades(depth):
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
-def test_a_wrong_focal_length_is_measured(factor) -> None:
+def test_wrong_focal_length_is_estimated(factor) -> None:
     plain = turning(camera=BROWN)
     wrong = replace(BROWN, fx=70 * factor, fy=70 * factor)
     ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in plain]
-    # Of z only views that the camera turned between tell, and of a longer one more clearly.
+    # From z only rotations constrain it, and they constrain a larger focal length better.
     for frames in (ranges, plain)[: 1 + (factor > 1)]:
-        said = tofuse.inspect(of(seen_by(frames, wrong))).findings
-        (found,) = [f for f in said if f.code == "focal_length"]
+        reported = tofuse.inspect(of(seen_by(frames, wrong))).findings
+        (found,) = [f for f in reported if f.code == "focal_length"]
         assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
 
 
 @pytest.mark.parametrize("boxes", [False, True])
-def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool) -> None:
-    """Edges that all run the same way fit anywhere along themselves."""
+def test_colour_shift_is_reported_only_if_unambiguous(boxes: bool) -> None:
+    """Parallel edges do not constrain a shift along themselves (aperture problem)."""
     camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
     rng = np.random.default_rng(61)
     frames = []
@@ -361,7 +361,7 @@ def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool)
             top, bottom = int(rng.integers(10, 60)), int(rng.integers(70, 110))
             rows = slice(top, bottom) if boxes else slice(None)
             depth[rows, at : at + 18] -= 0.3
-            grey[rows, at + 10 : at + 28] += 45  # 10 pixels beside
+            grey[rows, at + 10 : at + 28] += 45  # shifted by 10 pixels
         depth += rng.normal(0, 0.002, depth.shape).astype(np.float32)
         color = np.repeat(grey[..., None], 3, -1)
         frames.append(RangeFrame(k, k / 10, camera, depth, color_image=color))
@@ -371,29 +371,29 @@ def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool)
         assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
 
 
-def test_a_lens_that_folds_the_image_is_none() -> None:
+def test_folding_distortion_is_rejected() -> None:
     def distortion(t1: float, t2: float) -> Distortion:
         return Distortion(np.array([0.0, t1, t2]), 1e-4 * np.eye(3), 8, 0.007, 0.0067)
 
-    assert distortion(-0.571, -0.274).folds  # what a round body looked like
+    assert distortion(-0.571, -0.274).folds  # as estimated for a round object
     assert distortion(-0.5, 0.1).folds
     assert not distortion(-0.25, 0.05).folds
     assert not distortion(0.4, -0.2).folds
 
 
-def test_how_the_camera_moves() -> None:
+def test_camera_motion_is_classified() -> None:
     still = turning(6, 0.0)
     assert codes(still) == {"static"}
     assert codes(turning(6, 13.0)) == {"fast_motion"}
     fast = tofuse.inspect(of(turning(6, 40.0)))
-    # What comes of little overlap is for the run to state.
+    # Consequences of little overlap are reported by the run.
     assert ("little_overlap", "warning") in {(f.code, f.severity) for f in fast.findings}
     assert "moving_objects" in codes(walking(still))
     found = tofuse.inspect(of(walking(still)), turning=True)
     assert not {"static", "moving_objects"} & {f.code for f in found.findings}
 
 
-def test_a_bare_wall_and_no_planes_at_all() -> None:
+def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None:
     rng = np.random.default_rng(3)
     wall = [image(2.0, k) for k in range(4)]
     noisy = [replace(f, depth=f.depth + rng.normal(0, 0.004, f.depth.shape)) for f in wall]
@@ -403,18 +403,18 @@ def test_a_bare_wall_and_no_planes_at_all() -> None:
         RangeFrame(k, k / 10, BROWN, 2 + 0.3 * np.sin((u + 3 * k) / 9) * np.cos(v / 7))
         for k in range(8)
     ]
-    said = codes([replace(f, depth=f.depth.astype(np.float32)) for f in hills])
-    assert not said & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
+    reported = codes([replace(f, depth=f.depth.astype(np.float32)) for f in hills])
+    assert not reported & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
 
 
-def test_steps_between_joined_recordings_are_none_of_time(turn) -> None:
+def test_joined_recordings_are_not_unsorted(turn) -> None:
     twice = stamped([*turn[:5], *turn[:5]], np.tile(TIMES[:5], 2))
     parts = {"parts": [{"frames": 5}, {"frames": 5}]}
     assert "time_unsorted" not in codes(twice, metadata=parts)
     assert "time_unsorted" in codes(twice)
 
 
-def test_a_contact_sheet(turn, tmp_path, capsys) -> None:
+def test_contact_sheet_is_saved(turn, tmp_path, capsys) -> None:
     path = tofuse.inspect(of(FAULTS["range_taken_for_z"](turn))).save_sheet(
         tmp_path / "a/sheet.png"
     )
@@ -425,7 +425,7 @@ def test_a_contact_sheet(turn, tmp_path, capsys) -> None:
         tofuse.inspect(of(turn[:3])).save_sheet(path / "below.png")
 
 
-def test_a_run_tells_what_it_finds(copy, tmp_path, capfd) -> None:
+def test_run_reports_findings(copy, tmp_path, capfd) -> None:
     camera = json.loads((copy / "camera.json").read_text())
     (copy / "camera.json").write_text(json.dumps(camera | {"depth_unit_m": 0.01}))
     main(["run", str(copy), "--out", str(tmp_path / "out"), "--every", "3"])
@@ -438,7 +438,7 @@ def test_a_run_tells_what_it_finds(copy, tmp_path, capfd) -> None:
     assert "The median depth is" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
 
 
-def test_real_recordings_raise_only_what_is_true_of_them(shared_data) -> None:
+def test_real_recordings_have_only_true_findings(shared_data) -> None:
     explained = {
         "sr4000_corridor": {"phase_wrap", "flying_pixels"},  # longer than 5 m; a shiny floor
         "kinectv2_loop/recording": {"fast_motion", "little_overlap"},  # steps of 23 degrees
@@ -450,11 +450,11 @@ def test_real_recordings_raise_only_what_is_true_of_them(shared_data) -> None:
         "azure_kinect_mkv/recording.mkv", "ifm_o3r/O3RBuffer.data", "pico_zense_static",
         "open3d_rgbd5", "slam6d_scans", *explained,
     ):  # fmt: skip
-        said = {f.code for f in tofuse.inspect(shared_data / name).findings}
-        assert said <= explained.get(name, set()) | {"static"}, name
+        reported = {f.code for f in tofuse.inspect(shared_data / name).findings}
+        assert reported <= explained.get(name, set()) | {"static"}, name
 
 
-def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording: Path) -> None:
+def test_wraps_behind_rotating_object_do_not_affect_verdict(room_recording: Path) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     result = replace(result, recording={**result.recording, "warnings": []})
     wrap = Finding("phase_wrap", "Far surfaces look near.", "Drop them.", {})
@@ -465,7 +465,7 @@ def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording
     assert turning.recording["findings"] == moving.recording["findings"]
 
 
-def test_a_focal_length_that_was_corrected_is_no_fault_of_the_result(room_recording: Path) -> None:
+def test_corrected_focal_length_does_not_affect_verdict(room_recording: Path) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     result = replace(result, recording={**result.recording, "warnings": []})
     wrong = Finding("focal_length", "It is that of another camera.", "Use the right one.", {})
@@ -482,8 +482,8 @@ def test_a_focal_length_that_was_corrected_is_no_fault_of_the_result(room_record
 
 
 @pytest.mark.parametrize("degrees", [6.0, 15.0])
-def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(degrees) -> None:
-    """Its background stands, so a run without --object would give the camera no motion."""
+def test_rotating_object_is_distinguished_from_moving_camera(degrees) -> None:
+    """Its background is static, so a run without --object would estimate no motion."""
     frames = []
     for k in range(16):
         thing = ((0.0, 0.3, 0.4), (0.5, 0.6, 0.15), np.radians(degrees) * k)
@@ -491,12 +491,12 @@ def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(d
     findings = inspect_recording(of(frames)).findings
     hints = [str(f) for f in findings if "--object" in str(f)]
     assert hints, [str(f) for f in findings]
-    told = inspect_recording(of(frames), turning=True).findings
-    assert not any("--object" in str(f) for f in told)
+    remaining = inspect_recording(of(frames), turning=True).findings
+    assert not any("--object" in str(f) for f in remaining)
 
 
-def test_depth_errors_that_no_lens_explains_are_not_blamed_on_it(tmp_path) -> None:
-    """In a corridor few surfaces are seen, and errors of the depth bend them."""
+def test_depth_errors_are_not_attributed_to_lens(tmp_path) -> None:
+    """In a corridor few surfaces are visible, and depth errors bend them."""
     recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)
     found = tofuse.inspect(recording).findings
     assert not {f.code for f in found if f.severity == "severe"}

@@ -16,7 +16,7 @@ from tofuse.kernels import ahead, jit
 from tofuse.kernels.moving_objects import Cells, Limits
 
 
-def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
+def test_listed_kernels_exist_and_signatures_round_trip() -> None:
     lines = []
     for name, types in ahead.signatures():
         module, function = name.rsplit(".", 1)
@@ -27,12 +27,12 @@ def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
     assert len(lines) == len(set(lines)) > 50
 
 
-def test_named_tuples_are_listed_with_their_fields(
+def test_named_tuples_are_listed_with_fields(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits, image = Limits(0.005, 0.04, 2, 3.0, 1.2, 0.3), np.zeros((2, 3), np.float32)
-    alike = Cells(image, image, image, image)
-    types = tuple(numba.typeof(each) for each in (limits, 1, alike, (alike, alike)))
+    images = Cells(image, image, image, image)
+    types = tuple(numba.typeof(each) for each in (limits, 1, images, (images, images)))
     line = ahead.signature_line("moving_objects.compare", types)
     cells = "moving_objects.Cells(f4:2C,f4:2C,f4:2C,f4:2C)"
     mixed = "moving_objects.Limits(f8,f8,i8,f8,f8,f8)"
@@ -43,14 +43,14 @@ def test_named_tuples_are_listed_with_their_fields(
     assert ahead.signatures() == [("moving_objects.compare", types)]
 
 
-def test_what_is_listed_compiles(tmp_path: Path) -> None:
-    """From the cache of these tests, or anew: types that a kernel can't take would fail."""
+def test_listed_signatures_compile(tmp_path: Path) -> None:
+    """From the cache of these tests, or compiled now: unsupported types would fail."""
     words = [sys.executable, "-m", "tofuse.kernels.ahead"]
     subprocess.run(words, check=True, capture_output=True)
     assert ahead.compiled_marker().exists()
 
 
-def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
+def test_run_uses_listed_signatures(room_recording: Path) -> None:
     program = textwrap.dedent(
         """
         import sys, tofuse
@@ -72,7 +72,7 @@ def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
     assert len(called) > 40
 
 
-def test_only_a_first_run_starts_a_second_process(
+def test_only_first_run_starts_compiler_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
@@ -103,9 +103,7 @@ def test_only_a_first_run_starts_a_second_process(
     assert len(started) == 1
 
 
-def test_a_machine_without_more_processes_compiles_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object, **__: object) -> None:
         raise OSError("no more processes")
 

@@ -34,7 +34,7 @@ def target(camera=CAMERA):
 
 
 def source(n=60, noise=0.004, seed=1):
-    """Points near the target's plane as MOTION's camera sees them; normals, light nearly right."""
+    """Points near the target's plane in the frame of MOTION's camera; noisy normals and albedo."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-0.25, 0.25, (n, 2))
     z = 1 / (xy @ NORMAL[:2] + NORMAL[2])
@@ -50,7 +50,7 @@ def source(n=60, noise=0.004, seed=1):
 
 
 def packed(points, normals, sigma, albedo):
-    """The source's points as the kernel takes them."""
+    """The source's points in the layout of the kernel."""
     z = points[:, 2:]
     slopes = albedo[:, 1:] / z
     third = -(slopes * points[:, :2]).sum(1, keepdims=True) / z
@@ -69,7 +69,7 @@ def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P
 
 
 def photometric_row(slopes, p, R=None, moved=None):
-    """Of the albedo's slopes at the point `moved`, by the right perturbation; (1, 7)."""
+    """Jacobian (7,) of the albedo residual at `moved`, for the right perturbation and exposure."""
     q = p if moved is None else moved
     d = np.array([slopes[0], slopes[1], -(slopes @ q[:2]) / q[2]]) / q[2]
     m = d if R is None else R.T @ d
@@ -77,7 +77,7 @@ def photometric_row(slopes, p, R=None, moved=None):
 
 
 def twin(view, of, T=MOTION, exposure=0.0, slack=0.01):
-    """The same sums, point by point, with plane and albedo where the point lands exactly."""
+    """The same sums, point by point, with plane and albedo at the exact projection."""
     out = {"H": np.zeros((6, 6)), "g": np.zeros(6), "C": np.zeros((6, 6)), "HP": np.zeros((7, 7)),
            "gP": np.zeros(7), "CP": np.zeros((7, 7)), "squares": 0.0, "weight": 0.0, "metres": 0.0,
            "weight_p": 0.0, "squares_p": 0.0, "inliers": 0}  # fmt: skip
@@ -118,7 +118,7 @@ def twin(view, of, T=MOTION, exposure=0.0, slack=0.01):
 
 
 @pytest.mark.parametrize("exposure", [0.0, 0.3])
-def test_sums_are_those_of_numpy(exposure):
+def test_sums_match_numpy(exposure):
     view, of = source(noise=0.015), target()
     got, want = accumulate(view, of, exposure=exposure), twin(view, of, exposure=exposure)
     assert got[kernels.PROJECTED] == got[kernels.COMPARED] == 60
@@ -141,11 +141,11 @@ def test_sums_are_those_of_numpy(exposure):
         np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-4 * np.abs(wanted).max())
 
 
-def test_the_gradient_is_that_of_the_cost_by_finite_differences():
-    """With equal normals and slopes on both sides, and next to no robust weighting."""
+def test_gradient_matches_finite_differences():
+    """With equal normals and slopes on both sides, and almost no robust weighting."""
     view, of = packed(*source(noise=0.004)), target()
     wide = {"robust": 1e3, "slack": 0.02}
-    # Exactly the target's normal and slopes where the points land, so that both Jacobians agree.
+    # The target's exact normal and slopes at the projections, so that both Jacobians agree.
     view[:, 3:6] = MOTION[:3, :3].T @ NORMAL / np.linalg.norm(NORMAL)
     there = se3.transform(MOTION, view[:, :3])
     third = -(there[:, :2] @ SLOPES) / there[:, 2]
@@ -173,7 +173,7 @@ def test_the_gradient_is_that_of_the_cost_by_finite_differences():
 
 @pytest.mark.parametrize("step", [1, 2])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_a_point_lands_on_the_pixel_that_sees_it(camera, step):
+def test_points_project_onto_their_pixels(camera, step):
     """Each pixel's own point is compared with that pixel: a different depth in each."""
     rays = camera.rays()[::1, ::1]
     if step == 2:
@@ -195,11 +195,11 @@ def test_a_point_lands_on_the_pixel_that_sees_it(camera, step):
     assert sums[kernels.COUNT_P] == 0
 
 
-def test_what_can_not_be_compared_is_told_apart():
+def test_incomparable_points_are_counted_separately():
     of = target()
     points = np.float32([
         [0, 0, 1 / 0.6],  # on the plane
-        [0, 0, 1.0],  # in front of what was seen
+        [0, 0, 1.0],  # in front of the surface
         [0, 0, 3.0],  # behind
         [0, 0, -1.0],  # behind the camera
         [5, 0, 1.0],  # out of view
@@ -217,14 +217,14 @@ def test_what_can_not_be_compared_is_told_apart():
     assert (sums[kernels.PROJECTED], sums[kernels.COMPARED]) == (3, 0)
 
 
-def test_points_whose_normal_turns_away_are_no_inliers():
+def test_points_with_deviating_normals_are_no_inliers():
     view, of = list(source()), target()
     view[1][:30] = [1, 0, 0]
     sums = accumulate(view, of)
     assert sums[kernels.INLIERS] == 30
 
 
-def test_outliers_count_nothing():
+def test_outliers_have_no_weight():
     view, of = list(source()), target()
     before = accumulate(view, of, stop=40)
     view[0][40:, 2] *= 1.5
@@ -232,32 +232,32 @@ def test_outliers_count_nothing():
     np.testing.assert_array_equal(before[: kernels.PROJECTED], after[: kernels.PROJECTED])
 
 
-def test_what_is_not_there_of_a_block_of_points_adds_nothing():
+def test_partial_block_adds_only_its_points():
     view, of = source(), target()
     sums = accumulate(view, of, T=np.eye(4), stop=7)
     assert np.isfinite(sums).all()
     assert sums[kernels.COUNT_P] > 0
 
 
-def test_parts_of_the_points_add_up():
+def test_sums_are_additive():
     view, of = source(), target()
     whole = accumulate(view, of)
     parts = accumulate(view, of, stop=25) + accumulate(view, of, start=25)
     np.testing.assert_allclose(parts, whole, rtol=1e-12, atol=1e-12)
 
 
-# --- the small solvers ---------------------------------------------------------------------------
+# --- small solvers -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.1, 1.0, 2.5])
-def test_moved_is_the_exponential_map(size):
+def test_retract_is_exponential_map(size):
     rng = np.random.default_rng(5)
     T = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
     np.testing.assert_allclose(motion.retract(T, xi), T @ se3.exp(xi), atol=1e-9)
 
 
-def test_moved_takes_rounding_out_of_rotations():
+def test_retract_orthonormalises_rotations():
     T = se3.exp([1, 2, 3, 0.5, -0.2, 0.3])
     T[:3, :3] *= 1 + 1e-5
     out = motion.retract(T, np.zeros(6))
@@ -266,7 +266,7 @@ def test_moved_takes_rounding_out_of_rotations():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-10, 1e-5, 0.01, 0.03, 1.0, 2.5])
-def test_twist_between_is_the_logarithm(size):
+def test_twist_between_is_logarithm(size):
     rng = np.random.default_rng(6)
     A = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
@@ -278,7 +278,7 @@ def test_twist_between_is_the_logarithm(size):
 
 
 @pytest.mark.parametrize("photometric", [True, False])
-def test_normal_equations_unpack_the_sums(photometric):
+def test_normal_equations_unpack_sums(photometric):
     rng = np.random.default_rng(7)
     J, D = rng.normal(size=(9, 8)), np.zeros((9, 8))
     D[:, :6] = rng.normal(size=(9, 6))
@@ -302,8 +302,8 @@ def test_normal_equations_unpack_the_sums(photometric):
 
 
 @pytest.mark.parametrize("unheld", [0, 2])
-def test_a_step_solves_the_normal_equations(unheld):
-    """Without weak directions they and the prior decide, along weak ones the prediction alone."""
+def test_step_solves_normal_equations(unheld):
+    """Weak directions follow the prediction alone, the others the data and the prior."""
     rng = np.random.default_rng(9)
     total = np.zeros(kernels.SIZE)
     J = rng.normal(size=(40, 8)) * ([1] * 7 + [0.01])
@@ -324,7 +324,7 @@ def test_a_step_solves_the_normal_equations(unheld):
     np.testing.assert_allclose(step, -np.linalg.solve(A, b), rtol=1e-9)
 
 
-def test_weak_directions_are_those_with_little_information():
+def test_degenerate_directions_have_little_information():
     basis = np.linalg.qr(np.random.default_rng(10).normal(size=(6, 6)))[0]
     units = np.array([0.01] * 3 + [0.02] * 3)
     cross = (basis * [0.1, 0.3, 0.9, 1.1, 5.0, 20.0]) @ basis.T / np.outer(units, units)
@@ -335,8 +335,8 @@ def test_weak_directions_are_those_with_little_information():
 
 
 @pytest.mark.parametrize("sigma", [0.1, 1.0, 7.0])
-def test_the_scale_of_distances_is_that_of_normal_deviates(sigma):
-    """A third of outliers moves a median, but does not break it."""
+def test_scale_estimate_matches_normal_deviates(sigma):
+    """The scale of normally distributed distances is recovered."""
     view, of = list(source(3000, noise=0.0)), target()
     unit = NORMAL / np.linalg.norm(NORMAL)
     view[2][:] = 0.0
@@ -347,7 +347,7 @@ def test_the_scale_of_distances_is_that_of_normal_deviates(sigma):
     assert np.isnan(steps.scale_of_distances(np.zeros(kernels.BINS)))
 
 
-def test_the_difference_in_exposure_is_seen_where_points_land():
+def test_exposure_difference_is_measured_at_correspondences():
     view, of = list(source()), target()
     view[3][:, 0] -= 0.4
     view[3][5, 0] = np.nan
@@ -360,7 +360,7 @@ def test_the_difference_in_exposure_is_seen_where_points_land():
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
-def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
+def test_gather_samples_pixels_with_plane_at_stride(stride):
     planes, variance, albedo, _ = target()
     planes[3:9, 5:11] = 0
     variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)

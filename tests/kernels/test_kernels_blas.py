@@ -15,7 +15,7 @@ def counts() -> set[int]:
     return {library["num_threads"] for library in found}
 
 
-def test_one_inside_and_as_before_after() -> None:
+def test_thread_count_is_one_inside_and_restored_after() -> None:
     with threadpool_limits(2):
         before = counts()
         with one_blas_thread():
@@ -26,7 +26,7 @@ def test_one_inside_and_as_before_after() -> None:
         assert counts() == before
 
 
-def test_an_error_restores() -> None:
+def test_thread_count_is_restored_after_error() -> None:
     with threadpool_limits(2):
         before = counts()
         with pytest.raises(tofuse.RegistrationError):

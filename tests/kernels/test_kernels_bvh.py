@@ -9,7 +9,7 @@ from tofuse.kernels import bvh
 from tofuse.kernels.threads import chunk_bounds
 
 
-def every_ray_on_every_triangle(triangles, origins, directions):
+def brute_force_cast(triangles, origins, directions):
     """Möller and Trumbore (1997); returns distance (N,), inf without a hit, and face (N,)."""
     a, b, c = triangles.reshape(-1, 3, 3).transpose(1, 0, 2)
     e1, e2 = b - a, c - a
@@ -49,12 +49,12 @@ def cast(triangles, origins, directions, limit=np.inf):
     return distance, np.where(face >= 0, order[face], -1), weights
 
 
-def test_finds_what_trying_every_triangle_finds():
+def test_hits_match_brute_force():
     triangles = soup(300)
     rng = np.random.default_rng([1, 11])
     directions = unit(rng.normal(size=(1500, 3)))
     origins = rng.uniform(-4, 4, (1500, 3))
-    wanted, face = every_ray_on_every_triangle(triangles, origins, directions)
+    wanted, face = brute_force_cast(triangles, origins, directions)
     distance, got, weights = cast(triangles, origins, directions)
     hit = np.isfinite(wanted)
     assert 0.2 < hit.mean() < 0.99
@@ -67,18 +67,18 @@ def test_finds_what_trying_every_triangle_finds():
     np.testing.assert_allclose((w[..., None] * corners).sum(1), points, atol=1e-9)
 
 
-def test_one_origin_for_all_rays_and_directions_along_the_axes():
+def test_common_origin_and_axis_directions():
     triangles = soup(200, seed=5)
     directions = np.concatenate(
         [np.eye(3), -np.eye(3), unit(np.random.default_rng(3).normal(size=(500, 3)))]
     )
     origin = np.array([0.1, -0.2, 0.3])
-    wanted, _ = every_ray_on_every_triangle(triangles, origin, directions)
+    wanted, _ = brute_force_cast(triangles, origin, directions)
     distance, _, _ = cast(triangles, origin, directions)
     np.testing.assert_allclose(distance, wanted, atol=1e-9)
 
 
-def test_every_triangle_is_in_one_leaf_inside_the_boxes_above_it():
+def test_each_triangle_is_in_one_leaf_inside_its_ancestors():
     triangles = soup(500, seed=2)
     box, first, count, order = bvh.build_tree(triangles)
     assert sorted(order) == list(range(500))
@@ -97,7 +97,7 @@ def test_every_triangle_is_in_one_leaf_inside_the_boxes_above_it():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 400])
-def test_triangles_that_coincide_still_make_a_tree(count):
+def test_coincident_triangles_make_a_tree(count):
     triangles = np.tile([0.0, -1, -1, 0, 1, -1, 0, 0, 1], (count, 1))
     distance, face, _ = cast(triangles, [-2, 0, 0], np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
     assert distance[0] == 2.0
@@ -106,8 +106,8 @@ def test_triangles_that_coincide_still_make_a_tree(count):
     assert face[1] == -1
 
 
-def test_no_ray_slips_between_triangles_that_share_an_edge():
-    """Rays through the very vertices and edge points of a closed hull, from inside."""
+def test_no_ray_passes_between_adjacent_triangles():
+    """Rays through the exact vertices and edge points of a closed hull, from inside."""
     rng = np.random.default_rng([4, 12])
     rows, columns = 12, 20
     eta = np.linspace(-np.pi / 2, np.pi / 2, rows + 1)[:, None]
@@ -135,7 +135,7 @@ def test_no_ray_slips_between_triangles_that_share_an_edge():
         assert np.isfinite(distance).all()
 
 
-def test_a_nearer_distance_given_beforehand_stays():
+def test_distance_limit_is_respected():
     triangles = np.array([[5.0, -1, -1, 5, 1, -1, 5, 0, 1]])
     ray = np.array([[1.0, 0, 0]])
     assert cast(triangles, [0, 0, 0], ray, limit=6.0)[0][0] == 5.0
@@ -145,7 +145,7 @@ def test_a_nearer_distance_given_beforehand_stays():
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_distances_scale_with_the_scene(scale):
+def test_distances_scale_with_scene(scale):
     triangles = soup(200, seed=7)
     directions = unit(np.random.default_rng([8, 13]).normal(size=(600, 3)))
     plain, face, _ = cast(triangles, [0, 0, 0], directions)
@@ -154,7 +154,7 @@ def test_distances_scale_with_the_scene(scale):
     np.testing.assert_array_equal(face, scaled_face)
 
 
-def test_rays_in_pieces_give_the_same_bits():
+def test_chunked_rays_give_same_bits():
     triangles = soup(300, seed=9)
     directions = unit(np.random.default_rng([9, 14]).normal(size=(1000, 3)))
     whole = cast(triangles, [0, 0, 0], directions)[0]
@@ -162,7 +162,7 @@ def test_rays_in_pieces_give_the_same_bits():
     assert whole.tobytes() == np.concatenate(parts).tobytes()
 
 
-def test_a_ray_that_is_not_finite_hits_nothing():
+def test_non_finite_rays_hit_nothing():
     triangles = soup(50)
     directions = np.array([[np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]], float)
     distance, face, _ = cast(triangles, [0, 0, 0], directions)

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
 
 
-def test_equal_keys_have_one_number_in_the_order_in_which_they_come() -> None:
+def test_keys_are_numbered_in_order_of_appearance() -> None:
     rng = np.random.default_rng(0)
     for keys in (rng.integers(0, 3000, 9000), rng.integers(0, 1 << 62, 3000), np.zeros(0, int)):
         number = np.full(len(keys), -1)
@@ -21,7 +21,7 @@ def test_equal_keys_have_one_number_in_the_order_in_which_they_come() -> None:
         np.testing.assert_array_equal(number[first], np.arange(len(known)))
 
 
-def test_sums_are_those_of_each_corner_s_plane() -> None:
+def test_plane_sums_match_slow_sums() -> None:
     rng = np.random.default_rng(0)
     vertices = rng.normal(size=(30, 3)).astype(np.float32)
     faces = rng.integers(0, 30, (50, 3)).astype(np.int32)
@@ -45,7 +45,7 @@ def test_sums_are_those_of_each_corner_s_plane() -> None:
     assert not A[6].any(), "no vertex is in the last group"
 
 
-def test_pieces_are_those_of_a_graph_library() -> None:
+def test_connected_pieces_match_scipy() -> None:
     rng = np.random.default_rng(3)
     for count, faces in ((40, 9), (500, 150), (500, 400), (5, 0)):
         rows = rng.integers(0, count, (faces, 3)).astype(np.int32)

@@ -27,7 +27,7 @@ SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)
     ],
     ids=lambda camera: camera.model,
 )
-def test_points_land_where_the_camera_says(camera: Camera) -> None:
+def test_projection_matches_camera(camera: Camera) -> None:
     rng = np.random.default_rng(0)
     image = SurfaceImage.of(RangeFrame(0, 0.0, camera, np.ones((48, 64), np.float32)))
     points = rng.uniform([-2, -2, -1], [2, 2, 4], (500, 3))
@@ -36,13 +36,13 @@ def test_points_land_where_the_camera_says(camera: Camera) -> None:
     assert seen.sum() > 50
     assert found[seen] == pytest.approx(expected[seen], abs=1e-9)
     assert np.isnan(found[points[:, 2] <= 0]).all()
-    # What a lens_parameters can't see must not come back through its polynomials.
+    # Points outside the lens's field of view must not project into the image by its polynomials.
     inside = (found >= -0.5).all(1) & (found < [63.5, 47.5]).all(1)
     wide = np.hypot(points[:, 0], points[:, 1]) > 1.1 * math.sqrt(image.max_radius2) * points[:, 2]
     assert not (inside & wide).any()
 
 
-def test_moved_points_keep_the_invalid_at_the_origin() -> None:
+def test_moved_points_keep_invalid_ones_at_origin() -> None:
     points = np.array([[0.0, 0, 0], [1, 2, 3]])
     T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
     out = np.full((2, 3), np.nan)
@@ -51,7 +51,7 @@ def test_moved_points_keep_the_invalid_at_the_origin() -> None:
     assert out[1] == pytest.approx(se3.transform(T, points)[1])
 
 
-def test_sums_of_a_plane_by_hand() -> None:
+def test_agreement_sums_of_plane() -> None:
     target = np.zeros((2, 3, 3))
     target[..., 2] = 2.0
     target[1, 2, 2] = 0.0  # invalid
@@ -63,10 +63,10 @@ def test_sums_of_a_plane_by_hand() -> None:
             [0, 0, 1.96],  # an inlier
             [0, 0, 2.2],  # the same surface, but no inlier
             [0, 0, 2.3],  # neither
-            [0, 0, 2.01],  # lands where no normal is known
-            [0, 0, 2.01],  # lands on an invalid pixel
-            [0, 0, 2.01],  # lands outside
-            [0, 0, 2.01],  # does not land
+            [0, 0, 2.01],  # projects to a pixel without a normal
+            [0, 0, 2.01],  # projects to an invalid pixel
+            [0, 0, 2.01],  # projects outside
+            [0, 0, 2.01],  # does not project
             [0, 0, 0.04],  # too near
         ]
     )

@@ -31,7 +31,7 @@ def units(r, n):
 
 @settings(max_examples=100)
 @given(seed=seeds, flat=st.floats(0, 1), size=st.floats(-6, 6))
-def test_eigenvalues_equal_lapack(seed, flat, size):
+def test_eigenvalues_match_lapack(seed, flat, size):
     x = np.random.default_rng(seed).normal(size=(9, 3)) * [1, 0.5, flat] * 10.0**size
     A = x.T @ x
     values, vectors = np.empty(3), np.empty((3, 3))
@@ -50,7 +50,7 @@ def shapes(points, k, origin=(0.0, 0.0, 0.0)):
     return index, out
 
 
-def test_normals_are_plane_fits_towards_the_origin():
+def test_normals_are_plane_fits_facing_origin():
     r = np.random.default_rng(0)
     points = r.normal(size=(300, 3)) * [1, 1, 0.1] + np.array([0, 0, 3])
     index, (normals, _, _, roughness) = shapes(points, 10)
@@ -62,25 +62,25 @@ def test_normals_are_plane_fits_towards_the_origin():
         np.testing.assert_allclose(roughness[i], np.sqrt(values[0] / values[1]), atol=1e-9)
 
 
-def test_curvature_of_a_ball_is_one_over_its_radius():
+def test_curvature_of_sphere_is_inverse_radius():
     r = np.random.default_rng(1)
     ball = 0.5 * units(r, 4000)
     _, (_, outside, _, _) = shapes(ball + np.array([0, 0, 3]), 20, origin=(0, 0, 3 - 1e6))
     front = ball[:, 2] < -0.1
     np.testing.assert_allclose(np.median(outside[front]), 2.0, rtol=0.02)
-    # Seen from inside it is hollow.
+    # Seen from inside it is concave.
     _, (_, inside, _, _) = shapes(ball, 20)
     np.testing.assert_allclose(np.median(inside), -2.0, rtol=0.02)
 
 
-def test_curvature_of_a_pipe_is_half_of_one_over_its_radius():
+def test_curvature_of_cylinder_is_half_inverse_radius():
     r = np.random.default_rng(2)
     a, h = r.uniform(0, 2 * np.pi, 6000), r.uniform(-1, 1, 6000)
     _, (_, curvature, _, _) = shapes(np.column_stack([np.cos(a), h, np.sin(a)]), 20)
     np.testing.assert_allclose(np.median(curvature), -0.5, rtol=0.05)
 
 
-def test_the_edge_of_a_sheet_has_a_wide_gap():
+def test_sheet_border_has_wide_angular_gap():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
     sheet = np.column_stack([x.ravel(), y.ravel(), np.full(400, 9.0)])
     _, (_, _, gap, roughness) = shapes(sheet, 9)
@@ -90,14 +90,14 @@ def test_the_edge_of_a_sheet_has_a_wide_gap():
     assert roughness.max() < 1e-6
 
 
-def test_points_on_a_line_have_no_normal():
+def test_collinear_points_have_no_normal():
     _, (normals, curvature, gap, _) = shapes(np.outer(np.arange(20.0), [1, 2, 3]), 6)
     assert np.isnan(normals).all()
     assert np.isnan(curvature).all()
     assert (gap == 2 * np.pi).all()
 
 
-def test_moments_of_balls_equal_their_twin_and_do_not_turn():
+def test_moments_match_twin_and_are_rotation_invariant():
     r = np.random.default_rng(3)
     points = r.normal(size=(500, 3))
     centres = np.vstack([points[:50], [[50, 0, 0]]])
@@ -118,7 +118,7 @@ def numeric(residuals, step=1e-6):
     )
 
 
-def test_plane_sums_are_the_normal_equations_of_distances_along_a_normal():
+def test_plane_sums_are_point_to_plane_normal_equations():
     r = np.random.default_rng(4)
     T = se3.exp(r.normal(size=6))
     p, q, w = r.normal(size=(30, 3)), r.normal(size=(30, 3)), r.uniform(0, 2, 30)
@@ -141,7 +141,7 @@ def test_plane_sums_are_the_normal_equations_of_distances_along_a_normal():
     np.testing.assert_allclose(plain, [u @ own @ u / 2 for u in directions], rtol=1e-6)
 
 
-def test_matrix_sums_are_the_normal_equations_of_a_weighted_distance():
+def test_matrix_sums_are_normal_equations_of_weighted_distance():
     r = np.random.default_rng(5)
     T = se3.exp(r.normal(size=6))
     p, q, w = r.normal(size=(20, 3)), r.normal(size=(20, 3)), r.uniform(0, 2, 20)
@@ -157,7 +157,7 @@ def test_matrix_sums_are_the_normal_equations_of_a_weighted_distance():
     np.testing.assert_allclose(square, np.einsum("k,ki,kij,kj->", w, e, W, e))
 
 
-def test_plane_to_plane_weights_invert_the_sum_of_two_discs():
+def test_plane_to_plane_weights_invert_sum_of_disc_covariances():
     r = np.random.default_rng(6)
     a, b = units(r, 50), units(r, 50)
     W = plane_to_plane_weights(a, b, 0.02)
@@ -166,7 +166,7 @@ def test_plane_to_plane_weights_invert_the_sum_of_two_discs():
         np.testing.assert_allclose(each, np.linalg.inv(discs), atol=1e-9)
 
 
-def test_symmetric_sums_equal_their_twin():
+def test_symmetric_sums_match_twin():
     r = np.random.default_rng(7)
     p, q, n, w = (*r.normal(size=(3, 20, 3)), r.uniform(0, 2, 20))
     J = np.hstack([n, np.cross(p + q, n)])
@@ -186,7 +186,7 @@ def test_symmetric_sums_equal_their_twin():
     share=st.sampled_from([0.0, 1.0]),
     count=st.sampled_from([1, 3]),
 )
-def test_nearest_featured_equals_brute_force(seed, n, k, tolerance, limit, share, count):
+def test_nearest_featured_matches_brute_force(seed, n, k, tolerance, limit, share, count):
     r = np.random.default_rng(seed)
     # Coordinates on a grid, so that there are ties.
     points, queries = (r.integers(0, 8, (m, 3)) / 8 for m in (n, 40))
@@ -207,7 +207,7 @@ def test_nearest_featured_equals_brute_force(seed, n, k, tolerance, limit, share
             assert squared[q] == d[index[q]]
 
 
-def test_grid_search_goes_downhill_from_the_pixel():
+def test_grid_search_descends_from_pixel():
     grid = np.arange(400).reshape(20, 20)
     grid[5, 5] = -1
     v, u = np.divmod(np.arange(400), 20)
@@ -225,6 +225,6 @@ def test_grid_search_goes_downhill_from_the_pixel():
     assert list(index) == [21, -1, -1, -1, -1]
 
 
-def test_searches_refuse_what_is_no_cloud():
+def test_search_rejects_wrong_shape():
     with pytest.raises(InputError, match="shape"):
         KdTree(np.zeros((3, 3))).moments(np.zeros((3, 2)), 1.0)

@@ -35,10 +35,10 @@ def _run(env: dict[str, str], code: str = _COMPILE) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the home decides on other systems only")
+@pytest.mark.skipif(sys.platform == "win32", reason="the home folder is used on POSIX systems only")
 @pytest.mark.parametrize("place", ["file", "missing"])
-def test_a_home_that_cannot_be_written(tmp_path, place) -> None:
-    # Root may write anywhere but not below a file, nor in a system's own tree of processes.
+def test_unwritable_home_uses_temporary_cache(tmp_path, place) -> None:
+    # Even root can't write below a file, nor into /proc.
     if place == "file":
         home = tmp_path / "home"
         home.write_text("not a folder")
@@ -53,7 +53,7 @@ def test_a_home_that_cannot_be_written(tmp_path, place) -> None:
     assert [p.name for p in tmp_path.iterdir()] == (["home"] if place == "file" else [])
 
 
-def test_the_cache_is_kept_where_it_can_be_written(tmp_path) -> None:
+def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
     env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     text, folder, files = _run(env)
     assert text == "abc"
@@ -61,10 +61,10 @@ def test_the_cache_is_kept_where_it_can_be_written(tmp_path) -> None:
     stamps = {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")}
     assert len(stamps) >= int(files) > 0
     assert _run(env)[0] == "abc"
-    assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # was used
+    assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # reused
 
 
-def test_the_key_changes_with_any_kernel(tmp_path) -> None:
+def test_cache_key_changes_with_any_kernel(tmp_path) -> None:
     package = tmp_path / "kernels"
     shutil.copytree(Path(jit.__file__).parent, package, ignore=shutil.ignore_patterns("__pyc*"))
     code = (

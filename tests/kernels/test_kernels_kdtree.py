@@ -62,7 +62,7 @@ KINDS = ["random", "grid", "line", "same", "plane"]
     k=st.integers(1, 7),
     limit=st.sampled_from([0.0, 0.1, 0.5, 1.0, np.inf]),
 )
-def test_it_equals_the_search_through_all_points(seed, n, kind, k, limit):
+def test_search_matches_brute_force(seed, n, kind, k, limit):
     points = clouds(seed, n, kind)
     rng = np.random.default_rng(seed + 1)
     queries = np.concatenate([points[:20], clouds(seed + 1, 20, kind), rng.uniform(-3, 3, (5, 3))])
@@ -78,7 +78,7 @@ def test_it_equals_the_search_through_all_points(seed, n, kind, k, limit):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_it_agrees_with_scipy(dtype):
+def test_search_matches_scipy(dtype):
     rng = np.random.default_rng(3)
     points = rng.normal(size=(20_000, 3)).astype(dtype)
     queries = rng.normal(size=(5_000, 3)).astype(dtype)
@@ -97,7 +97,7 @@ def test_it_agrees_with_scipy(dtype):
     np.testing.assert_allclose(np.sqrt(distance2), want_distance, rtol=1e-12)
 
 
-def test_a_tie_goes_to_the_lowest_index():
+def test_ties_go_to_lowest_index():
     points = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1]] * 50)
     index, distance2 = KdTree(points).nearest(np.zeros((1, 3)))
     assert index[0] == 0
@@ -106,7 +106,7 @@ def test_a_tie_goes_to_the_lowest_index():
     np.testing.assert_array_equal(index[0], np.arange(6))
 
 
-def test_the_bound_is_inclusive():
+def test_distance_bound_is_inclusive():
     tree = KdTree([[0.0, 0, 0]])
     query = np.array([[0.5, 0, 0]])
     assert tree.nearest(query, 0.5)[0][0] == 0
@@ -114,7 +114,7 @@ def test_the_bound_is_inclusive():
     assert tree.nearest(query, -1.0)[0][0] == -1
 
 
-def test_no_points_and_no_queries():
+def test_empty_points_or_queries():
     empty = KdTree(np.zeros((0, 3)))
     assert len(empty) == 0
     index, distance2 = empty.nearest(np.zeros((4, 3)))
@@ -128,7 +128,7 @@ def test_no_points_and_no_queries():
     assert index.dtype == np.int64
 
 
-def test_a_query_that_is_not_finite_has_no_neighbour():
+def test_non_finite_query_has_no_neighbour():
     tree = KdTree(np.random.default_rng(0).normal(size=(100, 3)))
     queries = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]])
     assert (tree.nearest(queries)[0] >= 0).tolist() == [False, False, True]
@@ -136,12 +136,12 @@ def test_a_query_that_is_not_finite_has_no_neighbour():
 
 
 @pytest.mark.parametrize("bad", [np.zeros((3, 2)), np.zeros(3), [[np.nan, 0, 0]]])
-def test_bad_points_are_refused(bad):
+def test_bad_points_are_rejected(bad):
     with pytest.raises(InputError):
         KdTree(bad)
 
 
-def test_the_answer_does_not_depend_on_the_number_of_threads():
+def test_search_is_independent_of_threads():
     rng = np.random.default_rng(8)
     tree = KdTree(np.round(rng.normal(size=(9_000, 3)), 1))
     queries = rng.normal(size=(9_000, 3))
@@ -155,7 +155,7 @@ def test_the_answer_does_not_depend_on_the_number_of_threads():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_tree_is_balanced_and_cut_at_its_cuts(kind):
+def test_tree_is_balanced_and_split_at_its_cuts(kind):
     points = clouds(5, 1000, kind)
     depth = 7
     order, arranged, axes, cuts = kdtree_build(points, depth)

@@ -35,7 +35,7 @@ def fitted(nodes: np.ndarray, limit: float = 0.006) -> np.ndarray:
     return nodes
 
 
-def test_exchange_is_the_sum_over_sources_of_disc_form_factors_and_delays() -> None:
+def test_exchange_sums_disc_form_factors_with_delays() -> None:
     rng = np.random.default_rng(1)
     sources = rng.normal(size=(30, 9))
     sources[:, 2] += 4
@@ -60,7 +60,7 @@ def test_exchange_is_the_sum_over_sources_of_disc_form_factors_and_delays() -> N
     assert (np.abs(wanted) > 0).sum() > 100
 
 
-def test_a_disc_that_touches_sends_no_more_than_all_its_light() -> None:
+def test_touching_disc_sends_at_most_all_its_light() -> None:
     sources = np.float32([[0, 0, 1, 0, 0, -1, 0.1, 1, 0]])
     receivers = np.float32([[0], [0], [1 - 1e-4], [0], [0], [1]])
     out = np.zeros((2, 1), np.float32)
@@ -68,7 +68,7 @@ def test_a_disc_that_touches_sends_no_more_than_all_its_light() -> None:
     assert 0.99 < out[0, 0] <= 1.0
 
 
-def test_block_means_are_those_of_the_surface_in_the_middle() -> None:
+def test_block_means_use_median_surface() -> None:
     rays = grid_rays(8, 8)
     z = np.full((8, 8), 2.0, np.float32)
     z[0, :2] = 5.0
@@ -87,7 +87,7 @@ def test_block_means_are_those_of_the_surface_in_the_middle() -> None:
     assert nodes[1, 1, AREA] == pytest.approx(16 * 1e-4, rel=1e-4)
 
 
-def test_blocks_with_few_pixels_and_unknown_rays_are_left_out() -> None:
+def test_blocks_with_few_pixels_or_unknown_rays_are_skipped() -> None:
     rays = grid_rays(4, 8)
     z = np.zeros((4, 8), np.float32)
     z[0, :3] = 1.0  # three of sixteen
@@ -99,7 +99,7 @@ def test_blocks_with_few_pixels_and_unknown_rays_are_left_out() -> None:
     assert np.isfinite(nodes).all()
 
 
-def test_blocks_at_the_border_may_be_cut() -> None:
+def test_border_blocks_may_be_partial() -> None:
     nodes = means(np.full((6, 7), 2.0), grid_rays(6, 7), np.ones((6, 7)), 4)
     assert nodes.shape[:2] == (2, 2)
     assert nodes[..., W] == pytest.approx(0.5)
@@ -116,7 +116,7 @@ def roof(shape: tuple[int, int] = (24, 32)) -> tuple[np.ndarray, np.ndarray]:
     return nodes, right
 
 
-def test_planes_reach_up_to_an_edge_and_do_not_cut_it_off() -> None:
+def test_planes_are_fitted_up_to_edges() -> None:
     nodes, right = roof()
     fitted(nodes)
     np.testing.assert_allclose(nodes[..., A], np.where(right, 0.3, -0.2), atol=1e-9)
@@ -124,12 +124,12 @@ def test_planes_reach_up_to_an_edge_and_do_not_cut_it_off() -> None:
     np.testing.assert_allclose(nodes[..., C], 0.3, atol=1e-9)
 
 
-def test_a_node_at_an_edge_is_compared_with_a_plane_as_that_is_corrected() -> None:
+def test_edge_nodes_are_compared_with_corrected_planes() -> None:
     nodes, right = roof()
     length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
     true = length / nodes[..., W]
     shift = np.where(right, 0.4, 0.0)
-    # The two columns right of the edge were corrected as if they were on the left.
+    # The two columns right of the edge have the correction of the left plane.
     strip = right & (nodes[..., X] < 0.04)
     measured = true + shift
     nodes[..., W] = length / np.where(strip, measured, true)
@@ -143,14 +143,14 @@ def test_a_node_at_an_edge_is_compared_with_a_plane_as_that_is_corrected() -> No
     np.testing.assert_allclose(nodes[inner & strip][:, A], 0.3, atol=1e-6)
 
 
-def test_what_is_not_flat_gets_no_plane() -> None:
+def test_rough_nodes_get_no_plane() -> None:
     nodes, _ = roof()
     nodes[..., W] *= np.random.default_rng(0).uniform(0.9, 1.1, nodes.shape[:2])
     fitted(nodes)
     assert (nodes[..., C] != 0).mean() < 0.05
 
 
-def test_spread_carries_a_bias_to_its_own_surface_only() -> None:
+def test_upsampled_bias_stays_on_its_surface() -> None:
     rays = grid_rays(48, 64)
     right = rays[..., 0] > 0.045
     z = np.where(right, 1.0, 2.0).astype(np.float32)
@@ -168,7 +168,7 @@ def test_spread_carries_a_bias_to_its_own_surface_only() -> None:
     assert z_out[5, 5] == 0
 
 
-def test_flat_nodes_are_counted_on_planes_and_not_on_bent_ones() -> None:
+def test_flat_nodes_are_counted_on_planes_but_not_on_curved_surfaces() -> None:
     nodes, _ = roof()
     bent = nodes.copy()
     bent[..., W] *= 1 + bent[..., X] ** 2
@@ -181,7 +181,7 @@ SLANTEST = 0.6
 
 
 def lit_nodes(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """Nodes with planes at random, some of them without, in smooth pieces of four columns."""
+    """Nodes with random planes, constant over four columns; some without one."""
     nodes = np.zeros((rows, columns, COLUMNS))
     y, x = np.mgrid[:rows, :columns] * 0.1
     nodes[..., X], nodes[..., Y] = x - 0.4, y - 0.3
@@ -204,7 +204,7 @@ def surfaces_of(nodes: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, ...]
     return good, points, normals, values
 
 
-def test_light_surfaces_are_the_planes_and_their_light() -> None:
+def test_surface_radiometry_matches_reference() -> None:
     rng = np.random.default_rng(6)
     nodes = lit_nodes(rng, 9, 11)
     factor = rng.uniform(1, 1.5, (9, 11))
@@ -231,10 +231,10 @@ def test_light_surfaces_are_the_planes_and_their_light() -> None:
     np.testing.assert_allclose(values[:, good], [r, area, lit, radiosity, albedo])
 
 
-def test_seen_sources_are_means_of_four_nodes_that_are_alike_and_the_others_alone() -> None:
+def test_visible_sources_merge_similar_nodes_of_a_block() -> None:
     rng = np.random.default_rng(7)
     nodes = lit_nodes(rng, 9, 11)
-    # Beside the rough part, a large wall.
+    # Below the rough part, a large wall.
     nodes[4:, :, A:] = [0.02, 0.01, 0.5]
     nodes[4:, :, W] = 0.5
     good, points, normals, values = surfaces_of(nodes, np.ones((9, 11)))
@@ -284,7 +284,7 @@ def test_seen_sources_are_means_of_four_nodes_that_are_alike_and_the_others_alon
     )
 
 
-def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_border() -> None:
+def test_offscreen_sources_use_known_or_nearest_border_plane() -> None:
     rng = np.random.default_rng(8)
     border = lit_nodes(rng, 4, 6)
     border = border[(border[..., W] > 0) & (border[..., C] != 0)]
@@ -321,14 +321,14 @@ def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_bord
     assert count == len(wanted) > guessed + 20
     np.testing.assert_allclose(out[:count], wanted, rtol=1e-4, atol=1e-6)
     assert np.isnan(out[count:]).all()
-    # With nothing at the border, what is known is left.
+    # With an empty border, only the known sources remain.
     none = kernels.offscreen_sources(
         rays, size, planes, albedo, border[:0], border_albedo[:0], growth, 4.0, SLANTEST, 2.5, out
     )
     assert none == count - guessed
 
 
-def test_the_extent_is_that_of_the_known_rays() -> None:
+def test_ray_bounds_cover_known_rays() -> None:
     rays = np.random.default_rng(9).normal(size=(7, 9, 2)).astype(np.float32)
     rays[0] = rays[3, 4] = np.nan
     found = kernels.ray_bounds(rays)
@@ -337,7 +337,7 @@ def test_the_extent_is_that_of_the_known_rays() -> None:
     assert np.isnan(kernels.ray_bounds(np.full_like(rays, np.nan))).all()
 
 
-def test_recall_shows_the_nearest_surfaces_that_face_the_camera_in_each_cell() -> None:
+def test_projected_patches_average_nearest_front_faces() -> None:
     rng = np.random.default_rng(5)
     pitch = np.array([0.25, 0.2])
     x, y = np.meshgrid(np.arange(-4, 5) * pitch[0], np.arange(-4, 5) * pitch[1])

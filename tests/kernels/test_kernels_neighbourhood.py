@@ -22,7 +22,7 @@ def angle_twin(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_largest_angle() -> None:
+def test_largest_angle_matches_twin() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-1, -1, 1], [1, 1, 3], (9, 11, 3)).astype(np.float32)
     valid = rng.random((9, 11)) < 0.7
@@ -34,12 +34,12 @@ def test_largest_angle() -> None:
 
 
 @pytest.mark.parametrize("threshold", [np.pi / 2, 2.0, 2.6])
-def test_is_steeper(threshold: float) -> None:
+def test_is_steeper_matches_twin(threshold: float) -> None:
     rng = np.random.default_rng(1)
     z = (rng.uniform(1, 3, (9, 11)) * (rng.random((9, 11)) < 0.7)).astype(np.float32)
     rays = np.stack(np.meshgrid(np.linspace(-2, 2, 11), np.linspace(-2, 2, 9)), -1)
     points = np.concatenate([rays, np.ones((9, 11, 1))], -1) * z[..., None]
-    rays = np.where(z[..., None] > 0, rays, np.nan).astype(np.float32)  # never looked at
+    rays = np.where(z[..., None] > 0, rays, np.nan).astype(np.float32)  # never read
     out = np.zeros((9, 11), bool)
     cosine2 = np.float32(np.cos(threshold) ** 2)
     is_steeper(z, rays, cosine2, 0, 4, out)
@@ -51,7 +51,7 @@ def test_is_steeper(threshold: float) -> None:
     assert 5 < out.sum() < (z > 0).sum()
 
 
-def test_window_median_writes_its_rows_only() -> None:
+def test_window_median_writes_only_its_rows() -> None:
     z = np.float32([[1, 2, 3], [4, 0, 6], [7, 8, 9]])
     out = np.full((3, 3), -1, np.float32)
     window_median(z, 1, 1, 2, out)

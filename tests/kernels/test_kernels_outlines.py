@@ -13,7 +13,7 @@ GROWTH = np.array([1.5, 1.5, 1.5, 1.5, 3.5, 5.0], np.float32)
 SIGMAS, JUMP = 3.0, 0.04
 
 
-def carried_twin(w, sigma, rays, wanted, planes, variance, jump=JUMP):
+def extension_twin(w, sigma, rays, wanted, planes, variance, jump=JUMP):
     found, varied = planes.astype(float), variance.astype(float)
     for i, j in itertools.product(*map(range, w.shape)):
         for (di, dj), growth in zip(STEPS.tolist(), GROWTH, strict=True):
@@ -35,7 +35,7 @@ def carried_twin(w, sigma, rays, wanted, planes, variance, jump=JUMP):
     return found, varied
 
 
-def test_planes_are_carried_as_by_the_slow_twin():
+def test_extended_planes_match_slow_twin():
     rng = np.random.default_rng(1)
     shape = (15, 17)
     rays = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 17), np.linspace(-0.3, 0.3, 15)), -1)
@@ -54,12 +54,12 @@ def test_planes_are_carried_as_by_the_slow_twin():
     extend_planes(
         w, sigma, rays, wanted, planes, variance, STEPS, GROWTH, SIGMAS, JUMP, found, varied
     )
-    twin, twin_varied = carried_twin(w, sigma, rays, wanted, planes, variance)
+    twin, twin_varied = extension_twin(w, sigma, rays, wanted, planes, variance)
     new = twin[..., 3] != planes[..., 3]
-    # Some are found beside them, and some nowhere: the right surface is too steep along rows.
+    # Some pixels get a neighbour's plane, others none: the right surface is too steep along rows.
     assert 40 < new.sum() < wanted.sum() - 10
     assert not new[~wanted].any()
-    steep = carried_twin(w, sigma, rays, wanted, planes, variance, jump=1.0)[0][..., 3]
+    steep = extension_twin(w, sigma, rays, wanted, planes, variance, jump=1.0)[0][..., 3]
     assert (steep != twin[..., 3]).sum() > 5
     np.testing.assert_allclose(found, twin, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(varied, twin_varied, rtol=1e-5)

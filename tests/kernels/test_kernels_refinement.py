@@ -44,7 +44,7 @@ def pair():
     return corner(T_target_source), corner(np.eye(4)), T_target_source
 
 
-def test_the_step_leads_back_to_the_truth(pair):
+def test_steps_converge_to_truth(pair):
     source, target, T = pair
     xi = np.array([0.01, -0.008, 0.006, 0.004, 0.006, -0.005])
     start = T @ se3.exp(xi)
@@ -66,12 +66,12 @@ def as_measured(frame, kind):
 @pytest.mark.parametrize("kind", ["z", "range"])
 @pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
 @pytest.mark.parametrize("error", range(kernels.ERRORS))
-def test_an_error_of_the_camera_moves_the_gradient_as_the_matrix_says(
+def test_camera_error_changes_gradient_as_predicted_by_hessian(
     pair, error, scale_p, tolerance, kind
 ):
     """To first order g(e) = g(0) + H e: the mixed block is the slope of the gradient."""
     _, _, T = pair
-    # A pattern so coarse that it makes no difference at which pixel a point lands.
+    # A pattern so coarse that the pixel of a correspondence makes no difference.
     source, target = (as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4)))
     known = KNOWN.copy()
     known[error] = 0
@@ -90,8 +90,8 @@ def test_an_error_of_the_camera_moves_the_gradient_as_the_matrix_says(
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_with_the_error_of_the_focal_length_views_agree_as_with_the_true_camera(pair, kind):
-    """What is measured stays: z, or the range along another ray."""
+def test_focal_length_error_is_compensated(pair, kind):
+    """The measured quantity is kept: z, or the range along another ray."""
     source, target, T = pair
     share = 1.02
 
@@ -116,7 +116,7 @@ def test_with_the_error_of_the_focal_length_views_agree_as_with_the_true_camera(
     assert corrected - true < 0.3 * (wrong - true)
 
 
-def test_what_is_not_asked_for_has_no_equations(pair):
+def test_fixed_unknowns_have_no_equations(pair):
     source, target, T = pair
     H, g = unpack(evaluate(source, target, T))
     assert not H[7:].any()
@@ -135,7 +135,7 @@ def test_free_space_and_support_are_counted(pair):
     assert out[kernels.SUPPORT] < 0.1 * out[kernels.TERMS]
 
 
-def test_overlap_counts_what_both_see_from_the_same_side(pair):
+def test_overlap_counts_points_seen_from_same_side(pair):
     source, target, T = pair
     surface = prepare_view(target, SurfaceOptions(radii=(2,)))
     points = points_of(prepare_view(source, SurfaceOptions(radii=(2,))), 2)
@@ -162,5 +162,5 @@ def test_overlap_counts_what_both_see_from_the_same_side(pair):
     assert 0 < share(aside) < share(T)
     assert share(aside, least=share(aside) - 0.01) == share(aside)
     assert share(aside, least=share(aside) + 0.01) == 0
-    # All of it is behind what the target sees, so nothing is seen by both.
+    # Entirely behind the target's surface, so there is no overlap.
     assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05

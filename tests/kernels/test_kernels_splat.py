@@ -9,7 +9,7 @@ from tofuse.kernels.splat import nearest_points
 
 
 @pytest.mark.parametrize(("distance", "radius"), [(0.0, 1), (0.0, 3), (2.0, 1), (2.0, 2)])
-def test_the_nearest_point_of_each_pixel_is_found(distance: float, radius: int) -> None:
+def test_nearest_point_of_each_pixel_is_found(distance: float, radius: int) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.5, 1.5, (400, 3))
     points[5], points[6], points[7] = np.nan, points[8], (0, 0, -1.99)
@@ -35,4 +35,4 @@ def test_the_nearest_point_of_each_pixel_is_found(distance: float, radius: int) 
         nearest[square][nearer] = p[2]
     np.testing.assert_array_equal(found, wanted)
     assert 50 < (found >= 0).sum() < found.size
-    assert 6 not in found, "of two points in the same place the last is seen"
+    assert 6 not in found, "of two coincident points the last is seen"

@@ -37,7 +37,7 @@ def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8])
-def test_the_median_is_the_upper_one(count):
+def test_median_of_even_count_is_upper_one(count):
     values = np.random.default_rng(count).normal(size=(count, 1)).astype(np.float32)
     assert median(values) == np.sort(values.ravel())[count // 2]
 
@@ -70,7 +70,7 @@ def halved(z, value, variance=None, jump=0.02):
 
 
 @pytest.mark.parametrize("shape", [(20, 16), (21, 17)])
-def test_halving_is_that_of_the_slow_twin(shape):
+def test_halving_matches_slow_twin(shape):
     rng = np.random.default_rng(1)
     z = rng.choice([0, 1.0, 1.5, 1.51, 3], shape).astype(np.float32)
     z += np.where(z > 0, rng.uniform(0, 0.01, shape), 0).astype(np.float32)
@@ -80,14 +80,14 @@ def test_halving_is_that_of_the_slow_twin(shape):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
-def test_halving_never_makes_a_depth_between_two_surfaces():
+def test_halving_never_mixes_two_surfaces():
     z = np.where(np.arange(41) < 21, 1, 3).astype(np.float32)[None].repeat(8, 0)
     found, value, _ = halved(z, z * 10)
     assert set(np.unique(found)) <= {1.0, 3.0}
     np.testing.assert_allclose(value, 10 * found)
 
 
-def test_halving_keeps_a_plane_a_plane():
+def test_halving_preserves_planes():
     rays = CAMERA.rays()
     found, _, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
     blocks = rays.reshape(15, 2, 20, 2, 2).mean((1, 3))
@@ -97,7 +97,7 @@ def test_halving_keeps_a_plane_a_plane():
 # --- planes --------------------------------------------------------------------------------------
 
 
-def test_pixels_without_weight_count_nothing_even_if_their_rays_are_unknown():
+def test_pixels_without_weight_are_ignored_even_with_unknown_rays():
     rays = CAMERA.rays().copy()
     w, weight = plane_w(rays), np.ones(rays.shape[:2], np.float32)
     weight[4, 4] = 0
@@ -108,7 +108,7 @@ def test_pixels_without_weight_count_nothing_even_if_their_rays_are_unknown():
     assert (holed[4, 5:8, 3] > 0).all()
 
 
-def test_fits_are_the_same_however_the_rows_are_shared_out():
+def test_fits_are_independent_of_row_chunks():
     rng = np.random.default_rng(2)
     rays = LENS.rays()
     weight = rng.uniform(0.5e6, 2e6, rays.shape[:2]).astype(np.float32)
@@ -127,7 +127,7 @@ def test_fits_are_the_same_however_the_rows_are_shared_out():
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_the_coefficients_of_a_plane_are_exact(camera):
+def test_plane_coefficients_are_exact(camera):
     rays = camera.rays()
     planes, quality = fit(plane_w(rays), rays, np.full(rays.shape[:2], 1e4, np.float32), limit=0.01)
     inside = np.s_[3:-3, 3:-3]
@@ -148,7 +148,7 @@ def twin_of_one_fit(w, rays, weight, i, j, r):
     return found, here @ found, here @ inverse @ here, left_over
 
 
-def test_fits_are_weighted_least_squares_depth_by_the_smallest_window_slope_by_the_widest():
+def test_depth_is_fitted_in_smallest_and_slope_in_widest_window():
     rng = np.random.default_rng(3)
     rays = LENS.rays()
     weight = rng.uniform(0.5e6, 2e6, rays.shape[:2]).astype(np.float32)
@@ -164,7 +164,7 @@ def test_fits_are_weighted_least_squares_depth_by_the_smallest_window_slope_by_t
         assert quality[i, j, 0] == pytest.approx(small[3], rel=1e-3)
 
 
-def test_noise_in_slopes_falls_with_the_window_and_the_stated_variance_of_depths_is_right():
+def test_slope_noise_falls_with_window_and_depth_variance_is_calibrated():
     rng = np.random.default_rng(4)
     rays = CAMERA.rays()
     sigma = 0.002
@@ -189,40 +189,40 @@ def test_noise_in_slopes_falls_with_the_window_and_the_stated_variance_of_depths
     assert np.concatenate(errors).std() == pytest.approx(1, abs=0.1)
 
 
-def test_an_edge_is_not_bridged():
+def test_depth_edges_are_not_bridged():
     rays = CAMERA.rays()
     near = np.arange(40) < 20
     w = np.where(near, 1.0, 0.5).astype(np.float32)[None].repeat(30, 0)
     weight = np.full(w.shape, 1e6, np.float32)
     planes, _ = fit(w, rays, weight, limit=1.0)
-    # Windows that reach over the edge hold no plane; those that don't are exact.
+    # Windows that cross the edge have no plane; the others are exact.
     assert (planes[5:-5, 18:22, 3] == 0).all()
     np.testing.assert_allclose(planes[5:-5, 3:17, 3], 1.0, rtol=1e-5)
     np.testing.assert_allclose(planes[5:-5, 23:-3, 3], 0.5, rtol=1e-5)
     assert (np.abs(planes[5:-5, :, :2])[planes[5:-5, :, 3] > 0] < 1e-4).all()
 
 
-def test_a_crease_is_not_bridged_by_wide_windows():
+def test_creases_are_not_bridged_by_wide_windows():
     rays = CAMERA.rays()
     left, right = plane_w(rays, 0.6, 0, 0.5), plane_w(rays, -0.6, 0, 0.5)
     w = np.where(rays[..., 0] < 0, left, right)
     weight = np.full(w.shape, 1 / 0.002**2, np.float32)
     planes, _ = fit(w, rays, weight, limit=1.2)
-    # The wide window, half way over the crease, fits worse than noise: the small one is kept.
+    # The wide window, halfway across the crease, fits worse than the noise: the small one is kept.
     np.testing.assert_allclose(planes[8:-8, 15:17, 0], 0.6, atol=1e-3)
     np.testing.assert_allclose(planes[8:-8, 23:25, 0], -0.6, atol=1e-3)
 
 
-def test_a_wide_window_does_not_jump_over_what_a_small_one_has_seen():
+def test_wide_window_does_not_override_small_one():
     rays = CAMERA.rays()
     w = plane_w(rays)
-    # The pixel's neighbourhood is off the plane of everything around.
+    # The pixel's neighbourhood is off the plane of the surroundings.
     w[13:18, 18:23] += np.linspace(-0.3, 0.3, 25).reshape(5, 5).astype(np.float32) ** 2
     planes, _ = fit(w, rays, np.full(w.shape, 1e6, np.float32), radii=(2, 12), limit=1.0)
     assert (planes[15, 20] == 0).all()
 
 
-def test_pixels_at_an_outline_are_dropped():
+def test_pixels_at_outlines_are_dropped():
     rays = CAMERA.rays()
     w = plane_w(rays)
     weight = np.full(w.shape, 1e6, np.float32)
@@ -233,10 +233,10 @@ def test_pixels_at_an_outline_are_dropped():
     assert (planes[5:-5, 19] == 0).all(), "its window is mostly on one side"
     assert (planes[5:-5, 10:17, 3] > 0).all()
     loose, _ = fit(w, rays, weight, limit=1.0, fill=0.1, offset=5.0)
-    assert (loose[5:-5, 19, 3] > 0).all(), "the two limits, and nothing else, drop them"
+    assert (loose[5:-5, 19, 3] > 0).all(), "only the two limits drop them"
 
 
-def test_a_pixel_off_its_neighbours_plane_has_none():
+def test_pixel_off_its_neighbours_plane_has_no_plane():
     rays = CAMERA.rays()
     w = plane_w(rays)
     weight = np.full(w.shape, 1e6, np.float32)
@@ -252,7 +252,7 @@ def test_a_pixel_off_its_neighbours_plane_has_none():
 @pytest.mark.parametrize("falloff", [0.0, 4.0])
 @pytest.mark.parametrize("power", [0.0, 2.0])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_light_of_a_matte_plane_gives_one_albedo(power, camera, falloff):
+def test_lambertian_plane_has_uniform_albedo(power, camera, falloff):
     rays = camera.rays().astype(float)
     w = plane_w(rays).astype(float)
     direction = np.concatenate([rays, np.ones((*w.shape, 1))], -1)
@@ -274,7 +274,7 @@ def test_light_of_a_matte_plane_gives_one_albedo(power, camera, falloff):
     np.testing.assert_allclose(out[~holes], np.log(0.4), atol=1e-5)
 
 
-def test_light_from_elsewhere_is_taken_as_it_is():
+def test_passive_light_is_not_compensated():
     rays = CAMERA.rays()
     planes = np.broadcast_to(np.float32([A, B, C, 0]), (*rays.shape[:2], 4)).copy()
     planes[..., 3] = plane_w(rays)
@@ -284,7 +284,7 @@ def test_light_from_elsewhere_is_taken_as_it_is():
     np.testing.assert_allclose(out, np.log(90), rtol=1e-6)
 
 
-def test_a_surface_seen_along_itself_has_no_albedo():
+def test_surface_at_grazing_incidence_has_no_albedo():
     rays = CAMERA.rays()
     planes = np.zeros((*rays.shape[:2], 4), np.float32)
     planes[..., 0], planes[..., 2] = 10.0, 1.0  # nearly contains the optical axis
@@ -313,7 +313,7 @@ def flat(rays, w=0.5):
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_a_ramp_over_the_rays_gives_its_slope(camera, radius):
+def test_ramp_has_its_slope(camera, radius):
     rays = camera.rays()
     image = (0.7 + 3 * rays[..., 0] - 2 * rays[..., 1]).astype(np.float32)
     out = smoothed(image, flat(rays), rays, radius)
@@ -321,17 +321,17 @@ def test_a_ramp_over_the_rays_gives_its_slope(camera, radius):
     inside = out[h:-h, h:-h]
     assert np.isnan(out[:h]).all()
     assert np.isnan(out[:, -h:]).all()
-    # Box means of a bent lens's rays are those of the box's centre but for its curvature.
+    # Box means of a distorted lens's rays equal those of the centre up to curvature.
     atol = 1e-4 if camera is CAMERA else 0.01
     np.testing.assert_allclose(inside[..., 0], image[h:-h, h:-h], atol=atol)
     np.testing.assert_allclose(inside[..., 1], 3, atol=5 * atol)
     np.testing.assert_allclose(inside[..., 2], -2, atol=5 * atol)
 
 
-def test_no_slope_reaches_over_an_edge_in_depth_or_a_hole():
+def test_slopes_do_not_cross_depth_edges_or_holes():
     rays = CAMERA.rays()
     planes = flat(rays)
-    planes[:, 20:, 2:] = 1.0  # 1 m from here, 2 m before
+    planes[:, 20:, 2:] = 1.0  # 1 m from here on, 2 m before
     image = np.where(np.arange(40) < 20, 0, 5).astype(np.float32)[None].repeat(30, 0)
     out = smoothed(image, planes, rays)
     assert np.isnan(out[:, 18:22]).all(), "the cross reaches two pixels"
@@ -344,7 +344,7 @@ def test_no_slope_reaches_over_an_edge_in_depth_or_a_hole():
     assert np.isfinite(out[14, 19]).all()
 
 
-def test_holes_in_the_image_are_left_out_of_the_means():
+def test_holes_are_excluded_from_means():
     rays = CAMERA.rays()
     image = np.ones((30, 40), np.float32)
     image[10, 10] = np.nan
@@ -362,7 +362,7 @@ def test_holes_in_the_image_are_left_out_of_the_means():
     assert np.abs(out[known][:, 1:] - [3, -2]).max() < 1e-4
 
 
-def test_a_slanted_plane_is_no_edge():
+def test_slanted_plane_is_not_an_edge():
     rays = CAMERA.rays()
     planes = np.zeros((30, 40, 4), np.float32)
     planes[..., :3] = 1.2, 0, 0.8  # by 5 % a pixel and more at the near side

@@ -27,7 +27,7 @@ def noise_twin(table, points):
 
 
 def fractal_twin(table, points):
-    """Three octaves, each turned and shifted."""
+    """Three octaves, each rotated and shifted."""
     turns = np.array([[2, 2, -1], [-1, 2, 2], [2, -1, 2]]) / 3
     second = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     third = np.array([[1, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])
@@ -45,21 +45,21 @@ def patterns(material, points, seed=0):
     return np.array([kernels.pattern_at(*table, row, *p) for p in points])
 
 
-def test_noise_equals_its_twin():
+def test_noise_matches_twin():
     table = noise_tables(3)
     points = np.random.default_rng([0, 1]).uniform(-400, 400, (500, 3))
     got = [kernels.value_noise(*table, *p) for p in points]
     np.testing.assert_allclose(got, noise_twin(table, points), atol=1e-12)
 
 
-def test_octaves_equal_their_twin():
+def test_octaves_match_twin():
     table = noise_tables(4)
     points = np.random.default_rng([0, 3]).uniform(-50, 50, (300, 3))
     got = [kernels.fractal_noise(*table, *p) for p in points]
     np.testing.assert_allclose(got, fractal_twin(table, points), atol=1e-11)
 
 
-def test_shading_equals_its_twin():
+def test_shading_matches_twin():
     rng = np.random.default_rng([0, 4])
     faces, rays = 20, 400
     materials = [
@@ -109,7 +109,7 @@ def test_shading_equals_its_twin():
     np.testing.assert_allclose(albedo[hit], wanted, atol=1e-6)
 
 
-def test_noise_has_the_values_of_the_table_on_the_lattice_with_unit_variance():
+def test_lattice_values_are_those_of_table_with_unit_variance():
     table = noise_tables(0)
     assert table[1].std() == pytest.approx(1.0, abs=0.01)
     value = kernels.value_noise(*table, 3.0, -7.0, 11.0)
@@ -117,7 +117,7 @@ def test_noise_has_the_values_of_the_table_on_the_lattice_with_unit_variance():
 
 
 @pytest.mark.parametrize("pattern", ["noise", "wood", "tiles", "print", "speckle"])
-def test_contrast_is_about_the_standard_deviation(pattern):
+def test_contrast_is_approximately_standard_deviation(pattern):
     material = Material("any", 0.5, 0.2, pattern, (0.3, 0.3, 0.3))
     spread = []
     for seed in range(4):
@@ -139,7 +139,7 @@ def test_patterns_are_continuous(pattern):
     assert steps.max() > 1e-5
 
 
-def test_seed_and_place_in_the_list_choose_the_pattern():
+def test_pattern_depends_on_seed_and_list_position():
     material = Material("any", 0.5, 0.2, "noise", (0.3, 0.3, 0.3))
     assert (parameter_rows([material], 5) == parameter_rows([material], 5)).all()
     assert (parameter_rows([material], 5) != parameter_rows([material], 6)).any()
@@ -149,7 +149,7 @@ def test_seed_and_place_in_the_list_choose_the_pattern():
         assert (a == b).all()
 
 
-def test_a_plain_surface_has_no_pattern():
+def test_plain_surface_has_no_pattern():
     row = parameter_rows([Material("any", 0.5, 0.4, "plain")], 0)[0]
     assert row[kernels.CONTRAST] == 0.0
     assert kernels.pattern_at(*noise_tables(0), row, 0.3, 0.2, 0.1) == 0.0

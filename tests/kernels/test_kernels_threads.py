@@ -22,7 +22,7 @@ from tofuse.kernels.threads import (
 
 @pytest.mark.parametrize("size", [0, 1, 2, 15, 16, 17, 1000])
 @pytest.mark.parametrize("chunks", [1, 3, 16])
-def test_chunks_cover_the_work_once_and_evenly(size, chunks) -> None:
+def test_chunks_cover_work_once_and_evenly(size, chunks) -> None:
     bounds = chunk_bounds(size, chunks)
     assert [k for a, b in bounds for k in range(a, b)] == list(range(size))
     assert len(bounds) == min(size, chunks)
@@ -30,7 +30,7 @@ def test_chunks_cover_the_work_once_and_evenly(size, chunks) -> None:
     assert not lengths or max(lengths) - min(lengths) <= 1
 
 
-def test_the_same_sums_for_any_number_of_threads() -> None:
+def test_sums_are_independent_of_threads() -> None:
     values = np.random.default_rng(0).normal(size=100_003).astype(np.float32)
 
     def total() -> bytes:
@@ -44,7 +44,7 @@ def test_the_same_sums_for_any_number_of_threads() -> None:
     assert len(found) == 1
 
 
-def test_work_is_shared_and_results_keep_their_order() -> None:
+def test_chunks_run_in_parallel_and_results_keep_order() -> None:
     both = threading.Barrier(2, timeout=20)
 
     def wait(start: int, _stop: int) -> tuple[int, str]:
@@ -57,14 +57,14 @@ def test_work_is_shared_and_results_keep_their_order() -> None:
     assert len({name for _, name in found}) == 2
 
 
-def test_tasks_keep_their_order() -> None:
+def test_task_results_keep_order() -> None:
     with threads(3):
         assert run_all([lambda k=k: k * k for k in range(20)]) == [k * k for k in range(20)]
         assert run_all([]) == []
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_an_exception_comes_out_and_the_pool_lives_on(count) -> None:
+def test_exception_is_raised_and_pool_survives(count) -> None:
     def fail(start: int, _stop: int) -> int:
         if start >= 5:
             raise ValueError(f"chunk at {start}")
@@ -76,7 +76,7 @@ def test_an_exception_comes_out_and_the_pool_lives_on(count) -> None:
         assert run_chunks(lambda a, b: b - a, 10, chunks=5) == [2] * 5
 
 
-def test_work_inside_a_chunk_does_not_wait_for_ever() -> None:
+def test_nested_chunks_do_not_deadlock() -> None:
     def outer(a: int, _b: int) -> int:
         return sum(run_chunks(lambda c, d: sum(range(c, d)) + a, 8, chunks=8))
 
@@ -86,7 +86,7 @@ def test_work_inside_a_chunk_does_not_wait_for_ever() -> None:
             assert run_chunks(outer, 8, chunks=8) == expected
 
 
-def test_callers_on_several_threads_and_changing_counts() -> None:
+def test_concurrent_callers_with_changing_thread_counts() -> None:
     def job(k: int) -> list[int]:
         found = []
         for count in (1, 2, 3):
@@ -100,7 +100,7 @@ def test_callers_on_several_threads_and_changing_counts() -> None:
     set_thread_count(before)
 
 
-def test_the_count_is_put_back() -> None:
+def test_thread_count_is_restored() -> None:
     before = thread_count()
     with pytest.raises(RuntimeError), threads(before + 1):
         raise RuntimeError
@@ -113,7 +113,7 @@ def test_the_count_is_put_back() -> None:
     assert thread_count() == before
 
 
-def test_work_beside_other_work_is_not_divided() -> None:
+def test_work_in_job_pool_is_serial() -> None:
     def names() -> list[str]:
         return run_chunks(lambda _a, _b: threading.current_thread().name, 8, chunks=8)
 

@@ -36,7 +36,7 @@ def box_points(rng, widths, turn_deg=0.0, shift=(0.0, 0.0)) -> np.ndarray:
     ("widths", "turn"),
     [((0.30, 0.30, 0.40), 0.0), ((0.33, 0.31, 0.42), 0.0), ((0.30, 0.34, 0.40), 25.0)],
 )
-def test_a_box_is_measured_whatever_its_size_and_turn(widths, turn):
+def test_box_fit_recovers_size_and_rotation(widths, turn):
     points = box_points(np.random.default_rng(0), widths, turn, shift=(0.04, -0.03))
     fit = measures.fit_box(points, 0.9, 0.4, 0.3)
     np.testing.assert_allclose(np.sort(fit.widths_m), np.sort(widths[:2]), atol=0.003)
@@ -45,20 +45,20 @@ def test_a_box_is_measured_whatever_its_size_and_turn(widths, turn):
     np.testing.assert_allclose(fit.corners.mean(0), [0.04, -0.03], atol=0.003)
 
 
-def test_a_bent_box_shows_in_the_angles():
+def test_sheared_box_shows_in_angles():
     points = box_points(np.random.default_rng(1), (0.3, 0.3, 0.4))
     points[:, 0] += np.tan(np.radians(6)) * points[:, 1]
     angles = measures.fit_box(points, 0.9, 0.4, 0.3).angles_deg
     np.testing.assert_allclose(np.sort(angles), [84, 84, 96, 96], atol=0.7)
 
 
-def test_a_wall_that_was_not_seen_is_not_made_up():
+def test_unseen_wall_gives_nan():
     points = box_points(np.random.default_rng(1), (0.3, 0.3, 0.4))
     seen = points[points[:, 0] < -0.1]
     assert np.isnan(measures.fit_box(seen, 0.9, 0.4, 0.3).widths_m).all()
 
 
-def test_girth_is_the_length_around():
+def test_girth_is_circumference():
     rng = np.random.default_rng(2)
     angle = rng.uniform(0, 2 * np.pi, 20_000)
     z = rng.uniform(0, 1, 20_000)
@@ -71,7 +71,7 @@ def test_girth_is_the_length_around():
     assert np.isnan(measures.girth_m(body, 5.0, 6.0))
 
 
-def test_path_scores_say_where_a_path_goes_wrong():
+def test_path_score_localizes_errors():
     truth = np.tile(np.eye(4), (11, 1, 1))
     truth[:, 0, 3] = 0.1 * np.arange(11)
     path = truth.copy()
@@ -84,11 +84,11 @@ def test_path_scores_say_where_a_path_goes_wrong():
     assert score.axes_rms_m[1] == pytest.approx(0.01 * np.sqrt(36.9))
     assert np.isnan(score.step_m[[0, 4, 5]]).all()
     np.testing.assert_allclose(score.step_m[[1, 2, 3, 6, 10]], 0.01)
-    # Alignment takes the tilt of the straight path away, nothing else would.
+    # Only alignment removes the tilt of the straight path.
     assert score.ate_m < 0.02
 
 
-def test_turns_are_counted_beyond_a_whole_one():
+def test_rotation_accumulates_beyond_full_turn():
     poses = turning(20.0, 28)  # 540 degrees
     up = np.array([0.0, 1.0, 0.0])
     assert measures.turned_deg(poses, up)[-1] == pytest.approx(540)
@@ -97,7 +97,7 @@ def test_turns_are_counted_beyond_a_whole_one():
     np.testing.assert_allclose(measures.turned_deg(poses, up)[[4, 5, 6, -1]], [80, 80, 120, 540])
 
 
-def test_lines_and_circles():
+def test_straightness_and_circle_radius():
     t = np.linspace(0, 1, 50)
     line = np.stack([t, 2 * t, -t], 1)
     assert measures.straightness_m(line) == pytest.approx(0, abs=1e-12)
@@ -108,7 +108,7 @@ def test_lines_and_circles():
     assert measures.circle_radius_m(arc) == pytest.approx(1.4)
 
 
-def test_displacement_joins_position_and_orientation():
+def test_displacement_combines_position_and_orientation():
     a, b = turning(0, 2), turning(0, 2)
     b[0, 0, 3] = 0.3
     turn = np.zeros(6)
@@ -117,7 +117,7 @@ def test_displacement_joins_position_and_orientation():
     np.testing.assert_allclose(measures.displacement_m(a, b), [0.3, 4 * np.sin(0.05)])
 
 
-def test_the_distance_from_a_surface_is_that_of_the_model():
+def test_surface_error_is_distance_to_model():
     square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
     surface = sample_surface(square, 60_000)
     assert (np.histogram2d(*surface[:, :2].T, bins=4)[0] > 60_000 / 16 * 0.9).all()
@@ -125,7 +125,7 @@ def test_the_distance_from_a_surface_is_that_of_the_model():
     assert measures.surface_error_m(above, cKDTree(surface)) == pytest.approx(0.05, abs=1e-3)
 
 
-def test_frames_of_a_stride_are_those_of_a_recording_with_that_stride():
+def test_strided_frames_match_recording_with_that_stride():
     recorded = record_scene("rail", (2, 3), 1, limit=7)
     assert recorded.made.raw.tolist() == [0, 2, 3, 4, 6]
     ours, reference = recorded.every(3), simulate_recording("rail", every=3, frames=3, seed=1)

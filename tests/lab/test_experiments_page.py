@@ -32,19 +32,19 @@ def read(page):
     return json.loads((page.parent / "results.json").read_text(encoding="utf-8"))
 
 
-def test_a_mean_grade_decides():
+def test_outcome_follows_mean_grade():
     assert graded([1, 1, 1], "").outcome == "agrees"
     assert graded([0, 0, 0], "").outcome == "disagrees"
     assert graded([1, 0, 0.5], "").outcome == "partly"
     assert graded([1, 0.5], "So.").numbers == "So. Holds in 1 of 2 draws."
 
 
-def test_names_are_unique():
+def test_statement_names_are_unique():
     names = [s.name for s in STATEMENTS]
     assert len(set(names)) == len(names) >= 20
 
 
-def test_the_sweep_is_judged_by_its_numbers():
+def test_sweep_is_judged_by_its_errors():
     sigmas = np.arange(1, 11) / 100
     axes = np.ones((10, 2, 6))
     axes[:, 0] += np.array([2, 0.1, 2, 3, 0.5, 0.5]) * np.maximum(sigmas - 0.04, 0)[:, None]
@@ -65,7 +65,7 @@ def test_the_sweep_is_judged_by_its_numbers():
     assert outcome("peaks-threshold", replace(sweep, position=position + 1)) == "partly"
 
 
-def test_peaks_alone_gives_a_page_and_its_numbers(peaks_page):
+def test_peaks_case_gives_page_and_results(peaks_page):
     data = read(peaks_page)
     assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 2)
     assert data["cases"] == {}
@@ -81,7 +81,7 @@ def test_peaks_alone_gives_a_page_and_its_numbers(peaks_page):
     assert "“The yaw-angle is most improved.”" in text
 
 
-def test_a_scene_is_run_in_every_way(rail_page):
+def test_scene_is_run_with_all_variants(rail_page):
     data = read(rail_page)
     runs = data["cases"]["rail"]["runs"]
     ways = {(r["method"], r["stride"], r["guess"]) for r in runs}
@@ -90,7 +90,7 @@ def test_a_scene_is_run_in_every_way(rail_page):
     for run in runs:
         assert run["frames"] == run["with_pose"] == -(-12 // run["stride"])
         assert run["before"]["end_error_m"] < 0.1
-    # The same frames by the true poses lie on the true surface.
+    # With the true poses the same frames lie on the true surface.
     assert data["cases"]["rail"]["true_poses"]["surface_error_m"] < 0.03
     judged = {s["name"]: s for s in data["statements"]}
     assert set(judged) == {s.name for s in STATEMENTS if s.needs == ("rail",)}
@@ -101,14 +101,14 @@ def test_a_scene_is_run_in_every_way(rail_page):
     assert not re.search(r"\bnan\b", re.sub(r"data:[^\"']+", "", text), re.IGNORECASE)
 
 
-def test_one_seed_one_result(peaks_page, tmp_path):
+def test_same_seed_gives_same_result(peaks_page, tmp_path):
     again = run_experiments(tmp_path / "again", cases=("peaks",), seeds=2)
     first, second = read(peaks_page), read(again)
     del first["seconds"], second["seconds"]
     assert first == second
 
 
-def test_only_earlier_experiments_are_replaced(peaks_page, tmp_path):
+def test_only_earlier_experiments_are_overwritten(peaks_page, tmp_path):
     with pytest.raises(OutputError, match="overwrite"):
         run_experiments(peaks_page.parent, cases=("peaks",), seeds=1)
     other = tmp_path / "other"
@@ -124,17 +124,17 @@ def test_only_earlier_experiments_are_replaced(peaks_page, tmp_path):
     assert read(peaks_page) == before
 
 
-def test_unknown_cases_leave_nothing_behind(tmp_path):
+def test_unknown_cases_leave_no_output(tmp_path):
     with pytest.raises(InputError, match="use some of"):
         run_experiments(tmp_path / "new", cases=("peaks", "sofa"))
     assert not (tmp_path / "new").exists()
 
 
-def test_nothing_is_judged_without_its_case():
+def test_statements_without_case_are_not_judged():
     assert judge_all(Results({}, None), ("thesis",)) == ()
 
 
-def test_straightness_follows_the_trajectories():
+def test_straightness_is_judged_by_trajectories():
     class Runs:
         def __init__(self, *runs):
             self.runs = runs

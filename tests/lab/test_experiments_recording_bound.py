@@ -16,7 +16,7 @@ from tofuse.sensor.models import camera_model
 NOISE = Effects.none(shot_noise=True, ambient=1.0)
 
 
-def test_the_noise_is_that_of_the_simulated_camera():
+def test_phase_noise_matches_simulated_camera():
     """Range and log amplitude of one light, measured many times."""
     model = replace(camera_model("sr4000"))
     light, albedo, turn, ambient = 0.15, 0.6, 1.1, 0.4
@@ -38,17 +38,17 @@ def test_the_noise_is_that_of_the_simulated_camera():
     assert np.mean(levels / expected) == pytest.approx(1, abs=0.02)
 
 
-def test_normals_and_slopes_are_of_what_is_seen():
+def test_normals_face_camera_and_slopes_follow_albedo():
     made = plan("empty-room", effects=NOISE, frames=1)
     view = seen_by(made, int(made.raw[0]))
     np.testing.assert_allclose(np.linalg.norm(view.normals, axis=1), 1, atol=1e-5)
     assert ((view.points * view.normals).sum(1) < 0).all()
     plain = plan("empty-room", effects=NOISE, frames=1, texture=False)
-    # One albedo: no slope of it anywhere.
+    # With uniform albedo its slope is zero everywhere.
     assert np.abs(seen_by(plain, int(plain.raw[0])).slopes).max() < 1e-6
 
 
-def test_albedo_and_light_make_the_bound_lower():
+def test_albedo_and_light_lower_the_bound():
     made = plan("room", effects=NOISE, frames=4)
     distances, both = trajectory_bounds(made, every=4)
     assert 0 < both.mean < distances.mean

@@ -1,4 +1,4 @@
-"""Feature-based registration without a guess: consensus on a motion, and images."""
+"""Feature-based registration without a guess: sample consensus, and images."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def images():
 
 
 def made_pairs(right, wrong, *, seed=0, sigma=0.01, spread=1.0):
-    """Pairs of which some are right; the others are of points taken at random."""
+    """Pairs of which some are inliers; the others join random points."""
     rng = np.random.default_rng([8, seed])
     T = se3.exp(rng.normal(0, 0.8, 6))
     p = rng.uniform(-spread, spread, (right + wrong, 3)) + np.array([0, 0, 3])
@@ -86,12 +86,12 @@ def made_pairs(right, wrong, *, seed=0, sigma=0.01, spread=1.0):
     return Pairs(p, q, s**2), T
 
 
-# What pairs agree on
+# Consensus
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(("right", "wrong"), [(60, 0), (40, 60), (30, 120)])
-def test_the_right_pairs_are_told_from_the_wrong(way, right, wrong):
+def test_inliers_are_separated_from_outliers(way, right, wrong):
     for seed in range(3):
         pairs, T = made_pairs(right, wrong, seed=seed)
         missed = np.linalg.norm(se3.transform(T, pairs.source) - pairs.target, axis=1)
@@ -102,11 +102,11 @@ def test_the_right_pairs_are_told_from_the_wrong(way, right, wrong):
         assert turn < 0.6
         assert np.count_nonzero(found[0].inliers[:right]) >= 0.95 * most
         assert np.count_nonzero(found[0].inliers[right:]) <= 0.05 * wrong
-        # Nothing else comes near.
+        # No rival comes close.
         assert all(rival.count < 0.5 * right for rival in found[1:])
 
 
-def test_compatible_pairs_are_found_among_forty_times_as_many():
+def test_compatible_pairs_are_found_among_many_outliers():
     pairs, T = made_pairs(20, 780, sigma=0.005, spread=1.5)
     found = consensus(pairs, ConsensusOptions("compatible"), np.random.default_rng(0))[0]
     assert off(found.T_target_source, T)[0] < 0.02
@@ -114,8 +114,8 @@ def test_compatible_pairs_are_found_among_forty_times_as_many():
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_each_pair_is_judged_by_its_own_noise(way):
-    """Half of the points are ten times as noisy: they are inliers too, and hardly weigh."""
+def test_pairs_are_weighted_by_their_noise(way):
+    """Half of the points are much noisier: they are inliers too, but have little weight."""
     sigma = np.where(np.arange(80) % 2, 0.003, 0.05)
     errors = []
     for seed in range(5):
@@ -131,8 +131,8 @@ def test_each_pair_is_judged_by_its_own_noise(way):
     assert mine < 0.4 * plain
 
 
-def test_the_least_squares_are_those_of_a_slow_search():
-    """No small motion makes the weighted sum smaller."""
+def test_least_squares_motion_is_minimum():
+    """No small motion decreases the weighted sum."""
     pairs, _ = made_pairs(12, 0, sigma=np.linspace(0.01, 0.1, 12))
     T = motion_of(pairs)
 
@@ -145,7 +145,7 @@ def test_the_least_squares_are_those_of_a_slow_search():
             assert cost(T @ se3.exp(step * np.eye(6)[axis])) > cost(T)
 
 
-def test_information_is_the_inverse_of_the_scatter():
+def test_information_is_inverse_covariance():
     pairs, T = made_pairs(40, 0, sigma=np.linspace(0.002, 0.03, 40))
     rng = np.random.default_rng(4)
     exact = se3.transform(T, pairs.source)
@@ -159,23 +159,23 @@ def test_information_is_the_inverse_of_the_scatter():
     assert np.abs(np.linalg.eigvalsh(whitened @ seen @ whitened.T) - 1).max() < 0.4
 
 
-def test_points_on_a_line_leave_the_turn_about_it_loose():
+def test_collinear_points_leave_rotation_about_line_unconstrained():
     along = np.linspace(-1, 1, 30)[:, None] * [1.0, 0, 0] + [0, 0, 2.0]
     pairs = Pairs(along, along, np.full(30, 1e-4))
     (loose,) = loose_directions(information_of(pairs, np.eye(4)))
-    # About the line through z = 2: the camera swings round it.
+    # Rotation about the line through z = 2, which also translates the camera.
     expected = np.array([0, 2.0, 0, 1.0, 0, 0])
     assert abs(loose @ expected) / np.linalg.norm(expected) > 0.999
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_pairs_that_agree_on_nothing_are_refused(way):
+def test_inconsistent_pairs_are_rejected(way):
     pairs, _ = made_pairs(0, 40)
     with pytest.raises(RegistrationError, match="of 40 pairs of points not even 10 agree"):
         consensus(pairs, ConsensusOptions(way, inliers=10), np.random.default_rng(0))
 
 
-def test_one_seed_gives_one_result():
+def test_same_seed_gives_same_result():
     pairs, _ = made_pairs(40, 60)
     a, b = (consensus(pairs, ConsensusOptions(), np.random.default_rng(3))[0] for _ in range(2))
     np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
@@ -185,24 +185,24 @@ def test_one_seed_gives_one_result():
 
 
 @pytest.mark.parametrize("detector", ["sift", "orb", "fast"])
-def test_two_images_far_apart_are_registered_without_a_guess(images, detector):
+def test_distant_images_are_registered_without_guess(images, detector):
     found = tofuse.register(*images, method=Features(detector))
     shift, turn = off(found.T_target_source)
-    assert shift < (0.08 if detector == "orb" else 0.05)  # places it to a pixel of a coarse image
+    assert shift < (0.08 if detector == "orb" else 0.05)  # localizes to a pixel of a coarse image
     assert turn < 1.5
     assert found.margin > 0.2
     assert found.correspondences >= 10
     assert np.linalg.eigvalsh(found.information).min() > 0
 
 
-def test_the_pose_is_as_good_as_it_says(images):
+def test_pose_error_agrees_with_information(images):
     found = tofuse.register(*images, method=Features("sift"))
     xi = se3.log(se3.inverse(found.T_target_source) @ TRUE)
-    # Six degrees of freedom; points of one surface share errors, which widens it.
+    # Six degrees of freedom; correlated errors of one surface enlarge it.
     assert xi @ found.information @ xi < 60
 
 
-def test_colour_serves_as_well(images):
+def test_colour_images_are_registered(images):
     colored = []
     for k, frame in enumerate(images):
         r2 = frame.radial_range**2
@@ -218,15 +218,15 @@ def test_colour_serves_as_well(images):
         tofuse.register(*colored, method=Features(channel="albedo"))
 
 
-def test_the_light_does_not_fall_with_the_distance():
-    """One wall, oblique: raw amplitude falls along it, what is looked at does not."""
+def test_albedo_image_is_independent_of_distance():
+    """Raw amplitude falls with distance, the albedo image does not."""
     frame = poster(FIRST, seed=1, plain=True)
     assert np.corrcoef(frame.amplitude_image.ravel(), frame.depth.ravel())[0, 1] < -0.8
     image = channel_image(frame, "albedo").astype(float)
     assert abs(np.corrcoef(image.ravel(), frame.depth.ravel())[0, 1]) < 0.2
 
 
-def test_points_lie_where_the_pixels_see_them(images):
+def test_keypoints_lie_on_the_surface(images):
     frame = images[1]
     surface = prepare_view(frame, SurfaceOptions())
     found = keypoints(frame, surface, detector="sift", channel="auto", count=300, blur_px=0.7)
@@ -240,7 +240,7 @@ def test_points_lie_where_the_pixels_see_them(images):
 
 
 @pytest.mark.parametrize("detector", ["sift", "orb", "fast"])
-def test_images_of_nothing_are_refused(detector):
+def test_blank_images_are_rejected(detector):
     blank = [poster(T, seed=k, plain=True) for k, T in enumerate((SECOND, FIRST))]
     blank = [replace(b, amplitude_image=np.full_like(b.depth, 100)) for b in blank]
     blank = [replace(b, amplitude_kind="range_compensated") for b in blank]
@@ -248,15 +248,15 @@ def test_images_of_nothing_are_refused(detector):
         tofuse.register(*blank, method=Features(detector))
 
 
-def test_what_both_images_contradict_is_refused(images):
-    """The light is that of the first view, the surfaces are elsewhere."""
+def test_contradicted_pose_is_rejected(images):
+    """The amplitude matches the other view, but the surfaces do not."""
     source, target = images
     deeper = replace(target, depth=target.depth[:, ::-1] * np.float32(1.0))
     with pytest.raises(RegistrationError, match="agree"):
         tofuse.register(source, deeper, method=Features())
 
 
-def test_clouds_have_no_image(images):
+def test_clouds_are_rejected(images):
     cloud = CloudFrame(0, 0.0, images[0].points)
     with pytest.raises(RegistrationError, match="is not an image"):
         tofuse.register(cloud, cloud, method=Features())

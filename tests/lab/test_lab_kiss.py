@@ -39,7 +39,7 @@ def path(n):
     return np.array(out)
 
 
-def test_a_path_is_followed_with_nothing_tuned():
+def test_path_is_tracked_with_default_parameters():
     poses = path(12)
     tracker = Kiss().start(0)
     steps = [tracker.push(f) for f in frames(poses)]
@@ -55,12 +55,12 @@ def test_a_path_is_followed_with_nothing_tuned():
     assert np.linalg.eigvalsh(last.information).min() > 0
 
 
-def test_the_threshold_is_three_times_what_predictions_err():
-    """Eqs 3 to 5: the rms of the deviations that are large enough, and the first value before."""
+def test_threshold_follows_prediction_errors():
+    """Eqs 3 to 5: rms of the sufficiently large deviations; the initial value before any."""
     threshold = AdaptiveThreshold(range_m=5.0, smallest=0.01, initial=0.2)
     assert threshold.sigma == 0.2
     threshold.learn(np.eye(4))
-    assert threshold.sigma == 0.2  # too small to say anything
+    assert threshold.sigma == 0.2  # too small to count
     theta, shift = 0.1, 0.05
     threshold.learn(se3.exp([0, 0, 0, 0, theta, 0]) + np.pad([[shift]], ((0, 3), (3, 0))))
     delta = 2 * 5 * np.sin(theta / 2) + shift
@@ -69,7 +69,7 @@ def test_the_threshold_is_three_times_what_predictions_err():
     assert threshold.sigma == pytest.approx(np.sqrt((delta**2 + 0.3**2) / 2))
 
 
-def test_frames_without_points_and_of_another_place_are_lost():
+def test_empty_and_unrelated_frames_are_lost():
     poses = path(4)
     given = frames(poses)
     empty = CloudFrame(2, 2.0, np.zeros((0, 3), np.float32))
@@ -81,7 +81,7 @@ def test_frames_without_points_and_of_another_place_are_lost():
     assert "registered" in steps[3].reason
 
 
-def test_one_point_stays_in_each_voxel():
+def test_one_point_is_kept_per_voxel():
     p = rng(0).uniform(-1, 1, (9000, 3))
     kept = first_of_voxels(p, 0.25)
     cells = np.floor(kept / 0.25).astype(int)

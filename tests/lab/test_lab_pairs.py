@@ -60,7 +60,7 @@ def icp(metric, reach=3.0, steps=100, resolution=0.03):
 
 
 @pytest.mark.parametrize("method", EVERY, ids=parts.name_of)
-def test_a_small_motion_is_found(method):
+def test_small_motion_is_recovered(method):
     for k in range(2):
         T = small(k)
         source, target = view(stone(3000, 1), T), view(stone(3000, 0))
@@ -72,20 +72,20 @@ def test_a_small_motion_is_found(method):
 
 
 @pytest.mark.parametrize("method", EVERY, ids=parts.name_of)
-def test_the_same_draw_gives_the_same_pose(method):
+def test_same_seed_gives_same_pose(method):
     source, target = view(stone(2000, 1), small(0)), view(stone(2000, 0))
     one, other = (method.register(source, target, np.eye(4), rng(3)) for _ in range(2))
     np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
 
 
 @pytest.mark.parametrize("method", [LeastSquaresMatching(0.03), Ndt(0.03)], ids=parts.name_of)
-def test_views_that_are_far_apart_are_refused(method):
+def test_distant_views_are_rejected(method):
     far = view(stone(2000, 1) + np.array([50, 0, 0]))
     with pytest.raises(RegistrationError, match="points"):
         method.register(far, view(stone(2000, 0)), np.eye(4), rng())
 
 
-def test_comprehensive_pairs_are_those_of_the_whole_lookup_matrix():
+def test_comprehensive_pairs_match_full_lookup_matrix():
     a, b = rng(0).uniform(size=(60, 3)), rng(1).uniform(size=(45, 3))
     table = cdist(a, b)
     expected = []
@@ -101,8 +101,8 @@ def test_comprehensive_pairs_are_those_of_the_whole_lookup_matrix():
     assert near.distance.max() <= 0.1
 
 
-def test_cicp_is_nearer_among_noise_and_takes_fewer_steps():
-    """What the paper claims of pairs that no two points share: points seen twice, with noise."""
+def test_cicp_is_more_accurate_in_fewer_iterations_with_noise():
+    """The paper's claim for one-to-one pairs: the same points in both views, with noise."""
     comprehensive, closest = [], []
     for k in range(4):
         T = small(k, 8)
@@ -116,7 +116,7 @@ def test_cicp_is_nearer_among_noise_and_takes_fewer_steps():
     assert (np.median(comprehensive, 0) < 0.7 * np.median(closest, 0)).all()
 
 
-def test_ls3d_finds_the_scale_where_it_is_free_and_says_how_well():
+def test_ls3d_estimates_free_scale_and_its_precision():
     T = small(1, 4)
     target = view(bumpy_ball(6000, 0))
     for scale in (0.97, 1.02):
@@ -133,8 +133,8 @@ def test_ls3d_finds_the_scale_where_it_is_free_and_says_how_well():
         assert free.rms_m < 0.5 * rigid.rms_m
 
 
-def test_ls3d_leaves_out_what_is_no_part_of_the_other_surface():
-    """Outliers of the template are refused by their residuals (section 2.3)."""
+def test_ls3d_rejects_outliers_of_template():
+    """Outliers of the template are rejected by their residuals (section 2.3)."""
     T = small(2, 4)
     target = view(relief(4000, 0))
     wrong = relief(400, 2) + np.array([0, 0, 0.08])  # a second sheet, all on one side
@@ -145,7 +145,7 @@ def test_ls3d_leaves_out_what_is_no_part_of_the_other_surface():
     assert error(every, T)[0] > 2 * error(kept, T)[0]
 
 
-def test_ls3d_with_intensity_does_not_slide_along_a_wall():
+def test_ls3d_with_intensity_does_not_slide_along_wall():
     """Akca 2007: the intensity is a second surface that constrains what the first does not."""
 
     def wall(seed, T):
@@ -165,7 +165,7 @@ def test_ls3d_with_intensity_does_not_slide_along_a_wall():
     assert error(lit, T)[0] < 0.003
 
 
-def test_ndt_finds_motions_from_which_point_to_plane_does_not_return():
+def test_ndt_has_larger_convergence_basin_than_point_to_plane():
     """Magnusson 2009: coarse cells reach further than closest points."""
     target = view(relief(5000, 0))
     good = {"ndt": 0, "plane": 0}
@@ -180,7 +180,7 @@ def test_ndt_finds_motions_from_which_point_to_plane_does_not_return():
     assert good["ndt"] >= good["plane"] + 2
 
 
-def test_ndt_climbs_by_the_derivatives_of_its_score():
+def test_ndt_derivatives_match_finite_differences():
     from tofuse.lab.methods.ndt import _cells, _score
 
     cells = _cells(stone(3000, 0), 0.2)
@@ -200,8 +200,8 @@ def test_ndt_climbs_by_the_derivatives_of_its_score():
 
 
 @pytest.mark.parametrize("away", [-0.05, 0.08])
-def test_squared_distance_is_right_to_second_order(away):
-    """The distance from a ball, about a point in front of it or behind its surface."""
+def test_squared_distance_is_second_order_accurate(away):
+    """Distance from a sphere, near a point in front of or behind its surface."""
     ball = 0.5 * directions(6000, 0) + [0, 0, 2.0]
     normals = (ball - [0, 0, 2.0]) / 0.5
     target = CloudFrame(0, 0.0, ball.astype(np.float32), normals=normals.astype(np.float32))
@@ -219,11 +219,11 @@ def test_squared_distance_is_right_to_second_order(away):
     plane = ((x - ball[j]) @ outward) ** 2
     if away > 0:
         assert np.abs(stated - true).max() < 0.2 * np.abs(plane - true).max()
-    else:  # a negative coefficient is left out
+    else:  # a negative coefficient is set to zero
         np.testing.assert_allclose(stated, plane, atol=2e-6)
 
 
-def test_squared_distance_needs_fewer_steps_than_points_and_gets_as_near_as_planes():
+def test_squared_distance_is_accurate_in_fewer_steps_than_point_to_point():
     target = view(stone(3000, 0))
     for k in range(3):
         T = small(k, 8)
@@ -234,7 +234,7 @@ def test_squared_distance_needs_fewer_steps_than_points_and_gets_as_near_as_plan
         assert 2 * here.iterations < point.iterations
 
 
-def test_curvatures_of_a_cylinder():
+def test_principal_curvatures_of_cylinder():
     angle, z = rng(0).uniform(-1, 1, 4000), rng(1).uniform(-0.5, 0.5, 4000)
     tube = np.column_stack([0.3 * np.sin(angle), z, 1.0 - 0.3 * np.cos(angle)])
     frame = CloudFrame(0, 0.0, tube.astype(np.float32))
@@ -247,7 +247,7 @@ def test_curvatures_of_a_cylinder():
     assert np.median(along) > 0.99
 
 
-def test_imls_is_nearer_to_the_surface_than_the_plane_of_one_point():
+def test_imls_is_nearer_to_surface_than_plane_of_nearest_point():
     """Deschaud 2018: the noise of the target is averaged."""
     target, true = points_of(relief(4000, 0, noise=0.006)), relief(500, 1, -0.4, 0.4, noise=0.0)
     alignment = Alignment(points_of(true), target, 0.015, np.eye(4), true)
@@ -259,7 +259,7 @@ def test_imls_is_nearer_to_the_surface_than_the_plane_of_one_point():
     assert np.isnan(Implicit().distance(true + 5, alignment)).all()
 
 
-def test_imls_registers():
+def test_imls_registration_is_accurate():
     for k in range(3):
         T = small(k, 3, 0.01)
         source = view(relief(3000, 10 + k, noise=0.004), T)
@@ -268,8 +268,8 @@ def test_imls_registers():
         assert error(found, T)[0] < 0.004
 
 
-def test_gnc_finds_the_motion_though_three_of_four_pairs_are_wrong():
-    """Yang et al. 2020: 70 to 80 % of wrong correspondences, and no guess which they are."""
+def test_gnc_is_robust_to_75_percent_outliers():
+    """Yang et al. 2020: robust to 70 to 80 % of outlier correspondences."""
     cloud = bumpy_ball(400, 0)
     T = turn([1, 2, 3], 60)
     moved = transform_points(se3.inverse(T), cloud) + rng(4).normal(0, 0.002, cloud.shape)
@@ -286,7 +286,7 @@ def test_gnc_finds_the_motion_though_three_of_four_pairs_are_wrong():
     assert np.linalg.eigvalsh(information).min() > 0
 
 
-def test_without_wrong_pairs_gnc_is_least_squares():
+def test_gnc_without_outliers_is_least_squares():
     cloud = bumpy_ball(300, 0)
     alignment = alignment_of(cloud + rng(1).normal(0, 0.001, cloud.shape), cloud)
     n = np.arange(300)
@@ -296,16 +296,16 @@ def test_without_wrong_pairs_gnc_is_least_squares():
     )
 
 
-def test_the_adaptive_loss_takes_its_shape_from_the_residuals():
+def test_adaptive_loss_shape_follows_residuals():
     normal = rng(0).normal(size=20000)
     cauchy = rng(1).standard_cauchy(20000)
-    spoilt = np.where(rng(2).uniform(size=20000) < 0.3, rng(3).uniform(-9, 9, 20000), normal)
+    contaminated = np.where(rng(2).uniform(size=20000) < 0.3, rng(3).uniform(-9, 9, 20000), normal)
     assert shape_of(normal) == 2
     assert -0.75 <= shape_of(cauchy * np.sqrt(2)) <= 0.75
-    assert shape_of(spoilt) < shape_of(normal)
+    assert shape_of(contaminated) < shape_of(normal)
 
 
-def test_the_adaptive_loss_is_as_good_as_squares_and_better_among_outliers():
+def test_adaptive_loss_matches_least_squares_and_is_robust():
     T = small(1, 3, 0.01)
     for outliers, factor in ((0, 1.3), (1500, 0.5)):
         source = view(relief(3000, 1, outliers=outliers), T)

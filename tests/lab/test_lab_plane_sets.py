@@ -28,13 +28,13 @@ def in_view(T_world_camera):
     return np.array(out)
 
 
-def test_planes_of_a_view_are_those_of_the_scene():
+def test_detected_planes_match_scene():
     view = prepare_view(seen(A, seed=1), SurfaceOptions())
     found = detect_planes(view, np.random.default_rng(0))
     assert len(found) >= 3
     assert [p.fraction for p in found[:3]] == sorted((p.fraction for p in found[:3]), reverse=True)
     planes = np.array([[*p.normal, p.offset] for p in found])
-    for *normal, offset in in_view(A)[:2]:  # of the other wall hardly anything is seen
+    for *normal, offset in in_view(A)[:2]:  # the other wall is barely in view
         angle = np.degrees(np.arccos(np.clip(planes[:, :3] @ normal, -1, 1)))
         k = int(np.argmin(angle))
         assert angle[k] < 1.0
@@ -42,7 +42,7 @@ def test_planes_of_a_view_are_those_of_the_scene():
     assert all(p.rms_m < 0.02 for p in found)
 
 
-def test_a_furnished_corner_is_registered_without_a_guess():
+def test_furnished_corner_is_registered_without_guess():
     found = tofuse.register(seen(B, seed=1), seen(A, seed=2), method=PlaneSets())
     shift, angle = error(found.T_target_source, TRUE)
     assert shift < 0.05
@@ -53,7 +53,7 @@ def test_a_furnished_corner_is_registered_without_a_guess():
     assert np.linalg.eigvalsh(found.information).min() > 0
 
 
-def test_a_floor_alone_leaves_three_directions_to_the_guess():
+def test_single_floor_is_degenerate_in_three_directions():
     source, target = (seen(T, boxes=[], walls=False, seed=k) for k, T in ((1, B), (2, A)))
     guess = TRUE @ se3.exp(np.array([0.1, 0.05, -0.1, 0.05, 0.1, -0.05]))
     found = tofuse.register(source, target, guess=guess, method=PlaneSets())
@@ -63,25 +63,25 @@ def test_a_floor_alone_leaves_three_directions_to_the_guess():
     offset = floor[3] + turned @ found.T_target_source[:3, 3]
     assert abs(offset - in_view(A)[0, 3]) < 0.01
     assert found.unobservable.shape == (3, 6)
-    # Along the floor, and turning upon it.
+    # Translation along the floor, and rotation about its normal.
     basis = np.vstack([np.zeros((3, 6))])
     basis[0, 3:] = floor[:3]
     basis[1:, :3] = np.linalg.svd(floor[None, :3])[2][1:]
     np.testing.assert_allclose(np.abs(np.linalg.det(found.unobservable @ basis.T)), 1, atol=0.02)
-    # These are as guessed.
+    # These follow the guess.
     along = basis[1:, :3] @ (se3.inverse(guess) @ found.T_target_source)[:3, 3]
     assert np.abs(along).max() < 0.03
     gap = se3.log(se3.inverse(guess) @ found.T_target_source)
     assert abs(gap[3:] @ floor[:3]) < 0.02
 
 
-def test_one_seed_gives_one_result():
+def test_same_seed_gives_same_result():
     views = seen(B, seed=1), seen(A, seed=2)
     a, b = (tofuse.register(*views, method=PlaneSets(), seed=4) for _ in range(2))
     np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
 
 
-def test_views_without_planes_are_refused():
+def test_views_without_planes_are_rejected():
     rough = seen(A, sigma=0.4, seed=1)
     with pytest.raises(RegistrationError, match=r"no plane|contradicts"):
         tofuse.register(rough, rough, method=PlaneSets(min_fraction=0.3))
@@ -90,7 +90,7 @@ def test_views_without_planes_are_refused():
         tofuse.register(cloud, cloud, method=PlaneSets())
 
 
-def test_what_has_no_light_has_planes():
+def test_features_reject_frames_without_amplitude():
     views = seen(B, seed=1), seen(A, seed=2)
     with pytest.raises(RegistrationError, match="has no amplitude nor colour"):
         tofuse.register(*views, method=Features())

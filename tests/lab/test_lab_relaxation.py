@@ -17,7 +17,7 @@ from tofuse.posegraph.sparse import PairSystem
 
 
 def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph, Float64]:
-    """A camera that walks once round, each step of its own uncertainty; and the true poses."""
+    """A camera on a closed path, each step with its own uncertainty; and the true poses."""
     rng = np.random.default_rng(seed)
     step = se3.exp([0.2, 0.0, 0.03, 0.01, 2 * np.pi / n, 0.0])
     truth = np.array([np.linalg.matrix_power(step, k) for k in range(n)])
@@ -36,7 +36,7 @@ def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph
     return build_graph(range(n), np.array(poses), edges, closing), truth
 
 
-def test_one_linear_system_is_the_whole_of_a_linear_problem():
+def test_linear_problem_is_solved_in_one_step():
     """Without rotation one step is the weighted mean, by dense least squares."""
     rng = np.random.default_rng(0)
     n = 7
@@ -46,7 +46,7 @@ def test_one_linear_system_is_the_whole_of_a_linear_problem():
     for (i, j), A in zip(pairs, root, strict=True):
         T = np.eye(4)
         T[:3, 3] = rng.normal(size=3)
-        information = np.eye(6) * 1e13  # nothing turns
+        information = np.eye(6) * 1e13  # rotations are fixed
         information[:3, :3] = A.T @ A
         edges.append(Measured(i, j, T, information))
         row = np.zeros((3, 3 * n))
@@ -57,13 +57,13 @@ def test_one_linear_system_is_the_whole_of_a_linear_problem():
     expected = np.linalg.lstsq(np.concatenate(rows)[:, 3:], np.concatenate(values), rcond=None)[0]
     done = LuMilios(max_iterations=1).optimise(graph)
     np.testing.assert_allclose(done.graph.poses[1:, :3, 3].ravel(), expected, atol=1e-9)
-    # The second finds nothing left to do.
+    # The second step finds nothing to improve.
     again = LuMilios().optimise(graph)
     assert again.converged
     np.testing.assert_allclose(again.graph.poses, done.graph.poses, atol=1e-7)
 
 
-def test_the_linear_system_is_that_of_the_paper():
+def test_linear_system_matches_paper():
     """G X = B, block by block."""
     graph, _ = ring(8, 0.01, loops=2)
     system = PairSystem(8, graph.edges)
@@ -82,7 +82,7 @@ def test_the_linear_system_is_that_of_the_paper():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_small_loops_converge_to_the_minimum(seed):
+def test_small_loops_converge_to_minimum(seed):
     graph, _ = ring(30, 0.01, seed, loops=4)
     done = LuMilios(tolerance=1e-12).optimise(graph)
     assert done.converged
@@ -94,7 +94,7 @@ def test_small_loops_converge_to_the_minimum(seed):
     np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
 
 
-def test_relaxation_that_only_makes_it_worse_leaves_the_input():
+def test_relaxation_never_increases_the_error():
     graph, _ = ring(20, 0.01)
     best = minimise(graph, Settings("none", tolerance=1e-14)).graph
     done = LuMilios().optimise(best)
@@ -102,7 +102,7 @@ def test_relaxation_that_only_makes_it_worse_leaves_the_input():
     np.testing.assert_allclose(done.graph.poses, best.poses, atol=1e-6)
 
 
-def test_the_ends_of_a_loop_meet():
+def test_elch_closes_the_loop():
     graph, _ = ring(40, 0.02)
     done = Elch().optimise(graph).graph
     assert np.abs(graph.residuals()[-1]).max() > 0.02
@@ -110,7 +110,7 @@ def test_the_ends_of_a_loop_meet():
     np.testing.assert_array_equal(done.poses[0], graph.poses[0])
 
 
-def test_the_error_is_spread_in_proportion_to_the_covariances():
+def test_elch_distributes_error_by_covariance():
     """Each pose moves by the share of the uncertainty that lies before it on the loop."""
     graph, _ = ring(25, 0.02)
     done = Elch().optimise(graph).graph
@@ -124,8 +124,8 @@ def test_the_error_is_spread_in_proportion_to_the_covariances():
     np.testing.assert_allclose(angle, share * angle[-1], atol=1e-12)
 
 
-def test_what_hangs_on_a_loop_moves_with_it():
-    """Poses before the loop stay, those after it move as its end, a branch as its root."""
+def test_branches_of_loop_move_with_it():
+    """Poses before the loop are fixed, those after it move as its end, a branch as its root."""
     relative = np.tile(se3.exp([1.0, 0, 0, 0, 0, 0]), (9, 1, 1))
     loop = Measured(2, 6, se3.exp([4.4, 0, 0, 0, 0, 0]), np.eye(6))
     graph = chain(relative, [loop])
@@ -141,8 +141,8 @@ def test_what_hangs_on_a_loop_moves_with_it():
     np.testing.assert_allclose(moved, expected, atol=1e-12)
 
 
-def test_loops_after_the_first_go_by_way_of_it():
-    """A closed loop is short cut: what lies beside it is not bent again."""
+def test_later_loops_use_closed_loops_as_shortcuts():
+    """A closed loop is a shortcut: poses beside it are not moved again."""
     relative = np.tile(se3.exp([1.0, 0, 0, 0, 0, 0]), (19, 1, 1))
     first = Measured(0, 10, se3.exp([10.0, 0, 0, 0, 0, 0]), np.eye(6) * 1e6)
     second = Measured(0, 19, se3.exp([19.9, 0, 0, 0, 0, 0]), np.eye(6))
@@ -151,7 +151,7 @@ def test_loops_after_the_first_go_by_way_of_it():
     np.testing.assert_allclose(moved[10:], np.linspace(0, 0.9, 10), atol=1e-5)
 
 
-def test_a_loop_between_parts_that_nothing_joins_is_passed_over():
+def test_loops_between_unconnected_components_are_skipped():
     poses = np.tile(np.eye(4), (4, 1, 1))
     T = se3.exp([1.0, 0, 0, 0, 0, 0])
     graph = build_graph(
@@ -164,7 +164,7 @@ def test_a_loop_between_parts_that_nothing_joins_is_passed_over():
 
 
 @pytest.mark.parametrize("optimiser", [Elch(), LuMilios()])
-def test_nothing_to_do(optimiser):
+def test_trivial_graphs_are_unchanged(optimiser):
     for graph in (PoseGraph.empty(), chain(np.zeros((0, 4, 4)))):
         done = optimiser.optimise(graph)
         np.testing.assert_array_equal(done.graph.poses, graph.poses)

@@ -16,7 +16,7 @@ from tofuse.posegraph.levenberg import LevenbergMarquardt
 
 
 def grid(side: int, noise: float, seed: int) -> PoseGraph:
-    """A camera that walks to and fro over a square, tied to the lane before at every step."""
+    """A camera on a boustrophedon path over a square, with a loop to the previous lane per step."""
     rng = np.random.default_rng(seed)
     truth = []
     for row in range(side):
@@ -46,7 +46,7 @@ def grid(side: int, noise: float, seed: int) -> PoseGraph:
     return build_graph(range(n), np.array(poses), steps, loops)
 
 
-def test_it_comes_near_the_least_squares_from_a_chain():
+def test_sgd_approaches_least_squares_from_odometry():
     graph = grid(6, 0.03, 0)
     least = LevenbergMarquardt().optimise(graph).graph.chi2()
     found = Stochastic().optimise(graph)
@@ -55,8 +55,8 @@ def test_it_comes_near_the_least_squares_from_a_chain():
     np.testing.assert_array_equal(found.graph.poses[0], graph.poses[0])
 
 
-def test_it_comes_near_from_poses_that_say_nothing():
-    """A few rounds take out nearly all of the error, and least squares goes on from there."""
+def test_sgd_converges_from_random_poses():
+    """A few rounds remove most of the error, and least squares converges from there."""
     for seed in range(3):
         graph = grid(5, 0.05, seed)
         rng = np.random.default_rng(100 + seed)
@@ -69,7 +69,7 @@ def test_it_comes_near_from_poses_that_say_nothing():
         assert LevenbergMarquardt().optimise(near).graph.chi2() < 1.05 * least
 
 
-def test_exact_edges_are_satisfied_whatever_the_order_of_their_ends():
+def test_exact_edges_are_satisfied_in_either_direction():
     graph = grid(4, 1e-9, 1)
     edges = graph.edges[:, ::-1].copy()
     turned = replace(graph, edges=edges, measurements=se3.inverse(graph.measurements))
@@ -79,7 +79,7 @@ def test_exact_edges_are_satisfied_whatever_the_order_of_their_ends():
     np.testing.assert_allclose(found.graph.poses, graph.poses, atol=0.1)
 
 
-def test_graphs_with_nothing_to_do_and_bad_ones():
+def test_trivial_and_invalid_graphs():
     assert Stochastic().optimise(PoseGraph.empty()).converged
     graph = grid(3, 0.05, 0)
     broken = graph.with_poses(graph.poses * np.nan)

@@ -47,7 +47,7 @@ def small(seed):
 
 
 @pytest.mark.parametrize("overlap", [0.5, 0.65])
-def test_tricp_finds_the_overlap_and_the_motion_among_outliers(overlap):
+def test_tricp_estimates_overlap_and_motion_with_outliers(overlap):
     low = 0.5 - overlap  # of the source, where the target ends at 0.5
     for k in range(2):
         T = small(k)
@@ -62,7 +62,7 @@ def test_tricp_finds_the_overlap_and_the_motion_among_outliers(overlap):
         assert error(plain, T)[0] > 0.1
 
 
-def test_tricp_with_the_overlap_given_trims_to_it():
+def test_tricp_trims_to_given_overlap():
     T = small(0)
     source = view(relief(2000, 2, -0.1, 0.9), T)
     target = view(relief(2000, 1, -0.5, 0.5))
@@ -71,7 +71,7 @@ def test_tricp_with_the_overlap_given_trims_to_it():
     assert error(found, T)[0] < 0.02
 
 
-def test_tricp_prefers_all_of_two_views_that_overlap_fully():
+def test_tricp_keeps_all_points_with_full_overlap():
     T = small(3)
     found = Tricp(0.015, points=600).register(
         view(stone(3000, 1, 0.002), T), view(stone(3000, 0, 0.002)), np.eye(4), rng()
@@ -89,7 +89,7 @@ def textured_wall(n, seed, T=None):
     return view(points, T, amplitude=amplitude.astype(np.float32))
 
 
-def test_iccp_registers_a_wall_by_its_texture_where_icp_slides():
+def test_iccp_registers_textured_wall_where_icp_slides():
     T = se3.exp([0.04, -0.03, 0, 0, 0, 0.05])
     for k in range(3):
         target, source = textured_wall(4000, k), textured_wall(4000, 100 + k, T)
@@ -101,7 +101,7 @@ def test_iccp_registers_a_wall_by_its_texture_where_icp_slides():
         assert error(plain, T)[0] > 0.012
 
 
-def test_iccp_finds_partners_that_a_rejector_loses():
+def test_iccp_finds_correspondences_that_rejector_loses():
     T = se3.exp([0.08, -0.06, 0, 0, 0, 0.05])
     target, source = textured_wall(4000, 0), textured_wall(4000, 1, T)
     first = replace(Iccp(0.015, points=1500, ratio=1.1), max_iterations=1)
@@ -116,14 +116,14 @@ def test_iccp_finds_partners_that_a_rejector_loses():
     assert rejected.inlier_ratio < 0.5
 
 
-def test_iccp_without_amplitude_says_so():
+def test_iccp_requires_amplitude():
     bare = view(relief(100, 0))
     with pytest.raises(RegistrationError, match="no amplitude"):
         Iccp().register(bare, bare, np.eye(4), rng())
 
 
 @pytest.mark.parametrize("features", [("moments",), ("curvature",), ("curvature", "moments")])
-def test_icpif_converges_from_rotations_that_icp_does_not(features):
+def test_icpif_converges_from_larger_rotations_than_icp(features):
     target = view(bumpy_ball(4000, 0, 0.001), origin=(0, 0, 2))
     invariant, plain = [], []
     for k in range(4):
@@ -138,7 +138,7 @@ def test_icpif_converges_from_rotations_that_icp_does_not(features):
     assert min(plain, default=90) > 20
 
 
-def test_the_named_variants_register():
+def test_named_variants_register():
     T = turn([1, 2, 0.5], 2)
     source, target = view(relief(2500, 1), T), view(relief(2500, 0))
     for method in (PointToPlaneIcp(0.02), SymmetricIcp(0.02), GeneralizedIcp(0.02)):
@@ -149,7 +149,7 @@ def test_the_named_variants_register():
         assert error(found, T)[1] < 0.3
 
 
-def test_a_configuration_can_name_them():
+def test_variants_are_configurable_by_name():
     for name, data in {
         "point-to-plane": {"resolution": 0.05},
         "symmetric": {"points": 500},
@@ -173,7 +173,7 @@ def test_a_configuration_can_name_them():
         assert made.takes == {"range", "cloud"}
 
 
-def test_a_matcher_that_needs_images_shows_in_what_it_takes():
+def test_matcher_that_needs_images_restricts_inputs():
     made = parts.from_dict(
         Registrar, {"part": "icp", "matcher": {"part": "projection"}}, where="x.toml"
     )
@@ -192,11 +192,11 @@ def test_a_matcher_that_needs_images_shows_in_what_it_takes():
         lambda: InTurn(()),
     ],
 )
-def test_senseless_options_are_refused(make):
+def test_invalid_options_are_rejected(make):
     with pytest.raises(ValueError, match="must be"):
         make()
 
 
-def test_a_wrong_option_in_a_file_is_named():
+def test_wrong_option_in_file_is_reported():
     with pytest.raises(InputError, match="overlap"):
         parts.from_dict(Registrar, {"part": "tricp", "overlap": 2.0}, where="x.toml")

@@ -45,7 +45,7 @@ def ring(noise=0.002):
 
 
 def drifted(T, degrees=1.0, shift=0.004):
-    """Poses with an error that adds up along the chain."""
+    """Poses with drift along the chain."""
     out = [T[0]]
     for k in range(1, len(T)):
         slip = turn([0, 1, 0], degrees)
@@ -55,7 +55,7 @@ def drifted(T, degrees=1.0, shift=0.004):
 
 
 def errors_of(poses, T):
-    """Of the poses relative to the first, at the middle of the ball (m)."""
+    """Errors of the poses relative to the first, at the centre of the rock (m)."""
     middle = MIDDLE[None]
     gap = se3.inverse(T[0]) @ T
     here = se3.inverse(poses[0]) @ poses
@@ -81,7 +81,7 @@ def motions(n, seed):
 
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_the_error_of_a_closed_chain_is_taken_out(method):
+def test_closed_chain_error_is_reduced(method):
     T, clouds = ring()
     start = drifted(T)
     after = relaxed(replace(method, points=2000), [Cloud.of(c) for c in clouds], start)
@@ -91,7 +91,7 @@ def test_the_error_of_a_closed_chain_is_taken_out(method):
 
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_as_a_refinement_frames_in_between_follow(method):
+def test_refinement_corrects_drift(method):
     T, clouds = ring()
     start = drifted(T)
     refiner = replace(method, points=2000).start(ViewStore[PreparedView](Spacing()))
@@ -105,7 +105,7 @@ def test_as_a_refinement_frames_in_between_follow(method):
 
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_views_that_share_nothing_stay(method):
+def test_views_without_overlap_are_unchanged(method):
     refiner = method.start(ViewStore[PreparedView](Spacing()))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 50.0
@@ -119,12 +119,12 @@ def test_views_that_share_nothing_stay(method):
 
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_parts_are_registered_as_refinements(method):
+def test_methods_are_registered_as_refinements(method):
     assert parts.known("refinement")[parts.name_of(method)] is type(method)
     assert parts.from_dict(Refining, parts.to_dict(method), where="test") == method
 
 
-def test_bergevin_prefers_no_order_of_the_views():
+def test_bergevin_is_independent_of_view_order():
     """All increments come from the same poses, so the views may be numbered in any way."""
     T, clouds = ring()
     start = drifted(T)
@@ -136,8 +136,8 @@ def test_bergevin_prefers_no_order_of_the_views():
     np.testing.assert_allclose(shuffled, plain[order], atol=1e-6)
 
 
-def test_pulli_spreads_what_does_not_fit_evenly_over_the_ring():
-    """Section 4: a ring of pairwise alignments, each exact but for one, ends with equal gaps."""
+def test_pulli_distributes_misfit_evenly_over_ring():
+    """Section 4: a ring of pairwise alignments, all exact except one, ends with equal gaps."""
     n = 6
     T = np.array([turn([0, 1, 0], 60 * k, centre=np.zeros(3)) for k in range(n)])
     pairs = []
@@ -146,7 +146,7 @@ def test_pulli_spreads_what_does_not_fit_evenly_over_the_ring():
         relative = se3.inverse(T[j]) @ T[i]
         if i == n - 1:
             relative = turn([0, 1, 0], 6, centre=np.zeros(3)) @ relative
-        # Mates all round, so that each pair resists a turn alike.
+        # Correspondences all around, so that each pair constrains the rotation equally.
         p = rng(i).normal(size=(100, 3))
         pairs.append(Pairs(i, j, p, transform_points(relative, p), np.full((100, 3), np.nan)))
     chain = [np.eye(4)]
@@ -168,7 +168,7 @@ def test_pulli_spreads_what_does_not_fit_evenly_over_the_ring():
     assert max(gaps) < 1.5 * min(gaps)
 
 
-def test_williams_bennamoun_never_rises_and_ends_at_the_truth():
+def test_williams_bennamoun_decreases_monotonically_to_truth():
     poses, pairs = motions(6, 0)
     start = poses @ np.array([np.eye(4)] + [se3.exp(rng(9, k).normal(0, 0.3, 6)) for k in range(5)])
     found, history = corresponding(start, pairs, 200)
@@ -179,7 +179,7 @@ def test_williams_bennamoun_never_rises_and_ends_at_the_truth():
         assert np.abs(gaps).max() < 1e-4
 
 
-def test_williams_bennamoun_takes_parts_that_nothing_connects_each_by_itself():
+def test_williams_bennamoun_solves_unconnected_components_separately():
     poses, pairs = motions(3, 0)
     apart = [*pairs, *(replace(p, i=p.i + 3, j=p.j + 3) for p in pairs)]
     both = np.concatenate([poses, poses])
@@ -189,7 +189,7 @@ def test_williams_bennamoun_takes_parts_that_nothing_connects_each_by_itself():
     np.testing.assert_allclose(corresponding(start, apart, 200)[0], both, atol=1e-5)
 
 
-def test_small_angles_is_right_to_second_order():
+def test_small_angles_is_second_order_accurate():
     """One linear system: an error ten times smaller leaves a hundredth."""
     poses, pairs = motions(5, 1)
     left = []

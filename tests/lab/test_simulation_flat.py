@@ -18,7 +18,7 @@ def flat(request):
     return build(request.param)
 
 
-def test_walk_goes_through_all_rooms_and_comes_back(flat) -> None:
+def test_walk_visits_all_rooms_and_returns(flat) -> None:
     _, sequence = flat
     times = np.arange(0, sequence.frames, 3) / sequence.frame_rate_hz
     places = np.array([sequence.T_room_camera(t)[:3, 3] for t in times])
@@ -35,14 +35,14 @@ def test_walk_goes_through_all_rooms_and_comes_back(flat) -> None:
     assert np.degrees(se3.angle(off)) < 10
 
 
-def test_rooms_are_closed_but_for_their_doorways(flat) -> None:
+def test_rooms_are_closed_except_for_doorways(flat) -> None:
     scene, _ = flat
     for room in range(ROOMS):
         T = T_flat_room(room)
         origin = se3.transform(T, np.array([[0.0, 0.0, 2.3]]))[0]
         hits = scene.cast(origin, ALL_AROUND)
         assert np.isfinite(hits.distance).all()
-        # What leaves the room does so through its two doorways.
+        # Rays leave the room only through its two doorways.
         seen = se3.transform(se3.inverse(T), origin + hits.distance[:, None] * ALL_AROUND)
         beyond = np.abs(seen[:, :2]).max(1) > HALF + 0.13
         assert 0 < beyond.mean() < 0.05
@@ -52,7 +52,7 @@ def test_rooms_are_closed_but_for_their_doorways(flat) -> None:
         assert through.all()
 
 
-def test_rooms_alike_differ_less_than_the_others() -> None:
+def test_similar_rooms_differ_less() -> None:
     """Views of two rooms from the same place in each."""
     eye = se3.transform(np.eye(4), np.array([[0.6, 0.6, 1.3]]))
     unlike = {}
@@ -68,7 +68,7 @@ def test_rooms_alike_differ_less_than_the_others() -> None:
     assert 0.02 < unlike["flat-alike"] < 0.5 * unlike["flat"]
 
 
-def test_the_flat_is_recorded_from_any_frame_on() -> None:
+def test_flat_is_recorded_from_given_frame() -> None:
     from tofuse.lab.simulation.effects import Effects
     from tofuse.lab.simulation.record import plan, simulate_recording
 

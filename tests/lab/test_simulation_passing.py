@@ -13,7 +13,7 @@ from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 
 
 def covered(made, step=3):
-    """Share of the image that what passes covers in each frame (N,)."""
+    """Fraction of the image that the passing object covers in each frame (N,)."""
     ids = list(made.scene.passing_surfaces)
     xy = made.model.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
     rays = np.column_stack([xy, np.ones(len(xy))])
@@ -30,17 +30,17 @@ def covered(made, step=3):
 @pytest.mark.parametrize("kind", ["person", "box"])
 @pytest.mark.parametrize("scene", ["room", "flat", "rail"])
 @pytest.mark.parametrize("share", [0.10, 0.25, 0.40])
-def test_it_covers_what_was_asked_for_while_it_passes(kind, scene, share) -> None:
+def test_passing_object_covers_requested_fraction(kind, scene, share) -> None:
     part = covered(plan(scene, passing=Passing(kind, share), every=6, frames=40))
     seen = part > 0.02
     assert 0.25 < seen.mean() < 0.6
     assert 0.6 * share < part[seen].mean() < 1.5 * share
-    # It comes and goes: more than one pass, with nothing in view between.
+    # It enters and leaves at least once.
     assert (np.diff(seen.astype(int)) == 1).sum() >= 1
     assert (np.diff(seen.astype(int)) == -1).sum() >= 1
 
 
-def test_the_truth_stays_the_cameras() -> None:
+def test_ground_truth_is_unaffected_by_passing_object() -> None:
     plain, passed = plan("flat", frames=20), plan("flat", frames=20, passing=Passing())
     np.testing.assert_array_equal(plain.poses, passed.poses)
     np.testing.assert_array_equal(plain.scene.truth_mesh()[0], passed.scene.truth_mesh()[0])
@@ -48,7 +48,7 @@ def test_the_truth_stays_the_cameras() -> None:
     assert not plain.scene.passing_surfaces
 
 
-def test_motion_has_no_jumps_within_a_pass_and_limbs_swing() -> None:
+def test_motion_is_continuous_and_limbs_swing() -> None:
     made = plan("flat", frames=40, passing=Passing("person", 0.25, seconds=2.0, start_s=0.0))
     times = np.linspace(0.01, 1.99, 100)
     poses = np.array([made.sequence.T_room_bodies(t) for t in times])
@@ -61,7 +61,7 @@ def test_motion_has_no_jumps_within_a_pass_and_limbs_swing() -> None:
     assert (away[:, 2, 3] < -50).all()
 
 
-def test_pixels_on_it_are_flagged_and_nearer(tmp_path) -> None:
+def test_passing_pixels_are_flagged_and_nearer(tmp_path) -> None:
     effects = Effects.none()
     options = {"every": 3, "frames": 3, "first": 66, "effects": effects}
     passing = Passing("box", 0.3, start_s=-1.0)
@@ -76,7 +76,7 @@ def test_pixels_on_it_are_flagged_and_nearer(tmp_path) -> None:
     np.testing.assert_array_equal(memory.reference, empty.reference)
 
 
-def test_beside_a_turning_object_the_object_stays_the_world() -> None:
+def test_rotating_object_still_defines_world() -> None:
     made = plan("box", every=30, frames=4, passing=Passing("person", 0.2, start_s=0.0))
     np.testing.assert_array_equal(made.poses, plan("box", every=30, frames=4).poses)
     assert made.sequence.T_room_bodies(0.5).shape == (6, 4, 4)
@@ -86,11 +86,11 @@ def test_beside_a_turning_object_the_object_stays_the_world() -> None:
     ("options", "words"),
     [({"kind": "dog"}, "dog"), ({"fraction": 0.0}, "fraction"), ({"seconds": 5.0}, "end before")],
 )
-def test_bad_requests_say_what_to_do(options, words) -> None:
+def test_invalid_options_are_rejected(options, words) -> None:
     with pytest.raises(InputError, match=words):
         Passing(**options)
 
 
-def test_a_first_frame_must_be_there() -> None:
+def test_first_frame_must_exist() -> None:
     with pytest.raises(InputError, match="first"):
         plan("wall", first=60)

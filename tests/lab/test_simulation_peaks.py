@@ -10,7 +10,7 @@ from tofuse.lab.experiments.peaks import PoseErrors, run_peaks, sweep_peaks
 from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
 
 
-def test_peaks_is_matlabs():
+def test_peaks_matches_matlab():
     # At the origin two of the three terms are left; the extremes are those on MATLAB's plots.
     assert peaks(0, 0) == pytest.approx((3 - 1 / 3) / np.e)
     side = np.linspace(-3, 3, 601)
@@ -19,7 +19,7 @@ def test_peaks_is_matlabs():
     assert z.min() == pytest.approx(-6.5511, abs=1e-3)
 
 
-def test_the_points_are_the_first_5000_of_the_grid():
+def test_points_are_first_5000_of_grid():
     points = peaks_points()
     assert points.shape == (5000, 3)
     np.testing.assert_allclose(points[0, [0, 2]], [-3, -3])
@@ -29,7 +29,7 @@ def test_the_points_are_the_first_5000_of_the_grid():
     np.testing.assert_allclose(points[:, 1], peaks(points[:, 0], points[:, 2]))
 
 
-def test_the_cameras_stand_on_a_circle_and_look_at_the_origin():
+def test_cameras_are_on_circle_facing_origin():
     T = peaks_cameras()
     a = np.radians(18 * np.arange(20))
     expected = 10 * np.stack([np.sin(a), 0 * a, -np.cos(a)], 1)
@@ -43,7 +43,7 @@ def test_the_cameras_stand_on_a_circle_and_look_at_the_origin():
     np.testing.assert_allclose(np.degrees(se3.angle(se3.inverse(T[:-1]) @ T[1:])), 18)
 
 
-def test_a_view_holds_the_nearest_half_in_the_cameras_frame():
+def test_views_hold_nearest_half_in_camera_frame():
     views, truth = peaks_views(0.0, 0)
     assert len(views) == 20
     np.testing.assert_allclose(truth[0], np.eye(4), atol=1e-12)
@@ -60,7 +60,7 @@ def test_a_view_holds_the_nearest_half_in_the_cameras_frame():
         assert (view.points[:, 2] > 0).all()
 
 
-def test_the_noise_is_fresh_in_every_view_and_as_large_as_asked():
+def test_noise_is_independent_per_view_with_given_sigma():
     clean, _ = peaks_views(0.0, 3)
     noisy, _ = peaks_views(0.05, 3)
     noise = np.array([n.points - c.points for n, c in zip(noisy, clean, strict=True)])
@@ -74,7 +74,7 @@ def test_the_noise_is_fresh_in_every_view_and_as_large_as_asked():
     assert not np.array_equal(other[7].points, noisy[7].points)
 
 
-def test_errors_are_of_the_camera_in_position_and_about_its_axes():
+def test_pose_errors_are_position_and_rotation_about_camera_axes():
     truth = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
     wrong = truth.copy()
     wrong[1, :3, 3] += [0.3, 0, -0.4]
@@ -92,13 +92,13 @@ def test_errors_are_of_the_camera_in_position_and_about_its_axes():
     np.testing.assert_allclose(errors.axes, expected, atol=1e-12)
 
 
-def test_without_noise_the_method_is_nearly_exact():
+def test_method_is_nearly_exact_without_noise():
     run = run_peaks(0.0, 0)
     assert run.sequential.position.max() < 1e-3
     assert run.optimised.position.max() < 1e-3
 
 
-def test_the_noise_sweep_shows_what_the_thesis_saw():
+def test_noise_sweep_reproduces_thesis():
     """Figure 5.12, and the level that an independent implementation of the method reaches."""
     sweep = sweep_peaks(range(3), (0.02, 0.06, 0.10))
     sequential, optimised = sweep.position.T
@@ -119,6 +119,6 @@ def test_the_noise_sweep_shows_what_the_thesis_saw():
         assert (np.diff(run.objective) <= 0).all()
 
 
-def test_one_seed_gives_one_result():
+def test_same_seed_gives_same_result():
     a, b = run_peaks(0.08, 5), run_peaks(0.08, 5)
     np.testing.assert_array_equal(a.optimised.axes, b.optimised.axes)

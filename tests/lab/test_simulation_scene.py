@@ -46,14 +46,14 @@ def built():
         ("box", 570, 10, 57),
     ],
 )
-def test_frame_counts_are_the_theses(built, name, raw, stride, used):
+def test_frame_counts_match_thesis(built, name, raw, stride, used):
     sequence = built[name][1]
     assert (sequence.frames, sequence.stride) == (raw, stride)
     assert len(range(0, sequence.frames, sequence.stride)) == used
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_seen_is_sound(built, name):
+def test_hits_are_valid(built, name):
     scene, sequence = built[name]
     rays = sr4000_rays()
     for t in np.linspace(0, sequence.frames / sequence.frame_rate_hz, 5):
@@ -70,7 +70,7 @@ def test_what_is_seen_is_sound(built, name):
 
 
 @pytest.mark.parametrize("name", ["room", "empty-room", "rail", "torso", "box", "corridor"])
-def test_closed_rooms_let_no_ray_out(built, name):
+def test_rooms_are_closed(built, name):
     scene, sequence = built[name]
     origin = sequence.T_room_camera(0)[:3, 3]
     assert np.isfinite(scene.cast(origin, sphere_rays(60000)).distance).all()
@@ -85,7 +85,7 @@ def test_room_measures_6_by_3_2_m(built, name):
     np.testing.assert_allclose(hits.normal, np.concatenate([-np.eye(3), np.eye(3)]), atol=1e-6)
 
 
-def test_seven_chairs_are_around_and_one_is_always_in_view(built):
+def test_seven_chairs_with_one_always_in_view(built):
     scene, sequence = built["room"]
     chairs = [k for k, m in enumerate(scene.materials) if m.name.startswith("chair ")]
     fabrics = [k for k in chairs if scene.materials[k].name[-1].isdigit()]
@@ -114,7 +114,7 @@ def test_chairs_stand_on_the_floor_with_five_legs():
     assert away.max() < 0.12
 
 
-def test_rail_goes_90_cm_to_the_side_and_back_faster_on_the_way_out(built):
+def test_rail_moves_90_cm_sideways_and_back_slower(built):
     _, sequence = built["rail"]
     times = np.arange(sequence.frames) / 30
     poses = np.array([sequence.T_world_camera(t) for t in times])
@@ -132,7 +132,7 @@ def test_rail_goes_90_cm_to_the_side_and_back_faster_on_the_way_out(built):
 
 
 @pytest.mark.parametrize("name", ["room", "empty-room"])
-def test_turn_closes_just_after_the_last_frame(built, name):
+def test_turn_closes_after_last_frame(built, name):
     _, sequence = built[name]
     whole = sequence.frames / 30
     np.testing.assert_array_equal(sequence.T_world_camera(0.0), np.eye(4))
@@ -147,7 +147,7 @@ def test_turn_closes_just_after_the_last_frame(built, name):
     np.testing.assert_allclose(quarter[:3, 3], 0, atol=1e-12)
 
 
-def test_axis_offset_puts_the_optical_centre_on_a_circle():
+def test_axis_offset_moves_optical_centre_on_circle():
     _, sequence = build("room", axis_offset_m=0.02)
     half = sequence.T_world_camera(sequence.frames / 60)
     assert np.linalg.norm(half[:3, 3]) == pytest.approx(0.04, abs=1e-6)
@@ -155,7 +155,7 @@ def test_axis_offset_puts_the_optical_centre_on_a_circle():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_motion_is_smooth_and_no_faster_than_a_hand(built, name):
+def test_motion_is_smooth_and_slow(built, name):
     _, sequence = built[name]
     t = np.arange(0, sequence.frames / 30, 1 / 120)
     poses = np.array([sequence.T_world_camera(s) for s in t])
@@ -167,7 +167,7 @@ def test_motion_is_smooth_and_no_faster_than_a_hand(built, name):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_points_seen_at_any_time_lie_on_the_true_surface_of_the_world(built, name):
+def test_visible_points_lie_on_truth_mesh(built, name):
     """Hits, mapped by the true pose into the world and back onto the truth mesh."""
     scene, sequence = built[name]
     vertices, faces = scene.truth_mesh()
@@ -220,7 +220,7 @@ def test_box_is_300_by_300_by_400_mm_with_its_top_in_view(built):
         assert beyond.min() > scene.max_depth_m
 
 
-def test_torso_turns_in_view_nearer_than_the_cut(built):
+def test_torso_rotates_in_view_within_max_depth(built):
     scene, sequence = built["torso"]
     rays = sr4000_rays(4)
     person = [surface(scene, n) for n in ("shirt", "skin", "hair", "trousers", "seat")]
@@ -234,7 +234,7 @@ def test_torso_turns_in_view_nearer_than_the_cut(built):
 
 
 @pytest.mark.parametrize("name", ["torso", "box"])
-def test_with_a_moving_object_the_camera_circles_it(built, name):
+def test_camera_orbits_moving_object_in_its_frame(built, name):
     _, sequence = built[name]
     np.testing.assert_array_equal(
         sequence.T_room_camera(0.0), sequence.T_room_camera(sequence.frames / 60)
@@ -250,7 +250,7 @@ def test_with_a_moving_object_the_camera_circles_it(built, name):
     np.testing.assert_allclose(centres[0], centres[-1], atol=1e-9)
 
 
-def test_uniform_albedo_changes_nothing_but_the_albedo(built):
+def test_uniform_albedo_changes_only_albedo(built):
     textured, sequence = built["empty-room"]
     uniform, _ = build("empty-room", texture=False)
     rays = sr4000_rays(4)
@@ -262,12 +262,12 @@ def test_uniform_albedo_changes_nothing_but_the_albedo(built):
         assert np.ptp(b.albedo) == 0.0
         assert not b.gloss.any()
         contrast.append(a.albedo.std() / a.albedo.mean())
-    # Enough for a tracker that follows the amplitude, in every direction.
+    # Enough for photometric tracking, in every direction.
     assert min(contrast) > 0.06
     assert max(contrast) > 0.15
 
 
-def test_seed_changes_the_look_and_the_same_seed_does_not(built):
+def test_appearance_depends_on_seed(built):
     rays = sr4000_rays(8)
     first, sequence = built["room"]
     same, other = build("room")[0], build("room", seed=1)[0]
@@ -277,7 +277,7 @@ def test_seed_changes_the_look_and_the_same_seed_does_not(built):
     assert (a.albedo != c.albedo).mean() > 0.5
 
 
-def test_threads_change_no_bit(built):
+def test_hits_are_independent_of_threads(built):
     scene, sequence = built["torso"]
     rays = sr4000_rays(1)
     with threads(1):
@@ -288,7 +288,7 @@ def test_threads_change_no_bit(built):
         assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
 
 
-def test_one_origin_and_an_origin_for_each_ray_agree(built):
+def test_common_and_individual_ray_origins_agree(built):
     scene, _ = built["rail"]
     d = sphere_rays(3000)
     origin = np.array([0.1, 0.2, 1.0])
@@ -301,7 +301,7 @@ def test_one_origin_and_an_origin_for_each_ray_agree(built):
     assert len(scene.cast(origin, np.zeros((0, 3))).distance) == 0
 
 
-def test_fewer_frames_stop_earlier_on_the_same_path():
+def test_fewer_frames_follow_same_path():
     _, whole = build("wall")
     _, part = build("wall", frames=7)
     assert part.frames == 7
@@ -316,6 +316,6 @@ def test_fewer_frames_stop_earlier_on_the_same_path():
         ("rail", {"axis_offset_m": 0.1}, "axis_offset_m"),
     ],
 )
-def test_bad_requests_say_what_to_do(name, options, words):
+def test_invalid_options_are_rejected(name, options, words):
     with pytest.raises(InputError, match=words):
         build(name, **options)

@@ -17,7 +17,7 @@ def directed_edges(faces):
 
 
 def is_closed(mesh):
-    """Each edge is walked as often one way as the other."""
+    """Each edge occurs equally often in both directions."""
     edges = directed_edges(mesh.faces)
     there, count = np.unique(edges, axis=0, return_counts=True)
     back, back_count = np.unique(edges[:, ::-1], axis=0, return_counts=True)
@@ -45,7 +45,7 @@ def test_solids_are_closed_and_face_outward(mesh, wanted):
     assert volume(meshes.inside_out(mesh)) == pytest.approx(-wanted, rel=3e-3)
 
 
-def test_curved_surfaces_are_shaded_smooth_and_edges_stay_sharp():
+def test_normals_are_smooth_on_curved_surfaces_and_sharp_at_edges():
     ball = meshes.superellipsoid((2, 2, 2), segments=(16, 32))
     middle = ball.corners()
     wanted = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
@@ -57,7 +57,7 @@ def test_curved_surfaces_are_shaded_smooth_and_edges_stay_sharp():
     )
 
 
-def test_joined_meshes_keep_their_surfaces_and_places():
+def test_joined_meshes_keep_surfaces_and_positions():
     a = meshes.box((1, 1, 1)).of_surface(3)
     b = meshes.box((1, 1, 1)).moved(se3.exp([5, 0, 0, 0, 0, 1])).of_surface(4)
     both = meshes.joined([a, b])
@@ -66,7 +66,7 @@ def test_joined_meshes_keep_their_surfaces_and_places():
     assert volume(both) == pytest.approx(2.0)
 
 
-def test_surface_net_of_a_ball_is_closed_round_and_of_the_right_size():
+def test_surface_net_of_ball_is_closed_and_accurate():
     ball = implicit.surface_net(
         implicit.ellipsoid((0.1, 0, 0), (0.5, 0.5, 0.5)), (-1, -1, -1), (1, 1, 1), 0.08
     )
@@ -76,7 +76,7 @@ def test_surface_net_of_a_ball_is_closed_round_and_of_the_right_size():
     assert volume(ball) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.02)
 
 
-def test_blending_fills_the_gap_and_changes_nothing_far_away():
+def test_blending_is_local():
     a = implicit.ellipsoid((-0.5, 0, 0), (0.4, 0.4, 0.4))
     b = implicit.limb((0.5, 0, 0), (1.0, 0, 0), 0.4, 0.2)
     both = implicit.blend([(a, 0.0), (b, 0.3)])
@@ -94,20 +94,20 @@ def person():
     return torso.person()
 
 
-def test_the_person_is_closed_and_of_human_size(person):
+def test_person_is_closed_and_human_sized(person):
     mesh, _ = person
     assert is_closed(mesh)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     assert 0.85 < high[2] - 0.47 < 0.95  # sitting height above the seat
     chest = mesh.vertices[(np.abs(mesh.vertices[:, 2] - 1.02) < 0.02)]
     assert 0.40 < np.ptp(chest[:, 1]) < 0.52  # across the shoulders
-    assert low[0] > -0.25  # the grid cuts nothing off
+    assert low[0] > -0.25  # the grid does not crop the person
     assert high[0] < 0.66
-    # A person of 60 to 85 kg, nearly of the density of water; nothing is cut off.
+    # A person of 60 to 85 kg has about the density of water.
     assert 0.055 < volume(mesh) < 0.085
 
 
-def test_the_person_has_a_front_a_back_and_two_different_arms(person):
+def test_person_is_asymmetric(person):
     mesh, materials = person
     head = mesh.vertices[(mesh.vertices[:, 2] > 1.15)]
     assert head[:, 0].max() > 0.12 > 0.11 > -head[:, 0].min()
@@ -122,7 +122,7 @@ def test_the_person_has_a_front_a_back_and_two_different_arms(person):
     assert face[:, 0].mean() > hair[hair[:, 2] > 1.2][:, 0].mean() + 0.05
 
 
-def test_no_ray_from_inside_the_person_gets_out(person):
+def test_no_ray_leaves_the_person(person):
     mesh, materials = person
     scene = Scene("person", materials, mesh)
     rng = np.random.default_rng([0, 21])
@@ -132,7 +132,7 @@ def test_no_ray_from_inside_the_person_gets_out(person):
         assert np.isfinite(scene.cast(inside, d).distance).all()
 
 
-def test_smooth_normals_face_the_ray_even_at_silhouettes():
+def test_smooth_normals_face_rays_at_silhouettes():
     ball = meshes.superellipsoid((2, 2, 2), segments=(12, 24))
     scene = Scene("ball", [Material("ball", 0.5)], ball)
     y, z = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 400))

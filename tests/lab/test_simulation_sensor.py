@@ -19,7 +19,7 @@ from tofuse.recordings.native import corrected_depth
 from tofuse.sensor.models import CAMERAS, camera_model
 
 SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
-# Sharp, so that sums over sub-rays can be told exactly.
+# Without blur, so that sums over sub-rays are exact.
 MODEL = replace(camera_model("sr4000"), camera=SMALL, blur_px=0.0)
 CENTRE = (18, 22)
 
@@ -92,7 +92,7 @@ def stack(scene, effects: Effects, frames: int, **more) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
-def test_ideal_camera_measures_the_truth(name: str) -> None:
+def test_ideal_camera_measures_ground_truth(name: str) -> None:
     model = camera_model(name)
     small = replace(model.camera, width=24, height=20, cx=11.0, cy=9.0)
     model = replace(model, camera=small)
@@ -116,17 +116,17 @@ def test_amplitude_follows_albedo_incidence_and_range() -> None:
     assert counts(Board((0, 0, 1.0), albedo=0.2)) == pytest.approx(one / 4, rel=0.01)
     assert counts(Board((0, 0, 2.0), albedo=0.8)) == pytest.approx(one / 4, rel=0.01)
     tilted = Board((0, 0, 1.0), a=(40.0, 0, 40.0), albedo=0.8)
-    # 45 degrees at the axis; the pixel is half a pixel beside it.
+    # 45 degrees at the axis; the pixel is half a pixel off it.
     assert counts(tilted) == pytest.approx(one * np.sqrt(0.5), rel=0.03)
 
 
-def test_compensated_amplitude_is_the_albedo_seen_head_on() -> None:
+def test_compensated_amplitude_is_independent_of_range() -> None:
     near = shoot(wall(1.5), Effects.none()).frame.amplitude_image
     far = shoot(wall(3.0), Effects.none()).frame.amplitude_image
     np.testing.assert_allclose(near, far, rtol=0.02)
 
 
-def test_shot_noise_falls_as_amplitude_rises() -> None:
+def test_shot_noise_falls_with_amplitude() -> None:
     effects = Effects.none(shot_noise=True)
     found, expected = [], []
     for albedo in (0.05, 0.15, 0.6):
@@ -138,7 +138,7 @@ def test_shot_noise_falls_as_amplitude_rises() -> None:
         phase = np.sqrt(variance) / (MODEL.modulation_contrast * signal)
         expected.append(phase * MODEL.period_m / (2 * np.pi))
     np.testing.assert_allclose(found, expected, rtol=0.08)
-    # Read noise rules in the dark: a third of the amplitude, nearly three times the noise.
+    # Read noise dominates in the dark: a third of the amplitude, nearly three times the noise.
     assert 2.2 < found[0] / found[1] < 3.0
 
 
@@ -156,7 +156,7 @@ def test_noise_is_unbiased() -> None:
     assert abs((seen - truth).mean()) < 0.0005
 
 
-def test_other_noise_has_the_same_variance_heavy_tails_and_alike_neighbours() -> None:
+def test_other_noise_has_same_variance_heavy_tails_and_correlation() -> None:
     scene = wall(2.0, 0.3)
     truth = ranges(scene, Effects.none())
     known = stack(scene, Effects.none(shot_noise=True), 60) - truth
@@ -178,7 +178,7 @@ def test_other_noise_has_the_same_variance_heavy_tails_and_alike_neighbours() ->
 
 
 def edge(near: float, far: float, u: float) -> Boards:
-    """A near board that covers the columns left of pixel coordinate u, before a far wall."""
+    """A near board that covers the columns left of pixel coordinate u, and a far wall."""
     x = (u - MODEL.camera.cx) / MODEL.camera.fx * near
     return Boards([Board((x - 5, 0, near), a=(5.0, 0, 0)), Board((0, 0, far))])
 
@@ -196,7 +196,7 @@ def mixed_range(near: float, far: float, share: float, row: int, column: int) ->
 
 
 def test_mixed_pixels_are_phasor_sums() -> None:
-    # Of the half-pixel grid, the border between two pixels counts a quarter, the centre half.
+    # On the half-pixel grid, the border between two pixels has weight 1/4, the centre 1/2.
     for offset, share in ((-0.25, 0.25), (0.25, 0.75)):
         scene = edge(1.2, 2.2, 25 + offset)
         rendered = shoot(scene, Effects.none(mixed_pixels=True))
@@ -210,8 +210,8 @@ def test_mixed_pixels_are_phasor_sums() -> None:
         assert not flagged[:, 27:].any()
 
 
-def test_mixed_pixel_can_lie_outside_of_both_surfaces() -> None:
-    # More than half a period apart the shorter way round leads outside.
+def test_mixed_pixel_can_lie_outside_both_surfaces() -> None:
+    # With more than half a period between them, the mean phase lies outside.
     near, far, albedo = 0.9, 3.9, 0.9
     scene = edge(near, far, 25 - 0.25)
     scene.boards[0].albedo, scene.boards[1].albedo = 0.1, albedo
@@ -220,7 +220,7 @@ def test_mixed_pixel_can_lie_outside_of_both_surfaces() -> None:
     assert ranges(scene, Effects.none())[18, 25] == pytest.approx(far, rel=0.02)
 
 
-def test_blurred_edge_is_wider_and_keeps_to_its_place() -> None:
+def test_blur_widens_edge_in_place() -> None:
     scene = edge(1.2, 2.2, 24.5)
     sharp, soft = (
         shoot(scene, Effects.none(mixed_pixels=True), model=replace(MODEL, blur_px=blur))
@@ -235,7 +235,7 @@ def test_blurred_edge_is_wider_and_keeps_to_its_place() -> None:
     assert not (soft.flags[:, :20] & Flag.MIXED).any()
 
 
-def test_range_beyond_the_period_comes_back_short() -> None:
+def test_range_beyond_period_wraps() -> None:
     wrapped = shoot(wall(6.2), Effects.none(wrap=True))
     np.testing.assert_allclose(
         wrapped.frame.radial_range, ranges(wall(6.2), Effects.none()) - 5.0, atol=2e-4
@@ -244,14 +244,14 @@ def test_range_beyond_the_period_comes_back_short() -> None:
     assert not (shoot(wall(3.0), Effects.none(wrap=True)).flags & Flag.WRAPPED).any()
 
 
-def test_second_frequency_tells_the_periods_apart() -> None:
+def test_second_frequency_resolves_ambiguity() -> None:
     model = camera_model("kinect2")
     true = np.linspace(0.01, model.ambiguity_m - 0.01, 3001)
     phasors = np.stack([np.exp(2j * np.pi * true * 2 * f / 299792458.0) for f in model.frequencies])
     np.testing.assert_allclose(sensor.unwrapped(model, phasors), true, atol=1e-9)
 
 
-def test_wiggling_has_four_periods_to_one_of_the_phase() -> None:
+def test_wiggling_has_four_periods_per_phase_period() -> None:
     model = replace(MODEL, camera=Pinhole(8, 8, 57.0, 57.0, 4.0, 4.0))
     true = (np.arange(32) + 0.5) / 32 * model.period_m
     measured = np.array(
@@ -267,7 +267,7 @@ def test_wiggling_has_four_periods_to_one_of_the_phase() -> None:
     assert amplitude == pytest.approx((h3 - h5) * model.period_m / (2 * np.pi), rel=0.05)
 
 
-def test_pixel_offsets_grow_along_the_read_out_chain() -> None:
+def test_pixel_offsets_grow_along_readout() -> None:
     offset = ranges(wall(2.0), Effects.none(pixel_offsets=1.0)) - ranges(wall(2.0), Effects.none())
     np.testing.assert_allclose(offset, sensor.pixel_offsets(MODEL), atol=2e-4)
     slope = np.polyfit(np.arange(44), offset.mean(0), 1)[0]
@@ -275,7 +275,7 @@ def test_pixel_offsets_grow_along_the_read_out_chain() -> None:
     assert (offset - offset.mean(0)).std() > 0.5 * MODEL.pixel_delay_m
 
 
-def test_thermal_drift_grows_monotonously_to_its_limit() -> None:
+def test_thermal_drift_grows_monotonically_to_limit() -> None:
     times = [0, 300, 1500, 6000, 300000]
     seen = [
         float(ranges(wall(2.0), Effects.none(thermal_drift=1.0), index=k).mean()) for k in times
@@ -288,7 +288,7 @@ def test_thermal_drift_grows_monotonously_to_its_limit() -> None:
     np.testing.assert_allclose(drift, expected, atol=1e-4)
 
 
-def test_scattered_light_pulls_the_background_to_a_bright_foreground() -> None:
+def test_scattering_biases_background_towards_bright_foreground() -> None:
     near = Board((-0.25, 0, 0.5), a=(0.2, 0, 0), b=(0, 0.5, 0), albedo=0.9)
     scene = Boards([near, Board((0, 0, 2.0), albedo=0.3)])
     bias = ranges(scene, Effects.none(scatter=0.02)) - ranges(scene, Effects.none())
@@ -303,7 +303,7 @@ def test_scattered_light_pulls_the_background_to_a_bright_foreground() -> None:
     assert flags[18, 24:40].all()
 
 
-def test_scattering_keeps_the_light_of_a_uniform_image_inside() -> None:
+def test_scattering_kernel_conserves_light() -> None:
     from tofuse.lab.simulation.optics import LensScatter
 
     spread = LensScatter(176, 144, 0.02)
@@ -327,27 +327,27 @@ def corner(albedo: float = 0.6) -> Boards:
     )
 
 
-def test_corners_are_rounded_off_by_light_of_the_other_wall() -> None:
+def test_multipath_rounds_corners() -> None:
     bias = ranges(corner(), Effects.none(multipath=True)) - ranges(corner(), Effects.none())
     assert (bias > -0.002).all()
     middle, side = bias[:, 20:24].mean(), bias[:, [4, 5, 38, 39]].mean()
     assert middle > 0.01
     assert abs(bias[:, 4:8].mean() - bias[:, 36:40].mean()) < 0.4 * bias.mean()
-    # The fold looks flatter: the range errs more beside the edge than right in it,
+    # The corner looks flatter: the range error is larger beside the edge than at it,
     # where the detour vanishes.
     assert bias[:, 12:18].mean() > side * 0.5
-    # Twice the albedo, twice the share of light by way of the other wall.
+    # Half the albedo, half the fraction of light by way of the other wall.
     dark = ranges(corner(0.3), Effects.none(multipath=True)) - ranges(corner(), Effects.none())
     assert dark.mean() / bias.mean() == pytest.approx(0.5, abs=0.1)
 
 
-def test_a_single_wall_has_no_multipath() -> None:
+def test_single_wall_has_no_multipath() -> None:
     one, other = (ranges(wall(2.0), Effects.none(multipath=on)) for on in (True, False))
     np.testing.assert_array_equal(one, other)
 
 
-def test_bounced_light_is_what_two_facing_walls_exchange() -> None:
-    """A lit patch is seen by a small one: compared with the integral over the patch."""
+def test_bounced_light_matches_form_factor_integral() -> None:
+    """The light that a small patch receives from a lit one, compared with the integral."""
     from tofuse.lab.simulation.optics import bounced_light
 
     # A floor 1 m below the lens, a lit wall 3 m ahead; no shadows between.
@@ -375,14 +375,14 @@ def test_bounced_light_is_what_two_facing_walls_exchange() -> None:
         assert light[2 + 4 * k, 22, 0] == pytest.approx((lit * form).sum() * area, rel=0.12)
 
 
-def test_a_corner_gets_the_light_that_an_integral_over_its_walls_gives() -> None:
-    """Lamp and lens fall off by half each; light by way of the other wall had the lamp's there."""
+def test_corner_multipath_matches_integral_over_walls() -> None:
+    """Falloff: half lamp, half lens; bounced light has that of the lamp at its source."""
     model = replace(MODEL, camera=Pinhole(176, 144, 152.0, 152.0, 87.5, 71.5))
     only = Effects.none(multipath=True)
     found = render(corner(), STILL, model, 0, effects=only).frame
     direct = render(corner(), STILL, model, 0, effects=Effects.none()).frame
     k = 2 * np.pi / (2 * model.period_m)
-    # Points of both walls, as dense everywhere; the lamp ends at 1.1 to 1.3 times the corner.
+    # Uniform points of both walls; the lamp fades out at 1.1 to 1.3 times the corner angle.
     along, up = np.meshgrid((np.arange(600) + 0.5) / 200, (np.arange(800) - 399.5) / 133)
     s, area = np.sqrt(0.5), (1 / 200) * (1 / 133)
     corner_angle = np.arctan(np.nanmax(np.linalg.norm(model.camera.rays(), axis=-1)))
@@ -409,7 +409,7 @@ def test_a_corner_gets_the_light_that_an_integral_over_its_walls_gives() -> None
         assert share == pytest.approx(np.abs(ratio), rel=0.01)
 
 
-def test_mirror_shows_what_stands_in_front_of_it_at_the_longer_path() -> None:
+def test_mirror_shows_reflected_surface_at_longer_path() -> None:
     # A mirror at 45 degrees 1 m ahead; a wall 1.5 m to its side, out of the camera's view.
     mirror = Board((0, 0, 1.0), a=(0.7, 0, 0.7), b=(0, 1, 0), albedo=0.0, gloss=1.0)
     side = Board((1.5, 0, 1.0), a=(0, 0, 3), b=(0, 3, 0), albedo=0.8)
@@ -420,7 +420,7 @@ def test_mirror_shows_what_stands_in_front_of_it_at_the_longer_path() -> None:
     assert rendered.depth[CENTRE] == pytest.approx(1.0, abs=0.02)
 
 
-def test_mirror_before_nothing_returns_nothing() -> None:
+def test_mirror_without_reflected_surface_returns_nothing() -> None:
     mirror = Board((0, 0, 1.0), a=(0.7, 0, 0.7), b=(0, 1, 0), albedo=0.8, gloss=1.0)
     rendered = shoot(Boards([mirror]), Effects.none(gloss=True))
     assert rendered.frame.confidence_image[CENTRE] == 0
@@ -429,7 +429,7 @@ def test_mirror_before_nothing_returns_nothing() -> None:
     assert matte.frame.radial_range[CENTRE] == pytest.approx(1.0, abs=0.02)
 
 
-def test_too_much_light_saturates() -> None:
+def test_strong_light_saturates() -> None:
     rendered = shoot(wall(0.25, 0.9), Effects.none(saturation=True))
     assert (rendered.frame.amplitude_image == 65535).all()
     assert (rendered.frame.depth == 0).all()
@@ -439,7 +439,7 @@ def test_too_much_light_saturates() -> None:
     assert (fine.frame.amplitude_image < 65535).all()
 
 
-def test_too_little_light_gives_noise_of_no_confidence() -> None:
+def test_weak_light_gives_noise_without_confidence() -> None:
     rendered = shoot(wall(4.0, 0.004), Effects.none(shot_noise=True))
     frame = rendered.frame
     assert (frame.confidence_image == 0).mean() > 0.99
@@ -447,7 +447,7 @@ def test_too_little_light_gives_noise_of_no_confidence() -> None:
     assert (rendered.flags & Flag.UNDER_EXPOSED).all()
 
 
-def test_other_cameras_drop_what_is_too_dark() -> None:
+def test_under_exposed_pixels_are_dropped() -> None:
     model = replace(camera_model("kinect2"), camera=MODEL.camera)
     dark = wall(4.0, 0.004)
     effects = Effects.none(shot_noise=True, under_exposure=True)
@@ -456,7 +456,7 @@ def test_other_cameras_drop_what_is_too_dark() -> None:
     assert (shoot(dark, kept, model=model).frame.depth > 0).mean() > 0.9
 
 
-def test_strong_amplitudes_are_compressed_and_ranges_are_not() -> None:
+def test_strong_amplitudes_are_compressed_but_not_ranges() -> None:
     model = replace(MODEL, amplitude_kind="raw")
     share = []
     for z in (0.6, 1.2, 4.0):
@@ -469,7 +469,7 @@ def test_strong_amplitudes_are_compressed_and_ranges_are_not() -> None:
     assert share[2] > 0.99
 
 
-def test_confidence_rises_as_noise_falls() -> None:
+def test_confidence_rises_with_falling_noise() -> None:
     board = [Board((0, 0, 2.0), albedo=0.0)]
     board = [
         Board(((k - 5.5) * 0.15, 0, 2.0), a=(0.075, 0, 0), b=(0, 2, 0), albedo=0.004 * 1.6**k)
@@ -491,7 +491,7 @@ def turning(degrees_per_second: float) -> Sequence:
     return Sequence(100, 1, 30.0, pose)
 
 
-def test_motion_smears_edges_and_stillness_does_not() -> None:
+def test_motion_smears_edges() -> None:
     scene = edge(1.2, 2.2, 25.1)
     sharp, smeared = (Effects.none(smear=on) for on in (False, True))
     np.testing.assert_array_equal(ranges(scene, sharp), ranges(scene, smeared))
@@ -506,8 +506,8 @@ def test_motion_smears_edges_and_stillness_does_not() -> None:
     assert not (shoot(scene, smeared).flags & Flag.SMEAR).any()
 
 
-def test_phase_images_are_exposed_one_after_another() -> None:
-    """A wall that comes nearer: the four samples see it at four ranges."""
+def test_phase_images_are_exposed_sequentially() -> None:
+    """An approaching wall: the four samples measure it at four ranges."""
     speed = 2.0
 
     def pose(t: float) -> np.ndarray:
@@ -528,7 +528,7 @@ def test_phase_images_are_exposed_one_after_another() -> None:
 
 
 @pytest.mark.parametrize("name", ["sr4000", "kinect2", "pico-flexx"])
-def test_factory_correction_leaves_less_than_a_millimetre(name: str) -> None:
+def test_factory_correction_leaves_less_than_1_mm(name: str) -> None:
     model = camera_model(name)
     small = replace(model.camera, width=120, height=100, cx=60.0, cy=50.0)
     model = replace(model, camera=small)
@@ -546,7 +546,7 @@ def test_factory_correction_leaves_less_than_a_millimetre(name: str) -> None:
         assert np.sqrt((before**2).mean()) > 2 * np.sqrt((error**2).mean())
 
 
-def test_rendering_does_not_depend_on_threads_or_other_frames() -> None:
+def test_rendering_is_independent_of_threads_and_other_frames() -> None:
     scene, sequence = build("corner", frames=4)
     model = replace(camera_model("sr4000"), camera=MODEL.camera)
 
@@ -568,7 +568,7 @@ def test_rendering_does_not_depend_on_threads_or_other_frames() -> None:
     assert take(3, seed=1)[0] != one[0]
 
 
-def test_effects_are_switched_by_name() -> None:
+def test_effects_are_selected_by_name() -> None:
     assert Effects().without("all") == Effects.none()
     assert Effects().without("scatter", "smear") == replace(Effects(), scatter=0.0, smear=False)
     with pytest.raises(InputError, match="no effect called 'rain'"):
@@ -581,7 +581,7 @@ def test_effects_are_switched_by_name() -> None:
         camera_model("polaroid")
 
 
-def test_ifm_states_its_noise() -> None:
+def test_ifm_states_correct_noise() -> None:
     model = replace(camera_model("ifm-o3r"), camera=MODEL.camera)
     effects = Effects.none(shot_noise=True)
     seen = stack(wall(2.0, 0.3), effects, 40, model=model)

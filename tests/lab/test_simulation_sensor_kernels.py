@@ -10,7 +10,7 @@ from tofuse.kernels import phasor
 RNG = np.random.default_rng(7)
 
 
-def test_phasors_of_returns() -> None:
+def test_ray_phasors_match_twin() -> None:
     strength = RNG.uniform(-0.2, 1, (50, 3))
     path = RNG.uniform(0, 12, (50, 3))
     k = 0.63
@@ -26,7 +26,7 @@ def test_phasors_of_returns() -> None:
 
 
 @pytest.mark.parametrize(("stride", "weights"), [(1, [1.0]), (2, [0.25, 0.5, 0.25])])
-def test_pooling_is_a_weighted_sum_over_windows(stride: int, weights: list[float]) -> None:
+def test_pooling_is_weighted_sum_over_windows(stride: int, weights: list[float]) -> None:
     weights = np.array(weights)
     height, width, n = 5, 6, len(weights)
     fine = RNG.normal(size=((height - 1) * stride + n, (width - 1) * stride + n, 4))
@@ -39,7 +39,7 @@ def test_pooling_is_a_weighted_sum_over_windows(stride: int, weights: list[float
             np.testing.assert_allclose(out[v, u], twin, atol=1e-12)
 
 
-def test_distance_off_the_plane_of_the_centre() -> None:
+def test_off_plane_distance_matches_twin() -> None:
     points = RNG.normal(size=(7, 9, 3))
     points[0:3, 0:3][RNG.random((3, 3)) < 0.3] = np.inf
     points[1, 3] = np.inf
@@ -67,7 +67,7 @@ def plane_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return points, normals
 
 
-def test_upsampling_interpolates_on_a_plane_and_stops_at_edges() -> None:
+def test_upsampling_interpolates_on_planes_and_stops_at_edges() -> None:
     points, normals = plane_grid(24, 32)
     points[:, 16:, 2] = 3.0
     points[5, 5] = np.inf
@@ -90,7 +90,7 @@ def test_upsampling_interpolates_on_a_plane_and_stops_at_edges() -> None:
     np.testing.assert_allclose(out[..., 0], expected, atol=1e-3)
 
 
-def test_upsampling_follows_its_weights() -> None:
+def test_upsampling_matches_weighted_twin() -> None:
     points, normals = plane_grid(12, 12)
     points += RNG.normal(0, 0.01, points.shape)
     normals += RNG.normal(0, 0.2, normals.shape)

@@ -18,19 +18,19 @@ from tofuse.recordings.native import NativeSource
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    told = []
+    reported = []
     path = simulate(
         "corner",
         tmp_path_factory.mktemp("simulated") / "corner",
         every=10,
         frames=3,
-        progress=lambda done, of: told.append((done, of)),
+        progress=lambda done, of: reported.append((done, of)),
     )
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reported == [(1, 3), (2, 3), (3, 3)]
     return path
 
 
-def test_folder_reads_as_the_recording_in_memory(folder) -> None:
+def test_written_folder_matches_recording_in_memory(folder) -> None:
     source = NativeSource(folder)
     memory = simulate_recording("corner", every=10, frames=3)
     assert len(memory) == 3
@@ -47,7 +47,7 @@ def test_folder_reads_as_the_recording_in_memory(folder) -> None:
         assert source.metadata[key] == value
 
 
-def test_poses_are_exact(folder) -> None:
+def test_ground_truth_poses_are_exact(folder) -> None:
     _, sequence = build("corner")
     times, poses = read_tum(folder / "groundtruth.txt")
     np.testing.assert_array_equal(poses[0], np.eye(4))
@@ -57,7 +57,7 @@ def test_poses_are_exact(folder) -> None:
     assert np.abs(poses[2] - np.eye(4)).max() > 1e-3
 
 
-def test_truth_lies_on_the_true_surface(folder) -> None:
+def test_true_depth_lies_on_true_surface(folder) -> None:
     """True depth of any frame, moved by the true pose, lies in the planes of surface.ply."""
     mesh = read_ply(folder / "truth" / "surface.ply")
     corners = mesh.points.astype(float)[mesh.faces]
@@ -74,7 +74,7 @@ def test_truth_lies_on_the_true_surface(folder) -> None:
         assert off.max() < 3e-4
 
 
-def test_moving_object_is_the_world() -> None:
+def test_moving_object_defines_world() -> None:
     made = plan("box", every=50, frames=3)
     _, sequence = build("box")
     rate = sequence.frame_rate_hz
@@ -87,7 +87,7 @@ def test_moving_object_is_the_world() -> None:
         np.testing.assert_allclose(pose, expected, atol=1e-12)
 
 
-def test_a_raw_frame_is_the_same_at_any_stride() -> None:
+def test_raw_frame_is_independent_of_stride() -> None:
     effects = Effects()
     two = simulate_recording("wall", every=2, frames=3, effects=effects)
     four = simulate_recording("wall", every=4, frames=2, effects=effects)
@@ -96,7 +96,7 @@ def test_a_raw_frame_is_the_same_at_any_stride() -> None:
     assert not np.array_equal(two[1].depth, four[1].depth)
 
 
-def test_without_correction_the_bias_stays(tmp_path) -> None:
+def test_bias_remains_without_correction(tmp_path) -> None:
     effects = Effects.none(wiggling=1.0, pixel_offsets=1.0)
     path = simulate("wall", tmp_path / "raw", every=10, frames=1, effects=effects, correction=False)
     assert not (path / "correction.npz").exists()
@@ -114,7 +114,7 @@ def test_flags_are_written_as_16_bit_images(folder) -> None:
     assert flags.any()
 
 
-def test_peaks_is_written_as_clouds(tmp_path) -> None:
+def test_peaks_are_written_as_clouds(tmp_path) -> None:
     path = simulate("peaks", tmp_path / "peaks", sigma_m=0.02)
     source = NativeSource(path)
     assert len(source.timestamps) == 20
@@ -128,14 +128,14 @@ def test_peaks_is_written_as_clouds(tmp_path) -> None:
     assert len(simulate_recording("peaks", every=4)) == 5
 
 
-def test_bad_requests_are_refused(tmp_path) -> None:
-    for options, said in (
+def test_invalid_options_are_rejected(tmp_path) -> None:
+    for options, words in (
         ({"scene": "moon"}, "moon"),
         ({"scene": "wall", "camera": "polaroid"}, "polaroid"),
         ({"scene": "wall", "every": 0}, "every"),
         ({"scene": "wall", "frames": 0}, "frames"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=words):
             simulate_recording(**options)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError):

@@ -52,7 +52,7 @@ def check_depth(frame: RangeFrame, k: int, unit_m: float) -> None:
     assert frame.depth[3, 4] == 0
 
 
-def test_realsense(install: Install) -> None:
+def test_realsense_stream(install: Install) -> None:
     package = FakeRealSense()
     install(package)
     with device("realsense", {}).open() as stream:
@@ -70,7 +70,7 @@ def test_realsense(install: Install) -> None:
 
 
 def test_realsense_stereo_has_no_amplitude(install: Install) -> None:
-    """The infrared image of a stereo camera is of another viewpoint."""
+    """The infrared image of a stereo camera has another viewpoint."""
     package = FakeRealSense(line="D400", model="brown_conrady")
     install(package)
     with device("realsense", {}).open() as stream:
@@ -81,7 +81,7 @@ def test_realsense_stereo_has_no_amplitude(install: Install) -> None:
     assert stream.settings.camera.k2 == -0.05
 
 
-def test_realsense_inverse_lens_leads_from_pixel_to_ray(install: Install) -> None:
+def test_realsense_inverse_distortion_maps_pixel_to_ray(install: Install) -> None:
     install(FakeRealSense(model="inverse_brown_conrady"))
     with device("realsense", {}).open() as stream:
         rays = stream.settings.camera.rays()
@@ -95,7 +95,7 @@ def test_realsense_inverse_lens_leads_from_pixel_to_ray(install: Install) -> Non
     assert np.allclose(rays[5, 20], expected, atol=1e-6)
 
 
-def test_realsense_refusals(install: Install) -> None:
+def test_realsense_errors_are_reported(install: Install) -> None:
     package = FakeRealSense(model="ftheta")
     install(package)
     with pytest.raises(DeviceError, match="lens of the model ftheta"):
@@ -108,13 +108,13 @@ def test_realsense_refusals(install: Install) -> None:
         device("realsense", {"serial": "f999"}).open()
 
 
-def test_azure_kinect(install: Install) -> None:
+def test_azure_kinect_stream(install: Install) -> None:
     package = FakeK4A()
     install(package)
     with device("azure-kinect", {"mode": "WFOV_2X2BINNED", "frame_rate_hz": "30"}).open() as stream:
         assert package.config.depth_mode.name == "WFOV_2X2BINNED"
         assert package.config.camera_fps.name == "FPS_30"
-        frame = stream.read(7)  # frame 0 told the size, and frame 1 has no depth
+        frame = stream.read(7)  # frame 0 gave the size, and frame 1 has no depth
     assert frame.index == 7
     check_depth(frame, 2, 0.001)
     assert frame.timestamp == pytest.approx(0.1 + 2 * 0.066667)
@@ -130,7 +130,7 @@ def test_azure_kinect(install: Install) -> None:
         device("azure-kinect", {"frame_rate_hz": "20"}).open()
 
 
-def test_orbbec(install: Install) -> None:
+def test_orbbec_stream(install: Install) -> None:
     package = FakeOrbbec()
     install(package)
     with device("orbbec", {}).open() as stream:
@@ -154,7 +154,7 @@ def test_orbbec_without_infrared(install: Install) -> None:
 
 
 @pytest.mark.parametrize("converted", [True, False])
-def test_ifm(install: Install, converted: bool) -> None:
+def test_ifm_stream(install: Install, converted: bool) -> None:
     install(*fake_ifm3d(converted=converted).values())
     with device("ifm-o3r", {}).open() as stream:
         frame = stream.read(0)
@@ -168,7 +168,7 @@ def test_ifm(install: Install, converted: bool) -> None:
         device("ifm-o3r", {"address": "0.0.0.0"}).open()
 
 
-def test_options_and_packages_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_options_and_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(devices()) == {"azure-kinect", "ifm-o3r", "orbbec", "realsense"}
     with pytest.raises(InputError, match="no camera 'webcam'"):
         device("webcam", {})
@@ -179,18 +179,18 @@ def test_options_and_packages_that_are_missing(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match="use true or false"):
         device("orbbec", {"infrared": "1"})
     for name, kind in devices().items():
-        monkeypatch.setitem(sys.modules, kind.package[1], None)  # as if it weren't there
+        monkeypatch.setitem(sys.modules, kind.package[1], None)  # as if not installed
         with pytest.raises(DeviceError, match=f"pip install {kind.package[0]}"):
             device(name, {}).open()
 
 
-def test_record_keeps_what_the_camera_sent(install: Install, tmp_path: Path) -> None:
+def test_recorded_frames_match_stream(install: Install, tmp_path: Path) -> None:
     install(*fake_ifm3d(frames=5).values())
-    told: list[int] = []
+    counts: list[int] = []
     with device("ifm-o3r", {}).open() as stream:
-        done = record(stream, tmp_path / "a", frames=3, progress=told.append)
+        done = record(stream, tmp_path / "a", frames=3, progress=counts.append)
     assert (done.frames, done.dropped, done.ended_by) == (3, 0, "asked")
-    assert told == [1, 2, 3]
+    assert counts == [1, 2, 3]
     recording = tofuse.open(tmp_path / "a")
     assert recording.metadata["sensor"] == "ifm O3R (ToF)"
     assert np.diff(recording.timestamps) == pytest.approx(1 / 20, abs=1e-6)
@@ -202,7 +202,7 @@ def test_record_keeps_what_the_camera_sent(install: Install, tmp_path: Path) -> 
     assert np.allclose(frame.camera.rays(), stream.settings.camera.rays())
 
 
-def test_a_camera_that_fails_leaves_what_it_sent(install: Install, tmp_path: Path) -> None:
+def test_failing_camera_keeps_recorded_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=4))
     with device("realsense", {}).open() as stream:
         done = record(stream, tmp_path / "a", seconds=60)
@@ -211,20 +211,20 @@ def test_a_camera_that_fails_leaves_what_it_sent(install: Install, tmp_path: Pat
     assert len(tofuse.open(tmp_path / "a")) == 4
 
 
-def test_record_ends_by_the_cameras_clock(install: Install, tmp_path: Path) -> None:
+def test_record_duration_follows_camera_clock(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=5))
     with device("realsense", {}).open() as stream:
         assert record(stream, tmp_path / "a", seconds=0.05).frames == 2
 
 
-def test_a_camera_that_sends_nothing_leaves_nothing(install: Install, tmp_path: Path) -> None:
+def test_camera_without_frames_leaves_no_recording(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=0))
     with device("realsense", {}).open() as stream, pytest.raises(DeviceError, match="no frame"):
         record(stream, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
-def test_record_refuses_a_folder_that_holds_something(install: Install, tmp_path: Path) -> None:
+def test_record_rejects_non_empty_folder(install: Install, tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     install(FakeRealSense())
     with device("realsense", {}).open() as stream, pytest.raises(OutputError, match="isn't empty"):
@@ -233,7 +233,7 @@ def test_record_refuses_a_folder_that_holds_something(install: Install, tmp_path
 
 
 class Endless(Stream):
-    """Sends at once whatever is asked for."""
+    """Sends every requested frame immediately."""
 
     def __init__(self, settings: Any, frames: int) -> None:
         self.settings, self.left = settings, frames
@@ -249,7 +249,7 @@ class Endless(Stream):
         pass
 
 
-def test_a_slow_disk_costs_frames_and_says_how_many(install: Install, tmp_path: Path) -> None:
+def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense())
     with device("realsense", {}).open() as camera:
         stream = Endless(camera.settings, 5000)
@@ -258,7 +258,7 @@ def test_a_slow_disk_costs_frames_and_says_how_many(install: Install, tmp_path: 
     assert done.dropped > 0
     indices = np.rint(tofuse.open(tmp_path / "a").timestamps * 30)
     assert (np.diff(indices) >= 1).all()
-    assert indices[-1] > 99  # what was dropped is a gap in time, not hidden
+    assert indices[-1] > 99  # dropped frames leave a gap in the timestamps
 
 
 def test_record_command(
@@ -279,7 +279,7 @@ def test_record_command(
 
 
 class Clock:
-    """Time that passes only when someone sleeps or works."""
+    """Simulated time, advanced by sleeping and by the test."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -299,7 +299,7 @@ def ten_frames(times: Any = None) -> Recording:
     return Recording.of(ArraySource(frames), "made", "made")
 
 
-def test_player_keeps_time() -> None:
+def test_player_keeps_timing() -> None:
     clock = Clock()
     player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
     seen = [(frame.index, round(clock.now - 100, 6)) for frame in player]
@@ -307,7 +307,7 @@ def test_player_keeps_time() -> None:
     assert player.dropped == []
 
 
-def test_player_drops_what_comes_too_late_and_gives_the_newest() -> None:
+def test_player_drops_late_frames_and_returns_newest() -> None:
     clock = Clock()
     player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
     seen = []
@@ -319,22 +319,22 @@ def test_player_drops_what_comes_too_late_and_gives_the_newest() -> None:
     assert player.dropped == [1, 3, 4, 6, 8]
 
 
-def test_player_at_another_speed() -> None:
+def test_player_speed() -> None:
     clock = Clock()
     player = Player(ten_frames(), speed=2.0, clock=lambda: clock.now, sleep=clock.sleep)
     assert len(list(player)) == 10
     assert clock.now - 100 == pytest.approx(0.45)
 
 
-def test_player_refuses() -> None:
+def test_player_rejects_invalid_input() -> None:
     with pytest.raises(InputError, match="decrease"):
         Player(ten_frames(np.array([0.0, 0.2, 0.1])))
     with pytest.raises(InputError, match="speed"):
         Player(ten_frames(), speed=0.0)
 
 
-def test_a_mapper_takes_frames_as_they_come(room_recording: Path) -> None:
-    """A late program loses frames, and the mapper goes on with those that it gets."""
+def test_mapper_tolerates_dropped_frames(room_recording: Path) -> None:
+    """A slow program misses frames, and the mapper continues with the others."""
     recording = tofuse.open(room_recording)
     clock = Clock()
     step = float(np.median(np.diff(recording.timestamps)))
