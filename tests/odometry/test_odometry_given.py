@@ -28,21 +28,21 @@ def bare(covariance=None):
     return tracked(BARE, covariance, boxes=(), spots=0)
 
 
-def test_poses_stay_in_the_frame_of_their_component() -> None:
+def test_stated_poses_keep_their_component() -> None:
     steps = tracked(WALK)
     for step, T in zip(steps, WALK, strict=True):
         np.testing.assert_array_equal(step.T_component_camera, T)
         assert step.component == 2
 
 
-def test_given_poses_begin_with_the_identity() -> None:
+def test_given_poses_start_at_identity() -> None:
     tracker = GivenPoses().start(0)
     steps = [tracker.push(seen(T, k), T) for k, T in enumerate(WALK)]
     for step, T in zip(steps, WALK, strict=True):
         np.testing.assert_allclose(step.T_component_camera, se3.inverse(WALK[0]) @ T, atol=1e-12)
 
 
-def test_a_degenerate_registration_is_constrained_by_the_earlier_result() -> None:
+def test_earlier_result_constrains_degenerate_registration() -> None:
     alone = bare()[1].registration
     assert len(alone.unobservable) > 0
     found = bare(SMALL)[1].registration
@@ -52,7 +52,7 @@ def test_a_degenerate_registration_is_constrained_by_the_earlier_result() -> Non
     assert sigma[:3] == pytest.approx(np.sqrt(2) * 0.002, rel=0.1)
 
 
-def test_an_earlier_result_without_bounds_constrains_nothing() -> None:
+def test_unbounded_earlier_result_adds_no_constraint() -> None:
     unbounded = SMALL.copy()
     unbounded[0, 0] = 4.0
     alone, found = bare()[1].registration, bare(unbounded)[1].registration
@@ -60,7 +60,7 @@ def test_an_earlier_result_without_bounds_constrains_nothing() -> None:
     assert len(found.unobservable) == len(alone.unobservable)
 
 
-def test_a_frame_without_a_stated_pose_is_lost() -> None:
+def test_frame_without_stated_pose_is_lost() -> None:
     stated = {0: StatedPose("tracked", "", WALK[0]), 1: StatedPose("lost", "too dark")}
     tracker = StatedPoses(stated, GivenPoses()).start(0)
     steps = [tracker.push(seen(WALK[0], k)) for k in range(3)]

@@ -39,22 +39,22 @@ def small(monkeypatch):
     return KeyframeMap(0.2, 0.1)
 
 
-def test_memory_stays_flat_and_the_newest_stays(small) -> None:
+def test_keyframe_count_is_bounded_and_newest_is_kept(small) -> None:
     for k in range(30):
         small.add(along(0.3 * k, k))
         assert len(small) == min(k + 1, 4)
         assert small.newest.view.index == k
 
 
-def test_there_are_no_more_than_so_many() -> None:
+def test_default_capacity_is_not_exceeded() -> None:
     keyframes = KeyframeMap(0.2, 0.1)
     for k in range(keyframe_map.CAPACITY + 10):
         keyframes.add(along(0.3 * k, k))
     assert len(keyframes) == keyframe_map.CAPACITY
 
 
-def test_of_two_that_are_near_the_later_one_goes(small) -> None:
-    """There and back again: frames 0 to 4 cover the way, what came later lies on them."""
+def test_later_of_two_close_keyframes_is_removed(small) -> None:
+    """Out and back: frames 0 to 4 cover the path, later ones revisit it."""
     for n, place in enumerate([0, 1, 2, 3, 4, 3, 2, 1]):
         small.add(along(0.3 * place + 0.001 * n, n))
     found = kept(small)
@@ -62,34 +62,34 @@ def test_of_two_that_are_near_the_later_one_goes(small) -> None:
     assert len({min(n, 8 - n) for n in found}) == 4  # no place twice
 
 
-def test_turns_count_like_motions(small) -> None:
+def test_rotation_counts_like_translation(small) -> None:
     for index, angle in enumerate([0.0, 1.0, 1.05, 2.0, 3.0]):
         small.add(turned(angle, index))
     assert kept(small) == [0, 1, 3, 4]
 
 
-def test_places_of_other_components_are_elsewhere(small) -> None:
+def test_keyframes_of_different_components_are_not_compared(small) -> None:
     """Poses are comparable within a component only."""
     for index, (x, component) in enumerate([(0.0, 0), (0.5, 0), (0.01, 1), (0.6, 1), (0.0, 2)]):
         small.add(along(x, index, component))
-    # Of each component two or one: the nearest two of one component are 0 and 1.
+    # Two or one of each component: the nearest two of one component are 0 and 1.
     assert kept(small) == [0, 2, 3, 4]
 
 
-def test_the_only_keyframe_of_a_component_outlives_many_of_another(small) -> None:
+def test_only_keyframe_of_component_is_kept(small) -> None:
     small.add(along(0.0, 0, 0))
     for k in range(1, 12):
         small.add(along(0.3 * k, k, 1))
     assert kept(small)[0] == 0
 
 
-def test_of_components_of_one_keyframe_the_oldest_goes(small) -> None:
+def test_oldest_of_single_keyframe_components_is_removed(small) -> None:
     for k in range(7):
         small.add(along(0.0, k, k))
     assert kept(small) == [3, 4, 5, 6]
 
 
-def test_a_view_becomes_a_keyframe_by_its_motion() -> None:
+def test_motion_decides_when_view_becomes_keyframe() -> None:
     keyframes = KeyframeMap(0.2, 0.1)
     first = along(0.0, 0)
     keyframes.add(first)
@@ -110,12 +110,12 @@ def around():
     return keyframes, poses
 
 
-def test_the_one_that_looks_most_alike_is_found(around) -> None:
+def test_most_similar_keyframe_is_found(around) -> None:
     keyframes, poses = around
     for k, T in enumerate(poses):
         near = surface(seen(T @ se3.exp([0.02, 0, 0, 0, 0.05, 0]), 9))
         assert keyframes.most_similar(near, 9).view.index == k
-        # Of its own component none is asked for.
+        # Excluding keyframes of its own component.
         other = keyframes.most_similar(near, k // 3)
         assert other.component != k // 3
     only = KeyframeMap(0.2, 0.1)
@@ -124,7 +124,7 @@ def test_the_one_that_looks_most_alike_is_found(around) -> None:
     assert only.most_similar(VIEW, 2) is None
 
 
-# The budget of searches
+# Search budget
 
 
 def relocalizer():
@@ -132,7 +132,7 @@ def relocalizer():
 
 
 def counted(monkeypatch):
-    """Searches that find nothing; the frames that were asked for."""
+    """Searches that find nothing; returns the list of searched pairs."""
     asked = []
 
     def registered(view, target, **_):
@@ -142,7 +142,7 @@ def counted(monkeypatch):
     return asked
 
 
-def test_searches_are_few_at_first_and_more_with_the_frames(around, monkeypatch) -> None:
+def test_search_budget_grows_with_frames(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)
     budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
@@ -157,7 +157,7 @@ def test_searches_are_few_at_first_and_more_with_the_frames(around, monkeypatch)
     assert 10 <= len(asked) - at_first <= 50
 
 
-def test_a_pair_is_searched_once_for_each_view(around, monkeypatch) -> None:
+def test_each_pair_of_views_is_searched_once(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)
     budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
@@ -166,13 +166,13 @@ def test_a_pair_is_searched_once_for_each_view(around, monkeypatch) -> None:
     assert len(asked) == len(set(asked)) > 0
 
 
-def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) -> None:
+def test_newest_and_most_similar_keyframes_are_searched(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)
     lost = surface(seen(at(0, 0.3, 0.72), 7))
     assert relocalizer().links(lost, keyframes, 2, 5) == ()
     assert asked == [(7, 5), (7, 1)]
-    # Not in its own component, and each once.
+    # Only in other components, each keyframe once.
     asked.clear()
     relocalizer().links(lost, keyframes, 1)
     assert [j for _, j in asked] == [1]
@@ -182,13 +182,13 @@ def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) ->
     assert [j for _, j in asked] == [5]
 
 
-def test_without_options_nothing_is_searched(around, monkeypatch) -> None:
+def test_no_search_without_options(around, monkeypatch) -> None:
     asked = counted(monkeypatch)
     assert Relocalizer(None, UsualFit()).links(VIEW, around[0], 9) == ()
     assert asked == []
 
 
-def test_a_lost_view_is_linked_where_it_is(around) -> None:
+def test_lost_view_is_linked_at_correct_pose(around) -> None:
     keyframes, poses = around
     T = poses[1] @ se3.exp([0.05, 0, 0, 0, 0.1, 0])
     links = relocalizer().links(surface(seen(T, 7)), keyframes, 9)
@@ -199,7 +199,7 @@ def test_a_lost_view_is_linked_where_it_is(around) -> None:
     assert np.linalg.norm(off[:3, 3]) < 0.01
 
 
-def test_a_view_of_another_scene_is_linked_to_nothing_for_certain(around) -> None:
+def test_view_of_another_scene_gets_no_certain_link(around) -> None:
     frame = seen(at(0.1, 0, 2.0), 7, boxes=OTHER, half=(2.3, 1.2, 2.2), scene=9)
     links = relocalizer().links(surface(frame), around[0], 9)
     assert not any(link.certain for link in links)

@@ -22,7 +22,7 @@ from tofuse.recordings.open import open_recording
 from tofuse.sensor.models import camera_model
 
 MODEL = camera_model("sr4000")
-BAD = 4  # which frame is spoilt
+BAD = 4  # index of the corrupted frame
 
 
 class Sequence:
@@ -55,7 +55,7 @@ def unlit(frames):
 
 
 def in_order(frames):
-    """The same images as if they came one after another, without times."""
+    """The same images as consecutive frames, without timestamps."""
     return [replace(f, index=k, timestamp=float(k)) for k, f in enumerate(frames)]
 
 
@@ -77,7 +77,7 @@ def assert_near(T, true, metres=0.015, degrees=0.6):
 
 
 def assert_right(steps, poses, metres=0.015, degrees=0.6):
-    """Every frame is lost, or right in its component; so are the links that are certain."""
+    """Every frame is lost or correct within its component; so are certain links."""
     T_world_component = {}
     for step, true in zip(steps, poses, strict=True):
         if step.T_component_camera is None:
@@ -106,7 +106,7 @@ def certain_links(steps):
 
 @pytest.mark.parametrize("amplitude", [True, False])
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_it_follows_the_camera(request, scene, amplitude):
+def test_camera_is_tracked(request, scene, amplitude):
     sequence = request.getfixturevalue(scene)
     steps = run(sequence.frames if amplitude else unlit(sequence.frames))
     np.testing.assert_array_equal(steps[0].T_component_camera, np.eye(4))
@@ -126,21 +126,21 @@ def test_it_follows_the_camera(request, scene, amplitude):
         assert np.linalg.eigvalsh(found.information).min() > 0
 
 
-def test_a_frame_far_from_the_keyframe_becomes_one(room):
+def test_motion_thresholds_decide_keyframes(room):
     never = run(room.frames, Keyframes(keyframe_angle=3.0, keyframe_distance=9.0))
     assert {step.reference for step in never[1:]} == {0}
     always = run(room.frames, Keyframes(keyframe_angle=0.001))
     assert [step.reference for step in always[1:]] == list(range(7))
 
 
-def test_few_keyframes_are_enough_to_follow(room, monkeypatch):
+def test_tracking_works_with_few_keyframes(room, monkeypatch):
     monkeypatch.setattr(keyframe_map, "CAPACITY", 3)
     steps = run(room.frames, Keyframes(keyframe_angle=0.001))
     assert components(steps) == [0] * 8
     assert_right(steps, room.poses)
 
 
-def test_a_frame_that_fits_nothing_costs_only_so_many_alignments(corner, elsewhere, monkeypatch):
+def test_alignments_for_unmatched_frame_are_limited(corner, elsewhere, monkeypatch):
     tracker = Keyframes(keyframe_angle=0.001).start(0)
     for frame in corner.frames:
         tracker.push(frame)
@@ -158,7 +158,7 @@ def test_a_frame_that_fits_nothing_costs_only_so_many_alignments(corner, elsewhe
     assert len(tried) < 50
 
 
-def test_what_is_out_of_the_ordinary_is_reported(room):
+def test_missing_prediction_and_albedo_are_reported(room):
     frames = list(room.frames)
     frames[BAD] = scaled(frames[BAD], 0)
     steps = run(frames)
@@ -169,8 +169,8 @@ def test_what_is_out_of_the_ordinary_is_reported(room):
     assert all("albedo took no part" in step.reason for step in run(dark)[1:3])
 
 
-def test_the_last_motion_goes_on(room, monkeypatch):
-    """There an alignment begins; what the data leaves open goes on as it did on the mean."""
+def test_last_motion_is_extrapolated(room, monkeypatch):
+    """It gives the initial pose; the mean motion is used along degenerate directions."""
     asked = []
     align = hypotheses.align
 
@@ -187,9 +187,9 @@ def test_the_last_motion_goes_on(room, monkeypatch):
     np.testing.assert_allclose(predicted, steady, atol=1e-3)
 
 
-def test_odometry_is_used_where_the_images_leave_it_open():
+def test_odometry_fills_degenerate_directions():
     sequence = Sequence("wall", range(0, 15, 3))
-    # In a frame of its own, as odometry files are.
+    # In a frame of reference of its own, as in odometry files.
     T_odometry = [se3.exp([3, 1, -2, 0.3, 0.7, -1]) @ T for T in sequence.poses]
     steps = run(unlit(sequence.frames), Keyframes(guess="odometry"), T_odometry)
     assert components(steps) == [0] * 5
@@ -200,7 +200,7 @@ def test_odometry_is_used_where_the_images_leave_it_open():
     assert sum(degenerate) >= 3 * len(degenerate) - 1
 
 
-def test_a_guess_may_stand_still(room):
+def test_camera_is_tracked_with_identity_guess(room):
     steps = run(room.frames, Keyframes(guess="identity"))
     assert components(steps) == [0] * 8
     assert_right(steps, room.poses)
@@ -236,7 +236,7 @@ NONSENSE = {
         f, depth=np.where(RNG.random(f.depth.shape) < 0.6, RNG.choice([0.3, 8.0]), f.depth)
     ),
 }
-# These may be images of another place; whether they are is for the inspection to say.
+# These could be images of another place; only the inspection can tell.
 PLAUSIBLE = {
     "mirrored": lambda f: rearranged(f, np.s_[:, ::-1]),
     "upside down": lambda f: rearranged(f, np.s_[::-1]),
@@ -256,7 +256,7 @@ def spoilt(request, scene, amplitude, spoil):
 @pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
 @pytest.mark.parametrize("spoil", UNUSABLE.values(), ids=UNUSABLE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_an_image_of_which_nothing_can_be_made_is_lost(request, scene, spoil, amplitude):
+def test_unusable_image_is_lost(request, scene, spoil, amplitude):
     steps, poses = spoilt(request, scene, amplitude, spoil)
     assert_lost(steps[BAD])
     assert components(steps) == [0] * BAD + [None] + [0] * (7 - BAD)
@@ -266,7 +266,7 @@ def test_an_image_of_which_nothing_can_be_made_is_lost(request, scene, spoil, am
 @pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
 @pytest.mark.parametrize("spoil", NONSENSE.values(), ids=NONSENSE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_an_image_of_nonsense_is_connected_to_nothing(request, scene, spoil, amplitude):
+def test_corrupted_image_stays_unconnected(request, scene, spoil, amplitude):
     steps, poses = spoilt(request, scene, amplitude, spoil)
     found = components(steps)
     assert found[:BAD] == [0] * BAD
@@ -274,15 +274,15 @@ def test_an_image_of_nonsense_is_connected_to_nothing(request, scene, spoil, amp
     assert len(set(found[BAD + 1 :])) == 1
     assert not any(BAD in pair for pair in certain_links(steps))
     assert_right(steps, poses)
-    # What follows is linked to what was before.
+    # Later frames are linked to earlier ones.
     assert found[-1] == 0 or any(i < BAD < j for i, j in certain_links(steps))
 
 
 @pytest.mark.parametrize("spoil", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_an_image_as_of_another_place_leaves_the_others_right(request, scene, spoil):
+def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, spoil):
     steps, poses = spoilt(request, scene, True, spoil)
-    # Before it all are right, and those after it in relation to each other.
+    # Poses before it are correct; those after it are mutually consistent.
     assert components(steps)[:BAD] == [0] * BAD
     assert None not in components(steps)
     assert_right(steps[:BAD], poses[:BAD])
@@ -291,7 +291,7 @@ def test_an_image_as_of_another_place_leaves_the_others_right(request, scene, sp
 
 
 @pytest.mark.parametrize("spoil", ["mirrored", "upside down", "turned round"])
-def test_a_stretch_of_wrong_images_is_a_component_of_its_own(corner, spoil):
+def test_run_of_wrong_images_forms_its_own_component(corner, spoil):
     frames = list(corner.frames)
     frames[3:6] = [PLAUSIBLE[spoil](frame) for frame in frames[3:6]]
     steps = run(frames)
@@ -303,7 +303,7 @@ def test_a_stretch_of_wrong_images_is_a_component_of_its_own(corner, spoil):
 
 
 @pytest.mark.parametrize("spoil", [UNUSABLE["blank"], UNUSABLE["sparse"]], ids=["blank", "sparse"])
-def test_a_recording_may_begin_with_spoilt_frames(room, spoil):
+def test_recording_may_start_with_corrupted_frames(room, spoil):
     steps = run([spoil(room.frames[0]), spoil(room.frames[1]), *room.frames[2:]])
     assert components(steps) == [None, None] + [0] * 6
     np.testing.assert_array_equal(steps[2].T_component_camera, np.eye(4))
@@ -311,14 +311,14 @@ def test_a_recording_may_begin_with_spoilt_frames(room, spoil):
     assert_right(steps, room.poses)
 
 
-def test_a_camera_that_stands_still_stands_still(room):
+def test_static_camera_stays_static(room):
     steps = run([*room.frames[:4], *[replace(room.frames[3], index=k) for k in range(4, 8)]])
     assert components(steps) == [0] * 8
     assert_right(steps, [*room.poses[:4], *[room.poses[3]] * 4])
 
 
 @pytest.mark.parametrize("searches", [True, False])
-def test_a_camera_that_jumps_elsewhere_and_back_makes_three_components(corner, elsewhere, searches):
+def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
     poses = [*corner.poses[:4], *[None] * 3, *corner.poses[2:5]]
     steps = run(frames, Keyframes(searches=searches))
@@ -328,13 +328,13 @@ def test_a_camera_that_jumps_elsewhere_and_back_makes_three_components(corner, e
         assert f"begins component {steps[k].component}" in steps[k].reason
         assert steps[k].registration is None
         np.testing.assert_array_equal(steps[k].T_component_camera, np.eye(4))
-    # The last one is found to belong to the first, and the other place to neither.
+    # The last component is linked to the first; the other place is linked to neither.
     links = certain_links(steps)
     assert not any(4 <= i < 7 or 4 <= j < 7 for i, j in links)
     assert any(i < 4 and j >= 7 for i, j in links) == searches
 
 
-def test_links_are_between_components_that_were_tracked(corner, elsewhere):
+def test_links_connect_different_components(corner, elsewhere):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
     steps = run(frames)
     for k, step in enumerate(steps):
@@ -345,8 +345,8 @@ def test_links_are_between_components_that_were_tracked(corner, elsewhere):
             assert np.linalg.eigvalsh(link.information).min() > 0
 
 
-def test_what_the_images_leave_open_is_reported():
-    """A flat wall without albedo fits wherever the camera may have gone meanwhile."""
+def test_degenerate_directions_are_reported():
+    """A flat wall without albedo does not constrain motion within its plane."""
     wall = Sequence("wall", range(0, 12, 3), False)
     frames = unlit(wall.frames)
     for steps in (run(frames), run([frames[0], scaled(frames[1], 0), *frames[2:]])):
@@ -355,7 +355,7 @@ def test_what_the_images_leave_open_is_reported():
                 assert len(step.registration.unobservable) >= 1
 
 
-def test_threads_change_nothing(room, elsewhere):
+def test_result_is_independent_of_threads(room, elsewhere):
     frames = in_order([*room.frames[:3], *elsewhere, *room.frames[2:5]])
     results = []
     for count in (1, 2):
@@ -370,7 +370,7 @@ def test_threads_change_nothing(room, elsewhere):
         ]
 
 
-def test_where_a_recording_begins_the_motion_need_not_go_on(room):
+def test_interruption_starts_component_without_motion_prior(room):
     frames, poses = [*room.frames[:6], *room.frames[:6]], [*room.poses[:6], *room.poses[:6]]
     tracker = Keyframes().start(0)
     steps = []
@@ -382,18 +382,18 @@ def test_where_a_recording_begins_the_motion_need_not_go_on(room):
     assert_right(steps, poses)
     assert "nothing comparable was seen before" in steps[6].reason
     assert any(j == 6 for _, j in certain_links(steps))
-    # The same without a word is no wrong pose either.
+    # Without announcing the interruption, no pose is wrong either.
     assert_right(run(in_order(frames)), poses)
 
 
-def test_at_low_frame_rates_the_motion_may_change(room):
+def test_motion_may_change_at_low_frame_rates(room):
     frames, poses = [*room.frames[:4], *room.frames[:4]], [*room.poses[:4], *room.poses[:4]]
     steps = run([replace(f, index=k, timestamp=0.8 * k) for k, f in enumerate(frames)])
     assert components(steps) == [0] * 8
     assert_right(steps, poses)
 
 
-def test_a_prepared_view_is_as_good_as_the_frame(room):
+def test_prepared_view_gives_same_pose_as_frame(room):
     plain, early = Keyframes().start(0), Keyframes().start(0)
     for frame in room.frames[:3]:
         made = early.prepare(frame)
@@ -424,7 +424,7 @@ def test_clouds_are_refused():
         ("recovery", {}),
     ],
 )
-def test_options_that_make_no_sense_are_refused_with_their_name(path, value):
+def test_invalid_options_are_refused_by_name(path, value):
     options = value
     for name in reversed(path.split(".")):
         options = {name: options}
@@ -433,8 +433,8 @@ def test_options_that_make_no_sense_are_refused_with_their_name(path, value):
     assert "my.toml: odometry" in str(refused.value)
 
 
-def test_a_real_camera_that_was_carried_on_is_right_or_doubtful(shared_data):
-    """Two positions 305 mm apart along a corridor; what is between was not recorded."""
+def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
+    """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
     recording = open_recording(shared_data / "sr4000_corridor")
     steps = run([recording[k] for k in range(len(recording))])
     assert components(steps)[:4] == [0] * 4
@@ -448,8 +448,8 @@ def test_a_real_camera_that_was_carried_on_is_right_or_doubtful(shared_data):
             assert link.T_i_j[2, 3] == pytest.approx(0.305, abs=0.02)
 
 
-def test_a_real_camera_close_to_a_door_stays_where_it_is(shared_data):
-    """A quarter of a metre from it, moved by less than 1 cm: nothing must slide along it."""
+def test_real_camera_near_door_does_not_slide(shared_data):
+    """At a distance of 0.25 m, moved by less than 1 cm: poses must not slide along the door."""
     recording = open_recording(shared_data / "iphone_record3d")
     steps = run([recording[k] for k in range(0, len(recording), 3)])
     assert set(components(steps)) == {0}
@@ -458,12 +458,12 @@ def test_a_real_camera_close_to_a_door_stays_where_it_is(shared_data):
         assert np.linalg.norm((se3.inverse(true) @ step.T_component_camera)[:3, 3]) < 0.02
 
 
-def test_a_box_that_turns_by_half_a_corner_is_not_taken_for_its_other_sides():
+def test_rotated_box_is_not_registered_to_wrong_side():
     """At 46 degrees an alignment from the initial pose may converge to an error of 90 degrees."""
     scene = Sequence("box", range(0, 4 * 72, 72))
     steps = run([f.keep(f.z < 1.8) for f in scene.frames])
     assert_right(steps, scene.poses)
-    # Between neighbours the search has an answer: each goes on from the last one, or is linked.
+    # Each view continues the component of the one before, or is linked to it.
     linked = certain_links(steps)
     for k in (1, 2, 3):
         assert steps[k].component == steps[k - 1].component or (k - 1, k) in linked

@@ -1,4 +1,4 @@
-"""The motion model: continued motion is expected, a jump is outside of the gate."""
+"""Motion model: continued motion passes the gate, a jump does not."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
 
 def counted(k):
-    """A frame of which no time is known."""
+    """A frame of unknown time."""
     return Moment(k, float(k))
 
 
@@ -40,7 +40,7 @@ def elsewhere(T, metres=0.3, angle=0.0):
 
 
 @pytest.mark.parametrize("when", [counted, timed(15.0)])
-def test_the_last_motion_goes_on_over_frames_without_a_pose(when) -> None:
+def test_last_motion_is_extrapolated_over_lost_frames(when) -> None:
     poses = walk(9)
     motion = MotionModel()
     assert motion.predicted_pose(when(0)) is None
@@ -55,8 +55,8 @@ def test_the_last_motion_goes_on_over_frames_without_a_pose(when) -> None:
     np.testing.assert_allclose(motion.predicted_pose(when(8)), poses[8], atol=1e-12)
 
 
-def test_uneven_times_are_no_surprise() -> None:
-    """A camera moves evenly; frames are missing, and come late."""
+def test_uneven_timestamps_stay_within_gate() -> None:
+    """A camera moves evenly; frames are missing or late."""
     rng = np.random.default_rng(2)
     twist = np.array([0.6, 0, 0.2, 0, 0.9, 0.3])  # per second
     motion, t = MotionModel(), 0.0
@@ -69,7 +69,7 @@ def test_uneven_times_are_no_surprise() -> None:
         motion.update(T, now)
 
 
-def test_the_mean_motion_goes_on_more_steadily() -> None:
+def test_smoothed_prediction_is_less_noisy() -> None:
     rng = np.random.default_rng(5)
     true = walk(40)
     noise = np.array([0.004] * 3 + [0.005] * 3)
@@ -82,14 +82,14 @@ def test_the_mean_motion_goes_on_more_steadily() -> None:
             last.append(se3.log(back @ motion.predicted_pose(then)) / noise)
             mean.append(se3.log(back @ motion.smoothed_pose(then)) / noise)
     last, mean = (np.sqrt(np.mean(np.square(off))) for off in (last, mean))
-    # Of both ends of one motion, and of the newest place, beside hardly more than the latter.
+    # The last motion has the noise of two poses, the mean hardly more than the newest pose's.
     assert 1.9 < last < 2.6
     assert mean < 0.65 * last
     motion.interrupt()
     assert motion.smoothed_pose(counted(40)) is None
 
 
-def test_a_jump_hardly_counts_in_the_mean() -> None:
+def test_jump_barely_affects_mean_motion() -> None:
     poses = walk(9)
     motion = followed(poses[:8])
     there = elsewhere(poses[8], 0.5, 0.6)
@@ -101,16 +101,16 @@ def test_a_jump_hardly_counts_in_the_mean() -> None:
 
 @pytest.mark.parametrize(("metres", "angle"), [(0.3, 0.0), (0.0, 0.2)])
 @pytest.mark.parametrize("when", [counted, timed(30.0)])
-def test_a_place_out_of_nowhere_is_a_surprise(metres, angle, when) -> None:
+def test_sudden_displacement_violates_gate(metres, angle, when) -> None:
     poses = walk(9)
     motion = followed(poses[:7], when)
     words = motion.gate_violation(elsewhere(poses[7], metres, angle), when(7))
     assert f"{metres:.2f} m and {np.degrees(angle):.0f} degrees" in words
-    # What was expected is still expected after it.
+    # The regular motion still passes afterwards.
     assert not motion.gate_violation(elsewhere(poses[8], 0.02), when(8))
 
 
-def test_a_surprise_differs_by_more_than_is_allowed() -> None:
+def test_gate_violation_starts_at_limits() -> None:
     poses = walk(8)
     motion = followed(poses[:7])
     far, angle = motion.gate(counted(7))
@@ -120,7 +120,7 @@ def test_a_surprise_differs_by_more_than_is_allowed() -> None:
     assert motion.gate_violation(elsewhere(poses[7], 0.0, 1.01 * angle), counted(7))
 
 
-def test_what_goes_on_from_a_jump_is_expected() -> None:
+def test_motion_after_accepted_jump_passes_gate() -> None:
     poses = walk(12)
     motion = followed(poses[:6])
     jumped = [elsewhere(poses[5], 0.5) @ se3.inverse(poses[5]) @ T for T in poses]
@@ -132,7 +132,7 @@ def test_what_goes_on_from_a_jump_is_expected() -> None:
     np.testing.assert_allclose(motion.predicted_pose(counted(10)), jumped[10], atol=1e-12)
 
 
-def test_after_a_long_loss_of_unknown_time_the_camera_may_be_anywhere() -> None:
+def test_gate_is_unbounded_after_long_loss_of_unknown_duration() -> None:
     motion = followed(walk(6))
     far = elsewhere(np.eye(4), 5.0, 2.0)
     assert motion.gate_violation(far, counted(6))
@@ -140,7 +140,7 @@ def test_after_a_long_loss_of_unknown_time_the_camera_may_be_anywhere() -> None:
     assert np.isinf(motion.gate(counted(12))).all()
 
 
-def test_after_an_interruption_it_may_be_anywhere() -> None:
+def test_gate_is_unbounded_after_interruption() -> None:
     motion = followed(walk(6))
     motion.interrupt()
     assert motion.predicted_pose(counted(6)) is None
@@ -148,7 +148,7 @@ def test_after_an_interruption_it_may_be_anywhere() -> None:
     assert not motion.gate_violation(elsewhere(np.eye(4), 5.0, 2.0), counted(6))
 
 
-def test_a_restless_camera_may_be_restless() -> None:
+def test_irregular_motion_stays_within_gate() -> None:
     rng = np.random.default_rng(1)
     poses = [np.eye(4)]
     for _ in range(12):
@@ -157,7 +157,7 @@ def test_a_restless_camera_may_be_restless() -> None:
     followed(poses)
 
 
-def test_jumps_of_a_whole_path() -> None:
+def test_jumps_of_path_are_found() -> None:
     poses, moments = walk(20), [counted(k) for k in range(20)]
     assert jumps(poses, moments) == []
     shift = elsewhere(np.eye(4), 0.4)
@@ -173,8 +173,8 @@ def test_jumps_of_a_whole_path() -> None:
 @pytest.mark.parametrize(
     ("seconds", "usual"), [(None, False), (0.1, False), (0.2, False), (0.45, True), (2.0, True)]
 )
-def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, usual) -> None:
-    """0.2 m: what 3 m/s^2 lead to in 0.37 s."""
+def test_gate_widens_with_frame_interval(seconds, usual) -> None:
+    """0.2 m: the displacement by 3 m/s^2 in 0.37 s."""
     poses = walk(8)
     when = counted if seconds is None else timed(1 / seconds)
     motion = followed(poses[:7], when)
@@ -182,30 +182,30 @@ def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, usua
     assert (words == "") == usual
 
 
-def test_after_the_longest_time_not_everything_is_believed() -> None:
+def test_gate_stays_bounded_at_longest_interval() -> None:
     poses, when = walk(8), timed(1 / 60.0)
     motion = followed(poses[:7], when)
     assert motion.gate_violation(elsewhere(poses[7], 1.5), when(7))
 
 
-def test_over_a_lost_frame_the_motion_may_change_more() -> None:
+def test_gate_widens_over_lost_frames() -> None:
     poses, when = walk(9), timed(1 / 0.25)
     motion = followed(poses[:7], when)
     assert motion.gate_violation(elsewhere(poses[7], 0.2), when(7))
     assert not motion.gate_violation(elsewhere(poses[8], 0.2), when(8))
 
 
-def test_frames_that_are_only_counted_have_no_time() -> None:
+def test_frame_numbers_are_not_timestamps() -> None:
     assert Moment(5, 0.5).seconds_since(Moment(3, 0.3)) == pytest.approx(0.2)
     assert Moment(5, 5.0).seconds_since(Moment(3, 3.0)) is None
     assert Moment(5, 5.0).since(Moment(3, 3.0)) == 2
     assert Moment(5, 0.5).since(Moment(3, 0.3)) == pytest.approx(0.2)
-    # Times that stand still say nothing.
+    # Constant timestamps carry no information.
     assert Moment(5, 0.3).seconds_since(Moment(3, 0.3)) is None
     assert Moment(5, 0.3).since(Moment(3, 0.3)) == 2
 
 
-def test_jumps_know_the_time() -> None:
+def test_jump_detection_uses_timestamps() -> None:
     poses = walk(20)
     broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
     for rate, found in ((30.0, [8]), (2.0, [])):
@@ -213,14 +213,14 @@ def test_jumps_know_the_time() -> None:
         assert [k for k, _ in jumps(broken, moments)] == found
 
 
-def test_small_motions() -> None:
+def test_limits_of_small_motion() -> None:
     assert is_small(np.eye(4))
     assert is_small(elsewhere(np.eye(4), 0.05, 0.06))
     assert not is_small(elsewhere(np.eye(4), 0.07))
     assert not is_small(elsewhere(np.eye(4), 0.0, 0.08))
 
 
-def test_in_another_component_the_velocity_is_a_guess() -> None:
+def test_new_component_inherits_velocity() -> None:
     poses = walk(10)
     motion = followed(poses[:6])
     motion.change_frame()
@@ -229,7 +229,7 @@ def test_in_another_component_the_velocity_is_a_guess() -> None:
     np.testing.assert_allclose(motion.predicted_pose(counted(7)), step, atol=1e-12)
     assert motion.velocity_is_inherited
     assert motion.normalised_deviation(elsewhere(np.eye(4), 2.0, 1.0), counted(7)) == 0
-    # Once a motion was seen in it, this is what is expected.
+    # A motion observed in the new component replaces it.
     motion.update(step, counted(7))
     assert not motion.velocity_is_inherited
 
@@ -237,13 +237,13 @@ def test_in_another_component_the_velocity_is_a_guess() -> None:
 @pytest.mark.parametrize(
     ("metres", "angle", "possible"), [(0.3, 0.5, True), (0.5, 0.0, False), (0.0, 0.9, False)]
 )
-def test_a_hand_moves_a_camera_only_so_fast(metres, angle, possible) -> None:
+def test_hand_held_speed_limits_feasible_motion(metres, angle, possible) -> None:
     when = timed(10.0)
     motion = followed(walk(3), when)
     assert motion.is_feasible(elsewhere(walk(3)[2], metres, angle), when(3)) is possible
 
 
-def test_deviations_are_multiples_of_what_is_usual() -> None:
+def test_deviation_is_normalised_by_usual_deviation() -> None:
     rng = np.random.default_rng(2)
     poses = [T @ se3.exp(np.array([*rng.normal(0, 0.01, 3), 0, 0, 0])) for T in walk(12)]
     motion = followed(poses[:11])
@@ -264,7 +264,7 @@ def turning(count):
 
 
 @pytest.mark.parametrize(("drift", "proven"), [(0.0, True), (0.1, False)])
-def test_odometry_says_how_the_camera_turned_once_it_has_proved_right(drift, proven) -> None:
+def test_reliable_odometry_predicts_rotation(drift, proven) -> None:
     rng = np.random.default_rng(3)
     poses = turning(12)
     shaken = [T @ se3.exp(np.array([0, 0, 0, *rng.normal(0, 0.01, 3)])) for T in poses]
@@ -282,8 +282,8 @@ def test_odometry_says_how_the_camera_turned_once_it_has_proved_right(drift, pro
         assert se3.angle(off) < 1e-9
 
 
-def test_odometry_predicts_the_position_where_no_direction_constrains_it() -> None:
-    """A slide along a wall that begins suddenly: the tracked motion is the predicted one."""
+def test_odometry_predicts_position_along_degenerate_directions() -> None:
+    """A sudden slide along a wall: the tracked motion equals the predicted one."""
     rng = np.random.default_rng(4)
     poses = [
         se3.exp(np.array([0.05 * max(k - 5, 0), *rng.normal(0, 0.001, 3), 0.01 * k, 0]))
@@ -299,8 +299,8 @@ def test_odometry_predicts_the_position_where_no_direction_constrains_it() -> No
     np.testing.assert_allclose(predicted, poses[-1], atol=1e-9)
 
 
-def test_odometry_that_predicts_worse_than_the_velocity_is_ignored() -> None:
-    """Frozen poses, of a device that lost itself; and the first motion, which nothing predicts."""
+def test_odometry_worse_than_constant_velocity_is_ignored() -> None:
+    """Frozen poses of a device that lost tracking; and the first motion, which nothing predicts."""
     poses = walk(12)
     motion = MotionModel()
     for k, T in enumerate(poses[:11]):
@@ -308,7 +308,7 @@ def test_odometry_that_predicts_worse_than_the_velocity_is_ignored() -> None:
         motion.update(T, counted(k))
     motion.set_odometry(np.eye(4))
     np.testing.assert_allclose(motion.predicted_pose(counted(11)), poses[11], atol=1e-9)
-    # Further than a hand moves a camera between two frames.
+    # Farther than a hand moves a camera between two frames.
     first = MotionModel()
     for far, expected in ((0.1, True), (3.0, False)):
         first.set_odometry(np.eye(4))
@@ -318,7 +318,7 @@ def test_odometry_that_predicts_worse_than_the_velocity_is_ignored() -> None:
         first.interrupt()
 
 
-def test_odometry_that_is_missing_for_a_frame_says_nothing() -> None:
+def test_odometry_after_gap_is_not_used() -> None:
     poses = walk(13)
     motion = MotionModel()
     for k in range(12):

@@ -1,4 +1,4 @@
-"""Moving objects are segmented, the static scene is not, nor do wrong poses cause segments."""
+"""Moving objects are segmented; a static scene and wrong poses give no segments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NEAR = 1.3  # m
 
 
 def followed(objects: MovingObjects, *pair: object) -> Moving:
-    """Compare a view with a reference, and keep what came of it."""
+    """Compare a view with a reference and keep the result."""
     moving = objects.compare(*pair)
     objects.update(moving)
     return moving
@@ -59,7 +59,7 @@ def room():
 
 
 def with_box(frame, centre, half, noise, seed):
-    """Return a frame with a box before the camera, its outline mixed as a sensor does; its mask."""
+    """Add a box with flying pixels at its edges to a frame; return the frame and the mask."""
     rng = np.random.default_rng(seed)
     rays = frame.camera.rays().astype(float)
     d = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
@@ -97,7 +97,7 @@ def trajectory(motion, cover, frame):
 
 
 def segment(frames, poses):
-    """Segment each frame against keyframes as a tracker takes them; views and what was found."""
+    """Segment each frame against keyframes as a tracker does; return views and segments."""
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     objects, key, found = MovingObjects(), 0, []
     for n in range(1, len(frames)):
@@ -111,7 +111,7 @@ def segment(frames, poses):
     return views, found
 
 
-def test_a_static_room_does_not_move(room):
+def test_static_room_has_no_moving_objects(room):
     frames, poses, _ = room
     for _, predicted, moving in segment(frames, poses)[1]:
         assert moving.reliable
@@ -126,7 +126,7 @@ def test_a_static_room_does_not_move(room):
 
 @pytest.mark.parametrize("cover", [0.1, 0.25, 0.4])
 @pytest.mark.parametrize("motion", ["sideways", "towards", "away"])
-def test_a_box_that_moves_is_segmented(room, motion, cover):
+def test_moving_box_is_segmented(room, motion, cover):
     frames, poses, noise = room
     centres, half = trajectory(motion, cover, frames[0])
     made = [
@@ -156,7 +156,7 @@ def test_a_box_that_moves_is_segmented(room, motion, cover):
     assert vacated / len(late) > 0.9
 
 
-def test_what_enters_is_segmented_within_two_frames_and_forgotten_when_it_left(room):
+def test_entering_object_is_segmented_and_forgotten_after_leaving(room):
     frames, poses, noise = room
     centres, half = trajectory("through", 0.1, frames[0])
     made = [
@@ -175,10 +175,10 @@ def test_what_enters_is_segmented_within_two_frames_and_forgotten_when_it_left(r
     assert found[-1][2].fraction < 0.01
 
 
-def test_an_object_that_stops_becomes_static(room):
+def test_stopped_object_becomes_static(room):
     frames, poses, noise = room
     centres, half = trajectory("sideways", 0.15, frames[0])
-    # The camera stands still, too, so that only keyframes may change.
+    # The camera is static, too, so that only the keyframe changes.
     frames, poses = [replace(frames[0], index=n) for n in range(40)], [poses[0]] * 40
     made = [
         with_box(frame, centres[min(n, 8) * 2], half, noise, n)[0] for n, frame in enumerate(frames)
@@ -193,7 +193,7 @@ def test_an_object_that_stops_becomes_static(room):
     assert fractions[-1] == 0
 
 
-def test_leaving_out_what_moves_keeps_the_pose(room):
+def test_masking_moving_objects_preserves_pose(room):
     frames, poses, noise = room
     centres, half = trajectory("towards", 0.25, frames[0])
     made = [
@@ -224,7 +224,7 @@ def test_leaving_out_what_moves_keeps_the_pose(room):
 
 
 @pytest.mark.parametrize(("metres", "degrees"), [(0.06, 2.0), (0.3, 10.0), (1.5, 50.0)])
-def test_a_wrong_pose_is_no_motion(room, metres, degrees):
+def test_wrong_pose_causes_no_segments(room, metres, degrees):
     frames, poses, _ = room
     off = se3.exp(
         np.r_[np.array([0.8, -0.4, 0.4]) * metres, np.radians(degrees) * np.array([0.3, 0.9, 0.3])]
@@ -240,7 +240,7 @@ def test_a_wrong_pose_is_no_motion(room, metres, degrees):
             assert moving.scale_ratio > 1.5 or moving.agreement < 0.8
 
 
-def test_nothing_is_learnt_from_a_pair_that_disagrees():
+def test_unreliable_pair_does_not_update_state():
     views = [
         prepare_view(wall(depth, index), SurfaceOptions()) for index, depth in enumerate([2, 2, 1])
     ]
@@ -254,7 +254,7 @@ def test_nothing_is_learnt_from_a_pair_that_disagrees():
         assert moving.agreement == 0
 
 
-def test_a_pose_can_be_tried_without_learning_from_it(room):
+def test_comparison_does_not_change_state(room):
     frames, poses, noise = room
     centres, half = trajectory("towards", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(9)]
@@ -273,7 +273,7 @@ def test_a_pose_can_be_tried_without_learning_from_it(room):
     assert one.view.any()
 
 
-def test_keyframes_keep_what_was_learnt_and_are_forgotten_when_there_are_too_many(room):
+def test_masks_of_keyframes_are_kept_up_to_limit(room):
     frames, poses, noise = room
     centres, half = trajectory("sideways", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(10)]
@@ -291,7 +291,7 @@ def test_keyframes_keep_what_was_learnt_and_are_forgotten_when_there_are_too_man
     assert not objects.predicted_mask(poses[9], views[9]).any()
 
 
-def test_threads_change_nothing(room, monkeypatch):
+def test_result_is_independent_of_threads(room, monkeypatch):
     frames, poses, noise = room
     centres, half = trajectory("away", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(8)]
@@ -314,7 +314,7 @@ def wall(depth, index=0):
     return RangeFrame(index, float(index), camera, (z + noise).astype(np.float32))
 
 
-def test_pixels_left_out_have_no_surface_but_free_space_up_to_them(room):
+def test_masked_pixels_keep_free_space_but_no_surface(room):
     frames, poses, _ = room
     view, other = (prepare_view(frames[n], SurfaceOptions()) for n in (0, 1))
     mask = np.zeros(view.z.shape, bool)
@@ -333,7 +333,7 @@ def test_pixels_left_out_have_no_surface_but_free_space_up_to_them(room):
         without_pixels(view, mask[1:])
 
 
-def test_the_robust_scale_ignores_outliers():
+def test_robust_scale_ignores_outliers():
     rng = np.random.default_rng(0)
     ratios = np.abs(rng.normal(0, 1.7, 4000))
     assert _robust_scale(ratios.astype(np.float32)) == pytest.approx(1.7, rel=0.05)
@@ -399,7 +399,7 @@ def along(view, xy, i, j):
 
 
 def window(z, i, j, radius):
-    """Least and largest valid depth, and the invalid pixels, around a pixel."""
+    """Minimum and maximum valid depth, and number of invalid pixels, around a pixel."""
     part = z[max(i - radius, 0) : i + radius + 1, max(j - radius, 0) : j + radius + 1]
     valid = part[part > 0]
     return valid.min(initial=np.inf), valid.max(initial=0), part.size - valid.size
@@ -418,12 +418,12 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
 
 
 def sampled(view):
-    """The view with its cells as the kernels take it."""
+    """The view and its cells in the form that the kernels take."""
     images = view.rays, view.z, view.sigma, view.planes, view.plane_variance
     return kernels.View(*images, view.projection.lookup, view.projection.frame, STRIDE)
 
 
-def test_compare_is_its_twin():
+def test_compare_matches_reference():
     camera, view, other, T = pair()
     flagged = np.zeros((18, 24), bool)
     flagged[:, 12:] = True
@@ -465,7 +465,7 @@ def test_compare_is_its_twin():
     np.testing.assert_allclose(evidence, llr, atol=1e-3)
 
 
-def test_residual_ratios_are_their_twin():
+def test_residual_ratios_match_reference():
     camera, view, other, T = pair()
     moving = np.zeros((18, 24), bool)
     moving[:5] = True
@@ -479,7 +479,7 @@ def test_residual_ratios_are_their_twin():
     np.testing.assert_allclose(got, ratios[::3, ::3][ok[::3, ::3]], rtol=1e-3, atol=1e-4)
 
 
-def test_carry_and_predict_are_their_twins():
+def test_propagate_and_predict_match_reference():
     camera, view, other, T = pair()
     rng = np.random.default_rng(5)
     before = depth_and_variance(other, STRIDE)[0].astype(np.float32)
@@ -492,7 +492,7 @@ def test_carry_and_predict_are_their_twins():
     there = np.where(ok, before[i, j], 0)
     apart = np.maximum(tolerance * here, 4 * np.sqrt(variance))
     same = (there > 0) & (np.abs(here - there) <= apart)
-    # What moved with the camera is where it was in the image.
+    # Objects that move with the camera keep their pixel.
     moved = odds_before > 2
     _, _, own_i, own_j, on_ray = projected(camera, view, depth, np.eye(4), STRIDE)
     own_i, own_j = own_i // STRIDE, own_j // STRIDE
@@ -529,12 +529,12 @@ def test_carry_and_predict_are_their_twins():
     np.testing.assert_array_equal(got, expected)
 
 
-def test_a_person_who_turns_before_a_still_camera_is_segmented(shared_data):
+def test_person_before_static_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     objects, still = MovingObjects(), np.eye(4)
     found = [followed(objects, view, still, views[0], still) for view in views[1:]]
-    # The person is what is nearer than the wall.
+    # The person is nearer than the wall.
     person = views[-1].z < 0.5 * views[-1].z.max()
     person &= views[-1].planes[..., 3] > 0
     rest = (views[-1].planes[..., 3] > 0) & ~person
@@ -543,7 +543,7 @@ def test_a_person_who_turns_before_a_still_camera_is_segmented(shared_data):
     assert found[-1].agreement > 0.95
 
 
-def test_a_static_kitchen_does_not_move(shared_data):
+def test_static_kitchen_has_no_moving_objects(shared_data):
     recording = open_recording(shared_data / "sevenscenes_kitchen")
     frames = [frame for _, frame in zip(range(40), recording, strict=False)][::4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]

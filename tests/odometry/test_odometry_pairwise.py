@@ -1,4 +1,4 @@
-"""Views that are registered one by one: predicted motion."""
+"""Pairwise registration of consecutive views: predicted motion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ALONG_X = np.eye(6)[:1]
 
 @dataclass(frozen=True)
 class Scripted(AnyPair):
-    """Gives the motions of a script; keeps the guesses that it was followed from."""
+    """Returns scripted motions; records the initial guesses."""
 
     motions: tuple[float, ...] = ()
     degenerate_from: int = 1_000
@@ -46,22 +46,22 @@ class Scripted(AnyPair):
         )
 
 
-def test_along_degenerate_directions_the_mean_motion_goes_on() -> None:
-    """Not the last one, whose noise would add up."""
+def test_mean_motion_is_extrapolated_along_degenerate_directions() -> None:
+    """Not the last motion, whose noise would accumulate."""
     motions = (0.0, *[0.1] * 8, 0.13, *[0.1] * 6)
     method = Scripted(motions=motions, degenerate_from=10)
     tracker = Pairwise(registration=method).start(0)
     points = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
     steps = [tracker.push(CloudFrame(k, float(k), points)) for k in range(len(motions))]
     assert all(step.status == "tracked" for step in steps)
-    # While every direction is constrained, the last motion is expected.
+    # While all directions are constrained, the last motion is extrapolated.
     np.testing.assert_allclose(method.guesses[2:9], 0.1, atol=1e-9)
     np.testing.assert_allclose(method.guesses[9], 0.13, atol=1e-9)
-    # From the second one on the mean, in which the last motion counts 30 %.
+    # From the second one on the mean, in which the last motion has a weight of 30 %.
     assert all(0.1 < guess < 0.12 for guess in method.guesses[11:])
 
 
-def test_in_another_component_nothing_is_expected() -> None:
+def test_interruption_resets_predicted_motion() -> None:
     method = Scripted(motions=(0.0, 0.1, 0.1, 0.1))
     tracker = Pairwise(registration=method).start(0)
     points = np.zeros((40, 3), np.float32)

@@ -36,19 +36,19 @@ def test_runs_of_degenerate_frames() -> None:
 
 
 @pytest.mark.parametrize("n", [3, 20])
-def test_errors_grow_as_those_of_a_velocity_that_wanders(n) -> None:
-    """Frame by frame, or over all frames at once: as in many draws of a random walk."""
+def test_error_grows_as_for_random_walk_of_velocity(n) -> None:
+    """Frame by frame or over all frames at once, as in simulated random walks."""
     step = np.random.default_rng(1).standard_normal((20_000, n))
     expected = np.cumsum(np.cumsum(step, axis=1), axis=1)[:, -1].std()
     usual = Prediction((1.0, 1.0))
     single = np.sqrt(sum(usual.error(k, 1)[0] ** 2 for k in range(1, n + 1)))
     assert single == pytest.approx(expected, rel=0.03)
     assert usual.error(n, n)[0] == pytest.approx(single)
-    # Beside a later frame of the run, the velocity is off from the first one on.
+    # Relative to a later frame of the run, the velocity is off from the first one on.
     assert usual.error(n, 2)[0] == pytest.approx(np.hypot(n - 1, n))
 
 
-def test_one_prediction_is_off_by_its_own_error() -> None:
+def test_single_prediction_has_its_own_error() -> None:
     assert Prediction((0.3, 0.2)).error(1, 1) == (0.3, 0.2)
     assert Prediction((0.3, 0.2)).error(0, 0) == (0.0, 0.0)
 
@@ -56,15 +56,15 @@ def test_one_prediction_is_off_by_its_own_error() -> None:
 @pytest.mark.parametrize(
     ("walk", "low", "high"), [(random_walk, 1.5, 2), (around_a_mean, 0.7, 1.3)]
 )
-def test_growth_is_measured_where_the_motion_is_constrained(walk, low, high) -> None:
-    """A velocity that does a random walk is lost faster than one that is wrong, but stays so."""
+def test_error_growth_is_estimated_from_constrained_motion(walk, low, high) -> None:
+    """It is faster for a random walk of the velocity than for independent motions."""
     poses = path(walk(np.random.default_rng(5), 300))
     found = Prediction.of(poses, [NONE] * len(poses))
     assert low <= found.power[0] <= high
     assert low <= found.power[1] <= high
 
 
-def test_predicted_error_is_that_of_the_recording() -> None:
+def test_predicted_error_matches_recording() -> None:
     poses = path(around_a_mean(np.random.default_rng(6), 400))
     found = Prediction.of(poses, [NONE] * len(poses))
     steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(poses)])
@@ -74,8 +74,8 @@ def test_predicted_error_is_that_of_the_recording() -> None:
     assert found.error(12, 12)[0] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.15)
 
 
-def test_degenerate_directions_do_not_count() -> None:
-    """A direction that follows its prediction agrees with it, and is no evidence."""
+def test_degenerate_directions_are_excluded() -> None:
+    """Extrapolated motion agrees with its prediction by construction, and is no evidence."""
     motions = around_a_mean(np.random.default_rng(7), 300)
     motions[:, 1] = 0.02
     poses = path(motions * [1, 1, 1, 0, 0, 0])
@@ -86,7 +86,7 @@ def test_degenerate_directions_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
-def test_few_poses_are_known_by_a_share_of_the_motion(n) -> None:
+def test_few_poses_give_default_growth(n) -> None:
     found = Prediction.of(path(np.full((n, 6), 0.1))[:n], [NONE] * n)
     assert np.isfinite(found.sigma).all()
     assert min(found.sigma) > 0

@@ -14,9 +14,9 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 SHARP = SurfaceOptions(radii=(2,))
-# A camera that walks along and turns slowly.
+# A camera that translates and turns slowly.
 WALK = [at(-0.4 + 0.03 * k, 0.0, 0.015 * k) for k in range(24)]
-FIRST = 10  # frame with something before the camera
+FIRST = 10  # first frame with an object before the camera
 
 
 def run(frames, odometry=None, options=None):
@@ -29,7 +29,7 @@ def run(frames, odometry=None, options=None):
 
 
 def with_plate(frame, left, right, z=0.7):
-    """Put a textured plate before the camera, as high as the image, between two columns."""
+    """Put a textured plate of full image height before the camera, between two columns."""
     columns = np.arange(CAMERA.width)
     covered = np.broadcast_to((columns >= left) & (columns < right), frame.depth.shape)
     rng = np.random.default_rng(frame.index)
@@ -41,14 +41,14 @@ def with_plate(frame, left, right, z=0.7):
 
 
 def off(step, pose, first=WALK[0]):
-    """m and degrees by which a step's pose is wrong in component 0."""
+    """Pose error of a step in component 0, in m and degrees."""
     error = se3.inverse(se3.inverse(first) @ pose) @ step.T_component_camera
     return np.linalg.norm(error[:3, 3]), np.degrees(se3.angle(error))
 
 
 @pytest.mark.parametrize("columns", [24, 48])
-def test_what_passes_before_the_camera_does_not_take_it_along(columns) -> None:
-    """A plate goes with the camera, which moves by 3 cm a frame: nearly half a metre in all."""
+def test_passing_object_does_not_drag_poses(columns) -> None:
+    """A plate moves with the camera at 3 cm per frame: nearly half a metre in total."""
     frames = []
     for k, T in enumerate(WALK):
         frame = seen(T, k)
@@ -66,8 +66,8 @@ def test_what_passes_before_the_camera_does_not_take_it_along(columns) -> None:
     assert all(step.moving is None for step in steps[:FIRST])
 
 
-def test_a_camera_that_jumped_is_not_explained_by_moving_objects() -> None:
-    """What differs after a jump in the same room is as coherent as an object that moved."""
+def test_camera_jump_is_not_explained_by_moving_objects() -> None:
+    """Differences after a jump in the same room are as coherent as those of a moving object."""
     there = at(0.35, 0.3, 0.25)
     frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
     frames += [seen(there, 12 + k) for k in range(3)]
@@ -77,7 +77,7 @@ def test_a_camera_that_jumped_is_not_explained_by_moving_objects() -> None:
             assert off(step, there)[0] < 0.03
 
 
-def test_a_quick_turn_stays_in_the_component_if_a_search_is_certain() -> None:
+def test_fast_turn_keeps_component_if_search_is_certain() -> None:
     path = [*WALK[:12], *(at(-0.07 + 0.03 * k, 0.0, 0.165 + 0.45 + 0.015 * k) for k in range(6))]
     steps = run([seen(T, k) for k, T in enumerate(path)])
     assert [step.component for step in steps] == [0] * len(path)
@@ -86,7 +86,7 @@ def test_a_quick_turn_stays_in_the_component_if_a_search_is_certain() -> None:
         assert off(step, pose)[0] < 0.03
 
 
-def test_a_quick_turn_that_odometry_has_seen_needs_no_search() -> None:
+def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
     rng = np.random.default_rng(5)
     path = [T @ se3.exp([0, 0, 0, *rng.normal(0, 0.01, 3)]) for T in WALK[:12]]
     path += [at(-0.07 + 0.03 * k, 0.0, 0.615 + 0.015 * k) for k in range(6)]
@@ -99,8 +99,8 @@ def test_a_quick_turn_that_odometry_has_seen_needs_no_search() -> None:
         assert off(step, pose, path[0])[0] < 0.03
 
 
-def test_a_new_component_goes_on_as_the_camera_moved() -> None:
-    """Another room from one frame to the next, and the same motion."""
+def test_new_component_continues_motion() -> None:
+    """Another room from one frame to the next, with the same camera motion."""
     frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
     frames += [
         seen(T, 12 + k, boxes=(), spots=90, scene=9, half=(2.6, 1.4, 2.4))
@@ -113,8 +113,8 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
         assert off(step, pose, WALK[12])[0] < 0.03
 
 
-def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
-    """Steps of 26 cm: a wall fits anywhere, and what stands before it is out of reach."""
+def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
+    """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
     from tofuse.evaluation.trajectory import displacement
     from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
@@ -128,7 +128,7 @@ def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
     assert not any(len(f.unobservable) for f in result.diagnostics.frames)
 
 
-def test_starts_along_a_corridor_find_what_the_prediction_missed(tmp_path) -> None:
+def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.evaluation.trajectory import displacement
     from tofuse.pipeline.config import from_method
@@ -138,5 +138,5 @@ def test_starts_along_a_corridor_find_what_the_prediction_missed(tmp_path) -> No
     result = reconstruct(recording, from_method("default"))
     assert recording.reference is not None
     assert result.has_pose.all()
-    # 0.27 m near the prediction.
+    # 0.27 m if started only near the prediction.
     assert displacement(recording.reference, result.trajectory)[0] < 0.02

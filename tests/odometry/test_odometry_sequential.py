@@ -66,7 +66,7 @@ def test_motions_are_chained_by_equations_3_1_and_3_2():
         np.testing.assert_array_equal(step.registration.T_target_source, new)
 
 
-def test_the_guess_identity():
+def test_identity_guess():
     registrar = Scripted(list(MOTIONS))
     tracker = Sequential(registrar, "identity").start(0)
     for k in range(5):
@@ -75,7 +75,7 @@ def test_the_guess_identity():
         np.testing.assert_array_equal(guess, np.eye(4))
 
 
-def test_the_guess_previous_is_the_motion_found_last_even_across_a_lost_frame():
+def test_previous_guess_is_last_motion_even_across_lost_frame():
     lost = RegistrationError("too bad")
     registrar = Scripted([MOTIONS[0], MOTIONS[1], lost, found(MOTIONS[2], 0.0), MOTIONS[3]])
     tracker = Sequential(registrar, "previous").start(0)
@@ -87,7 +87,7 @@ def test_the_guess_previous_is_the_motion_found_last_even_across_a_lost_frame():
     assert [(s, t) for s, t, _, _ in registrar.asked] == [(1, 0), (2, 1), (3, 2), (4, 2), (5, 2)]
 
 
-def test_the_guess_odometry_is_the_motion_between_its_poses():
+def test_odometry_guess_is_relative_pose():
     registrar = Scripted(list(MOTIONS))
     tracker = Sequential(registrar, "odometry").start(0)
     poses = list(se3.exp(np.random.default_rng(2).normal(size=(6, 6))))
@@ -102,7 +102,7 @@ def test_the_guess_odometry_is_the_motion_between_its_poses():
         np.testing.assert_array_equal(guesses[missing], np.eye(4))
 
 
-def test_a_lost_frame_has_a_reason_and_the_next_is_registered_to_the_last_tracked():
+def test_lost_frame_has_reason_and_next_uses_last_tracked():
     registrar = Scripted(
         [MOTIONS[0], RegistrationError("no overlap"), found(MOTIONS[1], 0.019), MOTIONS[2]]
     )
@@ -117,7 +117,7 @@ def test_a_lost_frame_has_a_reason_and_the_next_is_registered_to_the_last_tracke
     np.testing.assert_allclose(steps[4].T_component_camera, MOTIONS[0] @ MOTIONS[2], atol=1e-12)
 
 
-def test_frames_without_points_are_lost_and_raise_nothing():
+def test_frames_without_points_are_lost():
     camera = Pinhole(width=8, height=6, fx=8, fy=8, cx=3.5, cy=2.5)
     invalid = RangeFrame(1, 0.1, camera, np.zeros((6, 8), np.float32))
     empty = CloudFrame.of(np.zeros((0, 3)), index=2)
@@ -136,7 +136,7 @@ def test_frames_without_points_are_lost_and_raise_nothing():
             np.testing.assert_array_equal(step.T_component_camera, np.eye(4))
 
 
-def test_registrations_that_fix_no_motion_lose_the_frame():
+def test_degenerate_registration_loses_frame():
     points = np.outer(np.linspace(0, 1, 50), [1, 1, 1])
     tracker = Sequential(algorithm_1(1.0)).start(0)
     assert tracker.push(CloudFrame.of(points, index=4)).status == "tracked"
@@ -151,7 +151,7 @@ def test_registrations_that_fix_no_motion_lose_the_frame():
         assert step.reference == 4
 
 
-def test_each_pair_draws_from_its_own_stream():
+def test_each_pair_has_its_own_random_stream():
     registrar = Scripted(list(MOTIONS))
     tracker = Sequential(registrar).start(12)
     for index in (3, 5, 9):
@@ -161,7 +161,7 @@ def test_each_pair_draws_from_its_own_stream():
         assert draw == want
 
 
-def test_rotations_stay_rotations_over_long_sequences():
+def test_rotations_stay_orthonormal_over_long_sequences():
     # A registrar whose motions are rotations only to 1e-6, as single precision would give.
     skewed = se3.exp([0.01, 0, 0, 0.02, 0.01, 0.03])
     skewed[:3, :3] *= 1 + 1e-6
@@ -187,7 +187,7 @@ def room_views(count, seed=0):
 
 
 @pytest.mark.parametrize("guess", ["identity", "previous"])
-def test_it_follows_a_camera(guess):
+def test_camera_is_tracked(guess):
     views, T = room_views(8)
     tracker = Sequential(algorithm_1(points=4000), guess).start(0)
     for view, truth in zip(views, T, strict=True):
@@ -198,7 +198,7 @@ def test_it_follows_a_camera(guess):
         assert np.linalg.norm(xi[3:]) < 0.02
 
 
-def test_the_number_of_threads_does_not_change_the_poses():
+def test_poses_are_independent_of_threads():
     views, _ = room_views(3)
     results = []
     for count in (1, 2):
@@ -208,7 +208,7 @@ def test_the_number_of_threads_does_not_change_the_poses():
     assert results[0] == results[1]
 
 
-def test_peaks_is_followed_at_low_noise_and_drifts_at_high():
+def test_peaks_is_tracked_at_low_noise_and_drifts_at_high_noise():
     """Section 5.6: "ICP does well on its own" below 0.05 m of noise, and not above."""
 
     def mean_error(sigma):
@@ -224,7 +224,7 @@ def test_peaks_is_followed_at_low_noise_and_drifts_at_high():
     assert mean_error(0.08) > 1
 
 
-def test_the_configuration_survives_a_round_trip():
+def test_configuration_round_trip():
     parts.discover("tofuse.registration")
     parts.discover("tofuse.odometry")
     odometry = Sequential(algorithm_1(0.02), "previous", min_inlier_ratio=0.1)

@@ -13,7 +13,7 @@ from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.run import Options, resolve
 
 
-def test_memory_is_divided_in_one_place() -> None:
+def test_memory_budget_is_divided_consistently() -> None:
     config = resolve(Options(Path("out"), memory=1_000_000_000))
     assert config.memory_mb == 1000
     assert config.fusion.memory_mb == voxels_mb(1000) == 300
@@ -21,12 +21,12 @@ def test_memory_is_divided_in_one_place() -> None:
     assert 1.5 * voxels_mb(2000) * 1_000_000 + views_bytes(2000) < 0.7 * 2e9
 
 
-def test_unless_asked_for_it_is_as_ever() -> None:
+def test_default_budget_equals_fusion_default() -> None:
     config = from_method("default")
     assert config.fusion.memory_mb == Fusion().memory_mb == voxels_mb(config.memory_mb)
 
 
-def test_memory_in_a_configuration_is_divided_as_well() -> None:
+def test_configured_memory_is_divided_too() -> None:
     config = changed(from_method("default"), {"memory_mb": 500}, where="test")
     assert (config.memory_mb, config.fusion.memory_mb) == (500, voxels_mb(500))
     said = {"memory_mb": 500, "fusion": {"memory_mb": 90}}

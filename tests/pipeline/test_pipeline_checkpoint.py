@@ -36,8 +36,8 @@ from tofuse.results.types import FrameRecord
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 
 
-def told(result: tofuse.Reconstruction) -> list[object]:
-    """All that must be the same."""
+def comparable(result: tofuse.Reconstruction) -> list[object]:
+    """Everything that must be identical."""
     data = run_json(result)
     del data["seconds"]
     cloud, mesh, graph = result.cloud, result.mesh, result.graph
@@ -53,7 +53,7 @@ def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate("peaks", tmp_path_factory.mktemp("clouds") / "peaks", frames=3)
 
 
-def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> None:
+def test_stopped_run_resumes_at_any_stage(room_recording: Path, monkeypatch) -> None:
     recording = tofuse.open(room_recording).select(every=2)
     kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
     known = {"views": {"falloff": 0.0, "range_falloff": 0.0}}  # not looked for then
@@ -62,7 +62,7 @@ def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> 
     never = Kept(0)
     whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
     assert never.saved == ["tracking"] * 4 + ["joining", "loops", "refinement", "fusion"]
-    assert told(reconstruct.reconstruct(recording, config, seed=3)) == told(whole)
+    assert comparable(reconstruct.reconstruct(recording, config, seed=3)) == comparable(whole)
     read = recording.source.read
     for stop_at in (2, 4, 6):
         kept = Kept(stop_at)
@@ -79,12 +79,12 @@ def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> 
         rest = list(range(2 * stop_at, 8, 2))  # nothing is tracked twice
         assert seen[3:] == rest  # after a look ahead at three
         again = tofuse.Reconstruction(**{**vars(again), "threads": whole.threads})
-        assert told(again) == told(whole)
+        assert comparable(again) == comparable(whole)
         assert set(again.diagnostics.seconds) == set(whole.diagnostics.seconds)
 
 
 @pytest.mark.parametrize("method", ["default", "thesis"])
-def test_clouds_go_on_too(method: str, turned_box: Path) -> None:
+def test_runs_of_clouds_resume(method: str, turned_box: Path) -> None:
     recording = tofuse.open(turned_box)
     config = changed(from_method(method, "cloud"), {"filters": []}, where="test")
     whole = reconstruct.reconstruct(recording, config)
@@ -92,10 +92,10 @@ def test_clouds_go_on_too(method: str, turned_box: Path) -> None:
     with pytest.raises(Stopped):
         reconstruct.reconstruct(recording, config, stages=kept)
     kept.stop_at = 0
-    assert told(reconstruct.reconstruct(recording, config, stages=kept)) == told(whole)
+    assert comparable(reconstruct.reconstruct(recording, config, stages=kept)) == comparable(whole)
 
 
-def test_states_are_kept_for_one_key_and_until_damaged(tmp_path: Path) -> None:
+def test_states_are_kept_for_one_key(tmp_path: Path) -> None:
     notes: list[str] = []
     one = Checkpoints(tmp_path, "a", notes.append)
     assert (one.fresh, one.load("loops")) == (None, None)
@@ -126,7 +126,7 @@ def test_states_are_kept_for_one_key_and_until_damaged(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["short", "flipped", "empty", "other"])
-def test_damage_is_noticed(damage: str, tmp_path: Path) -> None:
+def test_damaged_state_is_not_used(damage: str, tmp_path: Path) -> None:
     notes: list[str] = []
     kept = Checkpoints(tmp_path, "a", notes.append)
     kept.save("fusion", [np.arange(1000)])
@@ -150,7 +150,7 @@ class Harmful:
     "state",
     [Harmful(), Path("x"), np.array([Harmful()], object), main, Checkpoints, np.dtype("f4"), 1j],
 )
-def test_only_our_own_types_are_kept(state: object, tmp_path: Path) -> None:
+def test_foreign_types_are_not_stored(state: object, tmp_path: Path) -> None:
     notes: list[str] = []
     kept = Checkpoints(tmp_path / "out", "a", notes.append)
     kept.save("fusion", state)
@@ -158,7 +158,7 @@ def test_only_our_own_types_are_kept(state: object, tmp_path: Path) -> None:
     assert kept.load("fusion") is None
 
 
-def test_no_type_that_does_something_can_be_named() -> None:
+def test_loadable_types_have_no_side_effects() -> None:
     assert {name.partition(".")[0] for name in known_types()} == {"tofuse"}
     for cls in known_types().values():
         assert not issubclass(cls, BaseException | os.PathLike | tuple | type)
@@ -166,7 +166,7 @@ def test_no_type_that_does_something_can_be_named() -> None:
         assert not hasattr(cls, "__reduce_ex__") or cls.__reduce_ex__ is object.__reduce_ex__
 
 
-def test_a_state_comes_back_as_it_was() -> None:
+def test_state_round_trip() -> None:
     nan, shared = float("nan"), [np.arange(6.0).reshape(2, 3), b"\x00\xff"]
     looped: dict[object, object] = {(1, "a"): shared, 2.5: shared, None: (shared, {3, 4})}
     looped["self"] = looped
@@ -237,7 +237,7 @@ FORGED: dict[str, object] = {
 
 
 @pytest.mark.parametrize("name", FORGED)
-def test_a_forged_state_is_refused(name: str, tmp_path: Path) -> None:
+def test_forged_state_is_refused(name: str, tmp_path: Path) -> None:
     arrays = {"a": np.arange(8.0)}
     with pytest.raises(StateError) as caught:
         decode(FORGED[name], arrays)
@@ -297,7 +297,7 @@ def claims(shape: tuple[int, ...]) -> bytes:
         zipped("header", b"{}"),
     ],
 )
-def test_a_file_that_is_no_state_is_not_used(data: bytes, tmp_path: Path, monkeypatch) -> None:
+def test_invalid_state_file_is_not_used(data: bytes, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     notes: list[str] = []
     path = tmp_path / "out" / CHECKPOINT / "fusion.state"
@@ -310,8 +310,8 @@ def test_a_file_that_is_no_state_is_not_used(data: bytes, tmp_path: Path, monkey
     assert not Path("harmed").exists()
 
 
-def test_a_state_that_was_changed_ends_in_one_line(turned_box: Path, tmp_path, capfd) -> None:
-    """Whoever knows the key can forge what passes all checks: that costs one more try."""
+def test_valid_but_wrong_state_ends_in_one_line(turned_box: Path, tmp_path, capfd) -> None:
+    """A state forged with the right key passes all checks, at the cost of one more attempt."""
     out = tmp_path / "out"
     words = ["run", str(turned_box), "--out", str(out), "--method", "thesis"]
     seen: list[tuple[Path, str]] = []
@@ -334,7 +334,7 @@ def test_a_state_that_was_changed_ends_in_one_line(turned_box: Path, tmp_path, c
         assert not (out / "run.json").exists()
 
 
-def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:
+def test_failed_checkpoint_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
     notes: list[str] = []
     kept = Checkpoints(tmp_path, "a", notes.append)
     kept.save("tracking", [1])
@@ -355,7 +355,7 @@ def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_much_work_is_not_thrown_away_with_a_full_disk(tmp_path: Path, monkeypatch) -> None:
+def test_checkpoint_is_kept_after_output_error(tmp_path: Path, monkeypatch) -> None:
     for error, seconds, stays in (
         (OutputError("is full"), 0.0, True),
         (OutputError("is full"), 60.0, False),
@@ -370,7 +370,7 @@ def test_much_work_is_not_thrown_away_with_a_full_disk(tmp_path: Path, monkeypat
         kept.discard()
 
 
-def test_digest_tells_what_decides(tmp_path: Path) -> None:
+def test_digest_covers_configuration_and_input(tmp_path: Path) -> None:
     folder, out = tmp_path / "rec", tmp_path / "rec" / "out"
     (folder / "depth").mkdir(parents=True)
     image = folder / "depth" / "0.png"
@@ -389,8 +389,8 @@ def test_digest_tells_what_decides(tmp_path: Path) -> None:
     assert digest({}, [image], without=out) != alone
 
 
-# Keeps a state after every frame, and kills itself at the n-th event (a stage, a frame, a file or a
-# state that is moved), or at the n-th file that is moved to its place.
+# Saves a state after every frame, and kills itself at the n-th event (a stage, a frame, a file or
+# state that is moved), or when the n-th file is moved into place.
 _KILLED = """
 import os, pathlib, signal, sys
 from tofuse.cli import main
@@ -425,7 +425,7 @@ def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
-def test_killed_again_and_again_gives_the_same_bytes(
+def test_repeatedly_killed_run_gives_same_bytes(
     room_recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(
@@ -452,7 +452,7 @@ def test_killed_again_and_again_gives_the_same_bytes(
     assert {**one, "seconds": 0} == {**other, "seconds": 0}
 
 
-# No file may grow beyond some kilobytes: what a full disk is, for a test.
+# Files may not grow beyond some kilobytes: simulates a full disk.
 _FULL = """
 import resource, sys
 from tofuse.cli import main
@@ -466,7 +466,7 @@ sys.exit(main(sys.argv[2:]))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of other systems")
-def test_a_full_disk_leaves_what_was_there(room_recording: Path, tmp_path: Path) -> None:
+def test_full_disk_preserves_earlier_result(room_recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "run.json").write_text('{"schema": 1, "version": "0", "verdict": "good"}')
@@ -484,7 +484,7 @@ def test_a_full_disk_leaves_what_was_there(room_recording: Path, tmp_path: Path)
     assert os.listdir(out) == ["run.json"]
 
 
-def test_what_is_on_disk_is_kept_piece_by_piece(
+def test_spilled_images_survive_checkpoint_in_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spill_module, "_PIECE", 1500)

@@ -57,9 +57,9 @@ def evidence(
     parts=(),
     **more,
 ) -> Evidence:
-    """Nine frames of a walk, closed by loops (i, j, error of the chain as a 6-vector).
+    """Evidence of nine frames of a trajectory, closed by loops (i, j, 6-vector of the chain error).
 
-    `sigma` is the standard deviation of each registration and loop, m and rad, if it is known.
+    `sigma` is the standard deviation of each registration and loop, m and rad, if known.
     """
     n = len(statuses)
     records = tuple(FrameRecord(k, 0.1 * k, s) for k, s in enumerate(statuses))
@@ -119,7 +119,7 @@ def apart(*ranges) -> Component:
 
 
 def in_components(*others, frames=9, lost=()) -> Evidence:
-    """Frames of a walk, some in other components than the main one; posed are the connected."""
+    """Evidence of frames of which some are in other components; connected ones have poses."""
     number = {
         k: c
         for c, other in enumerate(others, 1)
@@ -206,7 +206,7 @@ CASES = {
 }
 
 
-def test_views_in_no_order_are_told_of_once() -> None:
+def test_unordered_views_are_reported_once() -> None:
     at = np.random.default_rng(1).permutation(16)
     mixed = evidence(("tracked",) * 16, steps=[(0, 0, 0, 0, 0.4 * k, 0) for k in at])
     (jumped,) = [r for r in judge(mixed)[1] if r.code == "jumped"]
@@ -214,9 +214,9 @@ def test_views_in_no_order_are_told_of_once() -> None:
 
 
 def test_every_reason_has_a_case() -> None:
-    # Whether there is a surface is no question of trust: fusion tells. What is wrong with the
-    # recording itself is found before it is run; that its camera was corrected, or is not where its
-    # rig says, after.
+    # Whether there is a surface is no question of trust: fusion reports it. Faults of the recording
+    # itself are found before it is run; a corrected camera, or one that is not where its rig
+    # states, afterwards.
     elsewhere = {"no_surface", "faulty_recording", "self_calibrated", "correction_left_out"}
     elsewhere |= {"rig_changed", "uncertain_rig", "inconsistent_poses"}
     assert set(CASES) == set(REASONS) - elsewhere
@@ -237,7 +237,7 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
     first, last = found[0].frames
     assert isinstance(first, int)
     assert 0 <= first <= last < len(CASES[code].records)
-    # Nothing else is said, but for what follows from it.
+    # No other reasons, except those that follow from it.
     follows = {"few_poses": {"lost_frames"}}
     assert {r.code for r in reasons} - {code} <= follows.get(code, set())
 
@@ -252,7 +252,7 @@ def test_frames_of_reasons() -> None:
     assert skipped.text == "Frame 4 could not be read."
 
 
-def test_all_stretches_of_lost_frames_are_one_reason() -> None:
+def test_all_runs_of_lost_frames_are_one_reason() -> None:
     e = evidence(("tracked", "lost", "tracked", "lost", "lost", "tracked", "tracked"))
     (lost,) = [r for r in judge(e)[1] if r.code == "lost_frames"]
     assert (lost.ranges, lost.frames) == (((1, 1), (3, 4)), (1, 4))
@@ -260,7 +260,7 @@ def test_all_stretches_of_lost_frames_are_one_reason() -> None:
     assert stretches(e.records, "skipped") == ()
 
 
-def test_a_loop_within_what_drift_allows_is_no_gap() -> None:
+def test_loop_error_within_expected_drift_is_no_gap() -> None:
     # Eight steps of 5 cm and 1.1 degrees: 3 cm and 2 degrees are allowed.
     assert codes(evidence(gaps=((0, 8, [0.025, 0, 0, 0, 0, 0]),))) == []
     assert codes(evidence(gaps=((0, 8, [0.035, 0, 0, 0, 0, 0]),))) == ["loop_gap"]
@@ -268,7 +268,7 @@ def test_a_loop_within_what_drift_allows_is_no_gap() -> None:
     assert codes(evidence(gaps=((0, 8, [0, 0, 0, 0, np.radians(2.2), 0]),))) == ["loop_gap"]
 
 
-def test_a_few_directions_that_are_not_held_do_not_drift() -> None:
+def test_few_unconstrained_directions_cause_no_drift() -> None:
     long = evidence(("tracked",) * 21, unheld=(4, 5))
     assert codes(long) == []
     assert codes(evidence(("tracked",) * 21, unheld=(4, 5, 6))) == ["unobserved_motion"]
@@ -284,7 +284,7 @@ def test_a_few_directions_that_are_not_held_do_not_drift() -> None:
         ((0.25, 0.2, 11.0), None, ""),
     ],
 )
-def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) -> None:
+def test_implausible_depth_suggests_wrong_unit(depths, ambiguity_m, words) -> None:
     reasons = judge(evidence(depths=depths, ambiguity_m=ambiguity_m))[1]
     assert [r.code for r in reasons] == ["implausible_depth"] * bool(words)
     assert all(words in r.text for r in reasons)
@@ -295,7 +295,7 @@ def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) ->
     assert bool(judge(known)[1]) is ("ambiguity" in words)
 
 
-def test_repeated_images_are_one_line() -> None:
+def test_repeated_images_are_reported_once() -> None:
     (reason,) = judge(evidence(repeated=(2, 5, 6)))[1]
     assert reason.ranges == ((2, 2), (5, 6))
     assert reason.text.startswith("3 images repeat the one before (frames 2, 5-6): ")
@@ -303,14 +303,14 @@ def test_repeated_images_are_one_line() -> None:
     assert reason.text.startswith("1 image repeats the one before (frame 3): ")
 
 
-def test_a_camera_that_moves_a_little_did_not_stand_still() -> None:
+def test_small_motion_is_not_standing_still() -> None:
     for axis, size in ((0, 0.012), (4, np.radians(0.6))):
         steps = np.zeros((9, 6))
         steps[5:, axis] = size
         assert codes(evidence(steps=steps)) == []
 
 
-def test_many_gaps_are_one_reason_that_tells_the_worst() -> None:
+def test_many_gaps_are_one_reason_with_largest_gap() -> None:
     far = [0.1, 0, 0, 0, 0, 0]
     gaps = [(0, k, far) for k in (5, 6, 8)] + [(1, 7, [0.3, 0, 0, 0, 0, 0]), (0, 4, np.zeros(6))]
     (reason,) = judge(evidence(gaps=gaps))[1]
@@ -320,7 +320,7 @@ def test_many_gaps_are_one_reason_that_tells_the_worst() -> None:
     assert "4 of 5 loops" in reason.text
 
 
-def test_a_loop_that_was_found_and_rejected_is_no_news() -> None:
+def test_rejected_loop_is_not_reported() -> None:
     assert codes(evidence(rejected=[(1, 7)])) == []
 
 
@@ -331,17 +331,17 @@ def test_images_without_inliers_disagree() -> None:
     assert reasons[0].text == text
 
 
-def test_images_that_do_not_overlap_say_nothing() -> None:
+def test_images_without_overlap_give_no_evidence() -> None:
     assert codes(evidence(images=CrossViewConsistency(tuple(range(5)), ()))) == []
     assert codes(replace(evidence(), cross_view=None)) == []
 
 
-def test_noise_that_neighbours_share_is_no_difference() -> None:
+def test_noise_shared_by_neighbours_is_no_difference() -> None:
     assert codes(evidence(images=seen(0.8, 0.02, 0.8, 0.02))) == []
 
 
-def test_views_that_are_further_apart_count_in_the_accuracy() -> None:
-    """They are no reason by themselves, as the bound has them."""
+def test_excess_distance_of_far_views_counts_in_accuracy() -> None:
+    """It is no reason by itself, as the bound includes it."""
     images = seen(far_rms=0.02)
     assert codes(evidence(images=images)) == []
     assert images.excess_m() == pytest.approx(np.sqrt(0.02**2 - 0.004**2))
@@ -349,7 +349,7 @@ def test_views_that_are_further_apart_count_in_the_accuracy() -> None:
     assert CrossViewConsistency(tuple(range(9)), ()).excess_m() == 0
 
 
-def test_views_that_the_others_contradict_are_named() -> None:
+def test_inconsistent_views_are_named() -> None:
     said = tuple(
         pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
     )
@@ -358,8 +358,8 @@ def test_views_that_the_others_contradict_are_named() -> None:
     assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
 
 
-def test_a_path_is_good_within_the_tolerance() -> None:
-    """It is 0.5 % of the model's diagonal and at least 1 cm, unless it is given."""
+def test_verdict_is_good_within_tolerance() -> None:
+    """By default 0.5 % of the model's diagonal and at least 1 cm."""
     e = evidence(gaps=(), sigma=(0.008, 0.0001))
     bound = e.accuracy.position_m
     assert 0.01 < bound < 0.03
@@ -373,11 +373,11 @@ def test_a_path_is_good_within_the_tolerance() -> None:
     assert codes(replace(e, diagonal_m=199 * bound)) == ["uncertain_poses"]
     assert codes(replace(e, tolerance_m=1.01 * bound)) == []
     assert codes(replace(e, tolerance_m=0.99 * bound, diagonal_m=100)) == ["uncertain_poses"]
-    # A loop takes a part of the error away.
+    # A loop removes a part of the error.
     assert evidence(sigma=(0.008, 0.0001)).accuracy.position_m < 0.8 * bound
 
 
-def test_rotations_have_a_tolerance_of_their_own() -> None:
+def test_rotation_has_its_own_tolerance() -> None:
     e = evidence(gaps=(), sigma=(1e-5, np.radians(0.8)))
     (reason,) = judge(replace(e, tolerance_m=10.0))[1]
     assert reason.code == "uncertain_poses"
@@ -385,7 +385,7 @@ def test_rotations_have_a_tolerance_of_their_own() -> None:
     assert codes(evidence(gaps=(), sigma=(1e-5, np.radians(0.1)))) == []
 
 
-def test_poses_that_no_measurement_bounds_are_named() -> None:
+def test_unbounded_poses_are_named() -> None:
     e = evidence(gaps=(), sigma=(0.001, 0.0005))
     loose = replace(e.accuracy, position_m=np.inf, unbounded=(3, 4, 7))
     verdict, (reason,) = judge(replace(e, accuracy=loose))
@@ -394,12 +394,12 @@ def test_poses_that_no_measurement_bounds_are_named() -> None:
     assert reason.text.startswith("Poses of frames 3-4, 7 are not constrained in some direction")
 
 
-def test_what_was_not_assessed_is_no_reason() -> None:
+def test_missing_assessment_is_no_reason() -> None:
     assert codes(replace(evidence(sigma=(0.001, 0.0005)), accuracy=Accuracy())) == []
 
 
-def test_a_gap_within_the_known_errors_is_no_alarm() -> None:
-    # The chain knows the end to sqrt(9) x 1 mm along each axis, and some more from its turns.
+def test_gap_within_known_errors_raises_no_alarm() -> None:
+    # The end of the chain is known to sqrt(9) x 1 mm along each axis, plus the effect of rotations.
     for gap, alarm in ((0.008, False), (0.03, True)):
         found = codes(evidence(gaps=((0, 8, [0, gap, 0, 0, 0, 0]),), sigma=(0.001, 0.0005)))
         assert ("calibration_alarm" in found) == alarm
@@ -411,7 +411,7 @@ def test_one_loop_among_many_raises_no_alarm() -> None:
     assert "calibration_alarm" not in codes(evidence(gaps=gaps, sigma=(0.001, 0.0005)))
 
 
-def test_the_gravest_reason_decides() -> None:
+def test_gravest_reason_decides() -> None:
     def of(*names: str) -> str:
         return verdict_of([Reason(name, ((0, 1),), "") for name in names])
 
@@ -460,18 +460,18 @@ def test_disconnected_parts_are_named() -> None:
     assert (hanging.text, hanging.ranges) == (text, ((5, 8),))
 
 
-def test_parts_of_several_stretches_and_lost_frames() -> None:
+def test_parts_of_several_ranges_with_lost_frames() -> None:
     linked = Component(((6, 8),), se3.exp(np.full(6, 0.1)), "links")
     e = in_components(linked, apart((10, 11), (14, 15)), frames=20, lost=(5, 9))
     verdict, (parts, lost) = judge(e)
     assert verdict == "degraded"
     assert (parts.code, parts.ranges) == ("disconnected", ((10, 11), (14, 15)))
-    # What is linked to the main part is one with it; lost frames are in none.
+    # What is linked to the main part belongs to it; lost frames belong to none.
     assert "frames 0-4, 6-8, 12-13, 16-19; frames 10-11, 14-15; no overlap" in parts.text
     assert (lost.code, lost.ranges) == ("lost_frames", ((5, 5), (9, 9)))
 
 
-def test_of_many_parts_the_largest_are_named() -> None:
+def test_largest_of_many_parts_are_named() -> None:
     others = [apart((k, k + 1)) for k in range(10, 26, 2)]
     reasons = judge(in_components(*others, frames=26))[1]
     (reason,) = [r for r in reasons if r.code == "disconnected"]
@@ -479,7 +479,7 @@ def test_of_many_parts_the_largest_are_named() -> None:
     assert "and 3 smaller; no overlap found." in reason.text
 
 
-def test_less_than_half_in_the_main_model_is_a_failure() -> None:
+def test_less_than_half_in_main_model_is_failure() -> None:
     e = in_components(apart((4, 6)), apart((7, 8)), frames=9)
     assert codes(e) == ["few_poses", "disconnected"]
     assert judge(e)[1][0].text == "Only 4 of 9 readable frames are in the main model."
@@ -487,17 +487,17 @@ def test_less_than_half_in_the_main_model_is_a_failure() -> None:
     assert codes(half) == ["disconnected"]
 
 
-def test_single_frames_that_nothing_connects_are_a_failure() -> None:
+def test_unconnected_single_frames_are_failure() -> None:
     for n in (2, 5):
         e = in_components(*(apart((k, k)) for k in range(1, n)), frames=n)
         verdict, reasons = judge(e)
         assert verdict == "failed"
         assert [r.code for r in reasons] == ["few_poses", "disconnected"]
-    # Of one view alone, nothing is known to be wrong, and nothing to be right.
+    # A single view is neither known to be wrong nor known to be correct.
     assert judge(evidence(("tracked",)))[0] == "degraded"
 
 
-def test_a_component_that_begins_elsewhere_is_no_jump() -> None:
+def test_component_that_starts_elsewhere_is_no_jump() -> None:
     there = Component(((5, 8),), np.eye(4), "links")
     e = in_components(there)
     moved = e.sequential.copy()
@@ -507,7 +507,7 @@ def test_a_component_that_begins_elsewhere_is_no_jump() -> None:
     assert "jumped" in codes(replace(same, sequential=moved))
 
 
-def test_moving_objects_and_doubtful_frames_are_told() -> None:
+def test_moving_objects_and_doubtful_frames_are_reported() -> None:
     (moving,) = judge(CASES["moving_objects"])[1]
     assert moving.ranges == ((3, 4),)
     assert "up to 23 % of the image in frames 3-4; they are excluded" in moving.text
@@ -518,7 +518,7 @@ def test_moving_objects_and_doubtful_frames_are_told() -> None:
     assert judge(CASES["doubtful_poses"])[0] == "good"
 
 
-def test_loops_given_by_hand_are_listed_once() -> None:
+def test_given_loops_are_listed_once() -> None:
     pairs = [(0, k) for k in range(1, 9)]
     (reason,) = judge(evidence(rejected=pairs, given=pairs))[1]
     assert reason.text.startswith("8 given loop closures were not used: 0-1 (only 3% ")
@@ -527,8 +527,8 @@ def test_loops_given_by_hand_are_listed_once() -> None:
     assert one.ranges == ((1, 1), (7, 7))
 
 
-def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
-    """A note: the verdict stays, as a camera's factory calibration is usually right."""
+def test_calibration_without_loop_confirmation_is_noted() -> None:
+    """Only a note: the factory calibration of a camera is usually right."""
     found = CalibrationCheck(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
@@ -557,7 +557,7 @@ def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
         assert said(quiet) == []
 
 
-def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
+def test_calibration_alarm_states_error_and_remedy() -> None:
     gap = Gap(2, 7, (0.33, 0.2), (0.09, 0.05))
     found = CalibrationCheck(
         True, {"focal": -0.05, "offset": -0.03}, {"focal": 0.003}, (0.6, 0.7), gap
@@ -570,7 +570,7 @@ def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
     assert alarm.frames == (2, 7)
     for words in ("330 mm", "11.5°", "focal length 5.3% larger", "ranges 30 mm shorter"):
         assert words in alarm.text
-    # Without an alarm nothing is said.
+    # Without an alarm nothing is reported.
     calm = replace(
         case, refinement=replace(refinement, calibration_check=replace(found, alarm=False))
     )

@@ -20,7 +20,7 @@ from tofuse.registration.search import SearchOptions
 
 DEFAULT = from_method("default")
 QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
-# Coarse and quick: it is about poses.
+# Coarse and fast: these tests are about poses.
 CONFIG = replace(
     DEFAULT,
     corrections=(),
@@ -35,7 +35,7 @@ PATH = [at(0.2 * np.sin(0.2 * k), 0.2 * np.cos(0.2 * k), 0.06 * k) for k in rang
 
 
 def frames_of(places, **scene):
-    """Views from these places of the path, in this order."""
+    """Views from these places of the path, in the given order."""
     return [seen(PATH[k], k, **scene) for k in places]
 
 
@@ -54,7 +54,7 @@ def run(frames, threads=1):
 
 
 def assert_right(trajectory, places, rows, metres=0.02, degrees=0.7):
-    """Poses of some frames are right in relation to the first of them."""
+    """Some poses are correct relative to the first of them."""
     first = rows[0]
     for k in rows[1:]:
         true = se3.inverse(PATH[places[first]]) @ PATH[places[k]]
@@ -65,7 +65,7 @@ def assert_right(trajectory, places, rows, metres=0.02, degrees=0.7):
 
 @pytest.fixture(scope="module")
 def there_and_back():
-    """Through a room, from elsewhere in it, and to where it began; with lost frames between."""
+    """Out through a room, from another place in it, and back; with lost frames in between."""
     places = [*range(8), 7, 7, *range(22, 28), 27, *range(3, 9)]
     frames = frames_of(places)
     for k in (8, 9, 16):
@@ -78,8 +78,8 @@ def joined(there_and_back):
     return run(there_and_back[1])
 
 
-def test_what_was_lost_sight_of_is_joined_into_one_model(there_and_back, joined) -> None:
-    """Frames 17 to 22 see again what 0 to 7 saw; what is between is of the other side."""
+def test_revisited_part_is_joined_into_one_model(there_and_back, joined) -> None:
+    """Frames 17 to 22 revisit 0 to 7; those in between show the other side."""
     places, _ = there_and_back
     result, live = joined
     lost = [8, 9, 16]
@@ -96,13 +96,13 @@ def test_what_was_lost_sight_of_is_joined_into_one_model(there_and_back, joined)
     again = next(c for c in others if c.frames[0][0] == 17)
     assert again.connected
     assert again.joined == "links"
-    # Each frame with a pose in the main model is of a component that is connected.
+    # Each frame with a pose in the main model belongs to a connected component.
     for record in result.diagnostics.frames:
         if record.component is not None:
             assert result.has_pose[record.index] == result.components[record.component].connected
 
 
-def test_live_poses_of_connected_components_are_right(there_and_back, joined) -> None:
+def test_live_poses_of_connected_components_are_correct(there_and_back, joined) -> None:
     places, _ = there_and_back
     _, live = joined
     rows = [k for k, T in enumerate(live) if T is not None]
@@ -110,7 +110,7 @@ def test_live_poses_of_connected_components_are_right(there_and_back, joined) ->
     assert_right([np.eye(4) if T is None else T for T in live], places, rows)
 
 
-def test_threads_change_nothing(there_and_back, joined) -> None:
+def test_result_is_independent_of_threads(there_and_back, joined) -> None:
     result, live = joined
     other, also = run(there_and_back[1], threads=2)
     assert other.trajectory.tobytes() == result.trajectory.tobytes()
@@ -127,13 +127,13 @@ def test_threads_change_nothing(there_and_back, joined) -> None:
 
 
 @pytest.mark.parametrize("after", [6, 12, 20])
-def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after) -> None:
+def test_restored_copy_gives_same_result(there_and_back, joined, after) -> None:
     _, frames = there_and_back
     result, _ = joined
     mapper = Mapper(CONFIG, threads=1)
     for frame in frames[:after]:
         mapper.push(frame)
-    # As checkpoints do, which load types of the package only.
+    # As in checkpoints, which load types of the package only.
     copy = decode(*encode(mapper))
     copy.resume(1, Silent())
     for frame in frames[after:]:
@@ -144,8 +144,8 @@ def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after)
     assert again.cloud.points.tobytes() == result.cloud.points.tobytes()
 
 
-def test_the_end_goes_on_after_any_stage(there_and_back, joined) -> None:
-    """What was decided about components is kept with the other stages."""
+def test_finish_resumes_after_any_stage(there_and_back, joined) -> None:
+    """Decisions about components are stored with the other stages."""
     result, _ = joined
     whole = Kept(0)
     states = []
@@ -153,7 +153,7 @@ def test_the_end_goes_on_after_any_stage(there_and_back, joined) -> None:
         mapper = Mapper(CONFIG, threads=1)
         for frame in there_and_back[1]:
             mapper.push(frame)
-        if stages is None:  # joining and loops are known, what follows is not
+        if stages is None:  # joining and loops are stored, later stages are not
             stages = Kept(0)
             stages.states = {k: whole.states[k] for k in ("joining", "loops")}
         states.append(mapper.finish(stages))
@@ -162,7 +162,7 @@ def test_the_end_goes_on_after_any_stage(there_and_back, joined) -> None:
         assert [c.frames for c in again.components] == [c.frames for c in result.components]
 
 
-def test_blank_frames_in_the_middle_leave_one_model() -> None:
+def test_blank_frames_leave_one_model() -> None:
     places = [*range(6), 6, 7, 8, *range(9, 15)]
     frames = frames_of(places)
     for k in (6, 7, 8):
@@ -173,7 +173,7 @@ def test_blank_frames_in_the_middle_leave_one_model() -> None:
     assert all(component.connected for component in result.components)
 
 
-def test_two_scenes_are_two_components_with_a_model_each() -> None:
+def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))
     assert result.has_pose.tolist() == [True] * 10 + [False] * 8
@@ -194,14 +194,14 @@ def test_two_scenes_are_two_components_with_a_model_each() -> None:
     assert result.diagnostics.verdict == "degraded"
 
 
-def test_a_few_frames_of_another_scene_get_no_model() -> None:
+def test_few_frames_of_another_scene_get_no_model() -> None:
     result, _ = run(in_order([*frames_of(range(6)), *frames_of(range(3), **STRANGE)]))
     assert [c.connected for c in result.components] == [True, False]
     assert result.components[1].result is None
 
 
 @pytest.mark.parametrize("seed", [2, 4])
-def test_views_in_no_order_are_put_together(seed) -> None:
+def test_unordered_views_are_joined(seed) -> None:
     places = np.random.default_rng(seed).permutation(range(0, 24, 2)).tolist()
     result, _ = run(in_order(frames_of(places)))
     rows = np.flatnonzero(result.has_pose).tolist()

@@ -34,7 +34,7 @@ def frames() -> list[RangeFrame]:
 
 @pytest.fixture(scope="module")
 def forward() -> list[RangeFrame]:
-    """Into a furnished room, so that ranges change."""
+    """Forward into a furnished room, so that ranges change."""
     scene, sequence = build("room", texture=True)
     start = sequence.T_room_camera(0.0)
 
@@ -69,23 +69,23 @@ def recording(frames: list[RangeFrame], exponent: float) -> Recording:
 
 
 @pytest.mark.parametrize("exponent", [-3.0, 2.0, 5.0])
-def test_it_is_found_whatever_it_is(frames, exponent):
+def test_falloff_is_estimated(frames, exponent):
     plain = estimate_falloff(recording(frames, 0.0), lambda f: f, SurfaceOptions())
     found = estimate_falloff(recording(frames, exponent), lambda f: f, SurfaceOptions())
     assert abs(plain) < 0.5
     assert found == pytest.approx(exponent, abs=0.6)
 
 
-def test_it_becomes_part_of_the_configuration_once(frames):
+def test_estimated_falloff_enters_configuration_once(frames):
     config = adapted(from_method("default"), recording(frames, 5.0), threads=1)
     assert config.odometry.views.falloff == pytest.approx(5.0, abs=0.6)
-    # What is given is taken.
+    # A given value is kept.
     views = replace(config.odometry.views, falloff=1.0)
     given = replace(config, odometry=replace(config.odometry, views=views))
     assert adapted(given, recording(frames, 5.0), threads=1).odometry.views.falloff == 1.0
 
 
-def test_a_recording_without_amplitude_or_motion_shows_none(frames):
+def test_no_falloff_without_amplitude_or_motion(frames):
     still = [replace(frames[0], index=k, timestamp=k / 15) for k in range(24)]
     assert estimate_falloff(recording(still, 4.0), lambda f: f, SurfaceOptions()) == 0.0
     dark = [replace(frame, amplitude_image=None) for frame in frames]
@@ -95,7 +95,7 @@ def test_a_recording_without_amplitude_or_motion_shows_none(frames):
 
 
 @pytest.mark.parametrize("exponent", [0.0, 4.0])
-def test_light_helps_where_geometry_does_not_tell_the_motion(wall, exponent):
+def test_falloff_is_estimated_where_geometry_is_degenerate(wall, exponent):
     given = recording(wall, exponent)
     views = [prepare_view(frame, SurfaceOptions(falloff=0.0)) for frame in given]
     by_shape = replace(ProjectiveOptions(), photometric=False)
@@ -104,13 +104,13 @@ def test_light_helps_where_geometry_does_not_tell_the_motion(wall, exponent):
     assert found == pytest.approx(exponent, abs=0.6)
 
 
-def test_a_few_pairs_are_enough(frames):
+def test_few_pairs_suffice(frames):
     few = recording(frames[:4], 4.0)
     assert estimate_falloff(few, lambda f: f, SurfaceOptions()) == pytest.approx(4.0, abs=0.6)
 
 
 def colored(frames: list[RangeFrame], exponent: float) -> Recording:
-    """Return frames with colour, of a gamma of 2.2, instead of amplitude."""
+    """Frames with colour, at a gamma of 2.2, instead of amplitude."""
     out = []
     for frame in frames:
         log_albedo = prepare_view(frame, SurfaceOptions(falloff=0.0)).albedo[..., 0]
@@ -124,14 +124,14 @@ def colored(frames: list[RangeFrame], exponent: float) -> Recording:
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 3.0])
-def test_colour_falls_off_with_the_range_only_if_lit_by_the_camera(forward, exponent):
+def test_colour_falloff_is_estimated(forward, exponent):
     config = adapted(from_method("default"), colored(forward, exponent), threads=1)
     assert config.odometry.views.range_falloff == pytest.approx(exponent / 2.2, abs=0.1)
     assert config.odometry.views.falloff == 0.0
 
 
 def infrared(frames: list[RangeFrame], exponent: float) -> Recording:
-    """Return frames whose amplitude falls off with the range, of kind "ir"."""
+    """Frames whose amplitude falls off with the range, of kind "ir"."""
     out = []
     for frame in frames:
         assert frame.amplitude_image is not None
@@ -143,7 +143,7 @@ def infrared(frames: list[RangeFrame], exponent: float) -> Recording:
 
 
 @pytest.mark.parametrize("exponent", [0.0, 2.0])
-def test_an_infrared_image_is_raw_unless_the_recording_shows_otherwise(forward, exponent):
+def test_falloff_of_infrared_images_is_estimated(forward, exponent):
     config = adapted(from_method("default"), infrared(forward, exponent), threads=1)
     views = config.odometry.views
     assert views.range_falloff == pytest.approx(exponent, abs=0.2)
@@ -154,7 +154,7 @@ def test_an_infrared_image_is_raw_unless_the_recording_shows_otherwise(forward, 
     assert np.nanstd(alone.albedo[..., 0] - expected.albedo[..., 0]) < 0.02
 
 
-def test_without_a_recording_an_infrared_image_is_raw(forward):
+def test_infrared_image_alone_is_assumed_raw(forward):
     raw = infrared(forward[:1], 2.0)[0]
     assert isinstance(raw, RangeFrame)
     alone = prepare_view(raw, SurfaceOptions(falloff=0.0))
@@ -162,7 +162,7 @@ def test_without_a_recording_an_infrared_image_is_raw(forward):
     np.testing.assert_array_equal(alone.albedo, expected.albedo)
 
 
-def test_colour_is_compensated_for_its_falloff(forward):
+def test_colour_falloff_is_compensated(forward):
     lit, ambient = colored(forward[:1], 4.4)[0], colored(forward[:1], 0.0)[0]
     view = prepare_view(lit, SurfaceOptions(range_falloff=2.0))
     expected = prepare_view(ambient, SurfaceOptions(range_falloff=0.0))

@@ -55,7 +55,7 @@ def of_bent(recording, truth):
     return tofuse.judge(recording, bent(truth))
 
 
-def test_right_poses_are_good(of_truth) -> None:
+def test_correct_poses_are_good(of_truth) -> None:
     assert of_truth.verdict == "good"
     assert of_truth.reasons == ()
     assert of_truth.started
@@ -67,7 +67,7 @@ def test_right_poses_are_good(of_truth) -> None:
     assert of_truth.consistency.inlier_ratio > 0.9
 
 
-def test_wrong_poses_are_as_far_off_as_is_said(of_bent, truth) -> None:
+def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
     wrong, _ = displacement(truth, bent(truth))
     assert wrong > 0.02
     stated = of_bent.accuracy.position_m
@@ -84,9 +84,7 @@ def test_wrong_poses_are_as_far_off_as_is_said(of_bent, truth) -> None:
     assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
 
 
-def test_wrong_poses_are_further_from_what_is_measured_than_right_ones(
-    recording, truth, of_truth, of_bent
-) -> None:
+def test_wrong_poses_deviate_more_from_measurements(recording, truth, of_truth, of_bent) -> None:
     wrong, right = of_bent.deviation, of_truth.deviation
     depth_m = wrong.fit.depth_m
     aligned = align(bent(truth), truth, arm_m=depth_m) @ bent(truth)
@@ -95,12 +93,12 @@ def test_wrong_poses_are_further_from_what_is_measured_than_right_ones(
     assert right.estimate_m < 0.005 < wrong.at_least_m <= true < wrong.at_most_m
     assert wrong.estimate_m == pytest.approx(true, rel=0.3)
     assert wrong.ids[wrong.steps].tolist() == [[3, 4]]
-    # Other poses of the recording can be compared without registering anything again.
+    # Other poses of the recording are compared without repeating registrations.
     again = deviation(right.fit, bent(truth)[right.ids])
     assert again.estimate_m == pytest.approx(wrong.estimate_m, rel=0.1)
 
 
-def test_a_tolerance_decides(recording, truth) -> None:
+def test_tolerance_decides_verdict(recording, truth) -> None:
     near = truth.copy()
     near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((8, 3))
     assert tofuse.judge(recording, near, tolerance_m=0.05).verdict == "good"
@@ -108,7 +106,7 @@ def test_a_tolerance_decides(recording, truth) -> None:
     assert reason.code == "uncertain_poses"
 
 
-def test_poses_of_another_place_are_contradicted_and_tracked_anew(recording, truth) -> None:
+def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) -> None:
     turns = np.array([se3.exp(np.array([0, 0, 0, 0, 2.5 * k, 0])) for k in range(8)])
     found = tofuse.judge(recording, turns @ truth)
     assert not found.started
@@ -122,7 +120,7 @@ def test_poses_of_another_place_are_contradicted_and_tracked_anew(recording, tru
     assert "images_disagree" in [r.code for r in found.reasons]
 
 
-def test_frames_without_a_pose_stay_without(recording, truth) -> None:
+def test_frames_without_pose_stay_without(recording, truth) -> None:
     some = truth.copy()
     some[[2, 5]] = np.nan
     found = tofuse.judge(recording, some)
@@ -131,7 +129,7 @@ def test_frames_without_a_pose_stay_without(recording, truth) -> None:
     assert found.to_dict()["frames"] == 6
 
 
-def test_given_poses_are_kept_where_nothing_refines(recording, truth) -> None:
+def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
     moved = bent(truth)
     config = replace(from_method("default"), odometry=GivenPoses(), refinement=NoRefinement())
     result = tofuse.reconstruct(with_odometry(recording, moved), config)
@@ -140,7 +138,7 @@ def test_given_poses_are_kept_where_nothing_refines(recording, truth) -> None:
     assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 8
 
 
-def test_what_can_not_be_judged_is_refused(recording, truth, tmp_path) -> None:
+def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
     with pytest.raises(InputError, match="for 8 frames"):
         tofuse.judge(recording, truth[:5])
     one = np.full_like(truth, np.nan)
@@ -190,7 +188,7 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     assert 0 < said["at_least_m"] <= said["estimate_m"] <= said["at_most_m"]
     assert len(said["frames"]) == len(said["of_frames_m"])
     assert said["inconsistent_steps"] == [[3, 4]]
-    # A result of it is replaced only if asked to, and is a trajectory itself.
+    # Its result is replaced only on request, and is a trajectory itself.
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main(["judge", str(room_recording), str(tmp_path / "out")]) == 0
@@ -211,10 +209,10 @@ def test_command_refuses(room_recording, tmp_path, capsys) -> None:
     assert "contains no earlier result" in capsys.readouterr().err
 
 
-def test_poses_that_a_phone_found_are_judged_unasked(recording, truth) -> None:
-    """Its statements also hold for wrong poses of the phone."""
+def test_device_poses_are_judged_by_default(recording, truth) -> None:
+    """The stated errors also hold for wrong poses of the phone."""
     result = tofuse.reconstruct(recording)
-    assert device_sentence(recording, result) == ""  # poses of a simulation are nobody's
+    assert device_sentence(recording, result) == ""  # a simulation has no device
     phone = phone_of(recording, bent(truth))
     said = device_sentence(phone, result)
     match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", said)

@@ -31,7 +31,7 @@ SMALL = se3.exp(se3.log(DRIFT) / 2)
 
 @dataclass(frozen=True)
 class Drifting:
-    """Odometry that errs by the same little motion at every step."""
+    """Odometry with the same small error in every step."""
 
     part_kind: ClassVar[str] = "odometry"
     part_name: ClassVar[str] = "drifting"
@@ -55,7 +55,7 @@ class _Drifting(Tracker):
         k, T = self.before
         motion = se3.inverse(truth[k]) @ truth[at] @ SMALL
         self.before = at, T @ motion
-        # As certain as the drift is large, so that the graph knows where to give way.
+        # As uncertain as the drift is large, so that the graph corrects it.
         information = np.diag([1 / 0.004**2] * 3 + [1 / 0.003**2] * 3)
         registration = Registration(motion, True, 1, 100, 100, 0.0, 0.001, information)
         return Step("tracked", "", self.before[1], frame.index - 1, registration, view)
@@ -80,13 +80,13 @@ def live(frames, threads):
     )
     mapper = Mapper(config, threads=threads)
     poses = [mapper.push(frame) for frame in frames]
-    # The camera stands still at the end, long enough for what was found last to count.
+    # The camera stands still at the end, long enough for the last loop to take effect.
     for k in range(COUNT, COUNT + DELAY + 1):
         poses += [mapper.push(replace(frames[-1], index=k, timestamp=float(k)))]
     return np.stack(poses)
 
 
-def test_loops_move_the_pose_while_frames_arrive_and_always_equally_late(frames):
+def test_loops_correct_live_pose_with_fixed_delay(frames):
     truth = away_and_back(COUNT)
     poses = live(frames, 1)
 
@@ -105,13 +105,13 @@ def test_loops_move_the_pose_while_frames_arrive_and_always_equally_late(frames)
 
 
 def scripted(pairs):
-    """Loops of which some frames close one, and which count how often they were asked."""
+    """A loop detector that returns given loops and counts its calls."""
 
     class Scripted:
         asked = 0
 
         def push(self, view, T_component_camera):
-            """Nothing to remember."""
+            """Nothing to store."""
 
         def look(self):
             self.asked += 1
@@ -127,7 +127,7 @@ def scripted(pairs):
     return Scripted()
 
 
-def test_what_is_found_counts_so_many_frames_later():
+def test_loops_take_effect_after_fixed_delay():
     loops = LiveLoops(scripted([(0, 3)]))
     new = [loops.advance() for _ in range(3 + DELAY + 3)]
     assert [k for k, known in enumerate(new) if known] == [3 + DELAY]
@@ -135,7 +135,7 @@ def test_what_is_found_counts_so_many_frames_later():
     loops.finish()
 
 
-def test_an_error_in_a_job_is_not_swallowed():
+def test_error_in_job_is_raised():
     class Broken:
         def look(self):
             def work():
@@ -160,7 +160,7 @@ class _AlwaysClosing:
         return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
 
 
-def test_the_graph_is_solved_less_often_the_longer_it_is():
+def test_long_graphs_are_solved_less_often():
     live, log = LivePoses(_AlwaysClosing()), FrameLog()
     solved = []
     for k in range(3000):
@@ -170,7 +170,7 @@ def test_the_graph_is_solved_less_often_the_longer_it_is():
             solved.append(k)
     live.finish()
     gaps = np.diff(solved)
-    # Of up to a thousand frames every loop counts when it is due.
+    # Up to a thousand frames every loop takes effect when due.
     assert (gaps[: np.searchsorted(solved, 900)] == DELAY).all()
     assert (gaps >= 0.01 * np.array(solved[1:])).all()
     assert gaps[-1] <= 40

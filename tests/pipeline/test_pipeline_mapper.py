@@ -25,7 +25,7 @@ from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
-# Fine enough for few frames, and quick.
+# Fine enough for few frames, and fast.
 CONFIG = changed(
     from_method("thesis"), {"odometry": {"registration": {"resolution": 0.03}}}, where="tests"
 )
@@ -60,7 +60,7 @@ def blank(frame: RangeFrame) -> RangeFrame:
     return replace(frame, depth=np.zeros_like(frame.depth))
 
 
-def test_frames_pushed_one_by_one_give_the_same_bytes(frames, whole) -> None:
+def test_frames_pushed_one_by_one_give_same_bytes(frames, whole) -> None:
     mapper = Mapper(CONFIG)
     poses = [mapper.push(frame) for frame in frames]
     result = mapper.finish()
@@ -72,7 +72,7 @@ def test_frames_pushed_one_by_one_give_the_same_bytes(frames, whole) -> None:
     assert result.recording == {"path": None, "format": "frames", "frames": 8}
 
 
-def test_result_of_a_whole_run(whole, recording) -> None:
+def test_result_of_whole_run(whole, recording) -> None:
     assert whole.trajectory.shape == (8, 4, 4)
     np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))
     np.testing.assert_array_equal(whole.timestamps, recording.timestamps)
@@ -82,7 +82,7 @@ def test_result_of_a_whole_run(whole, recording) -> None:
     assert len(whole.cloud) > 1000
     assert {"filters", "tracking", "loops", "fusion", "checking"} <= set(whole.diagnostics.seconds)
     assert 0 < whole.diagnostics.removed["neighbour_fraction"] < 1
-    # The camera of the simulation turned; the estimate must be near, not merely there.
+    # The simulated camera rotates; the estimate must be close, not just present.
     error = np.linalg.norm(whole.trajectory[:, :3, 3] - recording.reference[:, :3, 3], axis=1)
     assert error.max() < 0.1
 
@@ -96,7 +96,7 @@ def test_seed_and_threads(recording, whole) -> None:
     np.testing.assert_allclose(other.trajectory, whole.trajectory, atol=0.1)
 
 
-def test_the_number_of_threads_is_put_back(frames) -> None:
+def test_thread_count_is_restored(frames) -> None:
     before = thread_count()
     mapper = Mapper(threads=before + 1)
     mapper.push(frames[0])
@@ -104,7 +104,7 @@ def test_the_number_of_threads_is_put_back(frames) -> None:
     assert thread_count() == before
 
 
-def test_order_kind_and_end(frames) -> None:
+def test_order_kind_and_end_are_checked(frames) -> None:
     mapper = Mapper()
     mapper.push(frames[3])
     for index in (3, 1):
@@ -122,7 +122,7 @@ def test_order_kind_and_end(frames) -> None:
             call()
 
 
-def test_nothing_pushed_or_nothing_usable(frames) -> None:
+def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
     with pytest.raises(InputError, match="none of the 0 frames"):
         Mapper().finish()
     mapper = Mapper()
@@ -131,12 +131,12 @@ def test_nothing_pushed_or_nothing_usable(frames) -> None:
         mapper.finish()
 
 
-def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
+def test_filter_for_images_refuses_clouds_early(frames) -> None:
     config = replace(CONFIG, filters=(TemporalDeviation(),))
     mapper = Mapper(config)
     with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
         mapper.push(CloudFrame.of(frames[0].points))
-    mapper.push(frames[0])  # the refused view has not decided what comes next
+    mapper.push(frames[0])  # the refused view does not set the kind
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
         ("thesis", True, [], 0, True),
     ],
 )
-def test_what_is_prepared_out_of_turn_changes_nothing(
+def test_preparation_out_of_order_gives_same_result(
     frames, method, amplitude, filters, corrected, ready
 ) -> None:
     config = changed(from_method(method), {"filters": filters}, where="tests")
@@ -165,7 +165,7 @@ def test_what_is_prepared_out_of_turn_changes_nothing(
     assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
 
 
-def test_nothing_follows_the_end(frames) -> None:
+def test_no_frames_after_end(frames) -> None:
     mapper = Mapper(CONFIG)
     mapper.push(frames[0])
     mapper.end()
@@ -175,14 +175,14 @@ def test_nothing_follows_the_end(frames) -> None:
     assert mapper.finish().trajectory.shape == (1, 4, 4)
 
 
-def test_clouds_and_what_does_not_fit_are_not_prepared(frames) -> None:
+def test_clouds_and_unsuitable_frames_are_not_prepared(frames) -> None:
     assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
     assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None
     only_clouds = replace(from_method("default"), filters=(OnlyClouds(),))
     assert Mapper(only_clouds).prepare(frames[0]) is None
 
 
-def test_a_lost_frame_has_no_pose_and_the_next_goes_on(frames) -> None:
+def test_lost_frame_has_no_pose_and_tracking_continues(frames) -> None:
     lost = [blank(f) if f.index == 3 else f for f in frames]
     result = reconstruct(in_memory(lost), CONFIG)
     assert result.has_pose.tolist() == [k != 3 for k in range(8)]
@@ -193,13 +193,13 @@ def test_a_lost_frame_has_no_pose_and_the_next_goes_on(frames) -> None:
     assert result.diagnostics.verdict == "degraded"
 
 
-def test_a_lost_first_frame_is_not_the_world(frames) -> None:
+def test_lost_first_frame_is_not_the_origin(frames) -> None:
     result = reconstruct(in_memory([blank(frames[0]), *frames[1:]]))
     assert not result.has_pose[0]
     np.testing.assert_array_equal(result.trajectory[1], np.eye(4))
 
 
-def test_loops_given_by_hand(frames, whole) -> None:
+def test_given_loops_are_used_or_rejected(frames, whole) -> None:
     measured = np.linalg.inv(whole.trajectory[0]) @ whole.trajectory[7]
     given = [GivenLoop(0, 7, measured), GivenLoop(1, 3, np.eye(4))]
     lost = [blank(f) if f.index == 3 else f for f in frames]
@@ -212,28 +212,28 @@ def test_loops_given_by_hand(frames, whole) -> None:
     assert len(result.diagnostics.objective) > 0
 
 
-def test_clouds_alone_make_a_model(frames) -> None:
+def test_clouds_alone_give_a_model(frames) -> None:
     clouds = [CloudFrame.of(f.points[::3], index=f.index, timestamp=f.index) for f in frames[:4]]
     result = reconstruct(in_memory(clouds))
     assert result.has_pose.all()
     assert result.cloud.color is None
 
 
-def test_covariances_are_of_the_poses_relative_to_the_first(whole) -> None:
+def test_covariances_are_relative_to_first_pose(whole) -> None:
     first, second, *_, last = whole.diagnostics.frames
     np.testing.assert_array_equal(first.covariance, 0)
     edge = np.flatnonzero((whole.graph.edges == [0, 1]).all(1))[0]
     np.testing.assert_allclose(
         second.covariance @ whole.graph.information[edge], np.eye(6), atol=1e-6
     )
-    # Nothing closes a loop there, so that errors add up.
+    # Without loop closures, errors accumulate.
     assert np.trace(last.covariance[:3, :3]) > 2 * np.trace(second.covariance[:3, :3])
 
 
 @part("optimiser", "test-doubting")
 @dataclass(frozen=True)
 class Doubting(Optimiser):
-    """Leaves out the second loop, as if it contradicted the others."""
+    """Leaves out the second loop as an outlier."""
 
     def optimise(self, graph):
         weights = np.ones(len(graph.edges))
@@ -241,7 +241,7 @@ class Doubting(Optimiser):
         return Optimisation(graph, (2.0, 1.0), True, weights)
 
 
-def test_loops_that_the_optimiser_leaves_out_are_rejected(frames, whole) -> None:
+def test_loops_left_out_by_optimiser_are_rejected(frames, whole) -> None:
     loops = [GivenLoop(0, k, whole.trajectory[k]) for k in (3, 4, 5)]
     mapper = Mapper(replace(CONFIG, optimiser=Doubting()), loops=loops)
     for frame in frames[:6]:
@@ -257,7 +257,7 @@ def test_loops_that_the_optimiser_leaves_out_are_rejected(frames, whole) -> None
 @part("filter", "test-history")
 @dataclass(frozen=True)
 class SeesHistory(Filter):
-    """Notes which frames it was given, and how many points they had."""
+    """Records the frames it was given, and their numbers of points."""
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
     seen: ClassVar[list[tuple[int, list[int], list[int]]]] = []
@@ -273,7 +273,7 @@ class SeesHistory(Filter):
         return keep
 
 
-def test_temporal_filters_see_raw_neighbours_whatever_was_selected(recording, frames) -> None:
+def test_temporal_filters_see_raw_neighbours_of_selected_frames(recording, frames) -> None:
     SeesHistory.seen.clear()
     config = replace(CONFIG, filters=(SeesHistory(),))
     result = reconstruct(recording.select(0, None, 3), config)
@@ -293,7 +293,7 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     assert result.has_pose.all()
 
 
-def test_joined_recordings_are_not_each_others_history(room_recording) -> None:
+def test_joined_recordings_share_no_history(room_recording) -> None:
     SeesHistory.seen.clear()
     joined = tofuse.open(room_recording, room_recording).select(6, 11)
     reconstruct(joined, replace(CONFIG, filters=(SeesHistory(),)))
@@ -301,7 +301,7 @@ def test_joined_recordings_are_not_each_others_history(room_recording) -> None:
     assert found == [(6, [4, 5]), (7, [5, 6]), (8, []), (9, [8]), (10, [8, 9])]
 
 
-def test_pushed_frames_are_each_others_history(frames) -> None:
+def test_pushed_frames_form_the_history(frames) -> None:
     SeesHistory.seen.clear()
     mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
     for frame in frames[:4]:
@@ -310,7 +310,7 @@ def test_pushed_frames_are_each_others_history(frames) -> None:
     assert SeesHistory.seen[3][2] == [len(frames[1]), len(frames[2])]
 
 
-def test_odometry_is_used_where_it_is_asked_for(frames, recording) -> None:
+def test_odometry_is_used_as_guess_on_request(frames, recording) -> None:
     config = replace(CONFIG, odometry=replace(CONFIG.odometry, guess="odometry"))
     odometry = recording.reference.copy()
     with_odometry = reconstruct(in_memory(frames, odometry=odometry), config)
@@ -320,7 +320,7 @@ def test_odometry_is_used_where_it_is_asked_for(frames, recording) -> None:
     assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
 
 
-def test_the_model_before_optimisation_is_kept_where_a_loop_moved_it() -> None:
+def test_model_before_loop_closure_is_kept() -> None:
     views, poses = peaks_views(0.06, 0)
     recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
     changes = {
@@ -345,7 +345,7 @@ def test_the_model_before_optimisation_is_kept_where_a_loop_moved_it() -> None:
     assert len(closed.cloud) != len(before)
 
 
-def test_a_camera_that_jumps_back_is_followed(frames) -> None:
+def test_camera_that_jumps_back_is_tracked(frames) -> None:
     mapper = Mapper("default")
     again = [replace(f, index=k) for k, f in enumerate([*frames[:6], *frames[:4]])]
     for frame in again:

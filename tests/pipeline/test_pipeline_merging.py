@@ -37,7 +37,7 @@ TRUE = np.array([*HERE, *THERE])
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory) -> dict[str, Path]:
-    """Two walks in a room, and one in another flat of the same plan, furnished differently."""
+    """Two sessions in a room, and one in a differently furnished flat of the same plan."""
     base = tmp_path_factory.mktemp("sessions")
     return {
         "here": made_result(base / "here", HERE, 1),
@@ -69,7 +69,7 @@ def changed_run_json(folder: Path, **changes: object) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
-def test_two_walks_in_one_room_are_one_map(both) -> None:
+def test_two_sessions_in_one_room_give_one_map(both) -> None:
     assert both.has_pose.all()
     off = se3.inverse(TRUE[0]) @ TRUE
     error = np.linalg.norm(off[:, :3, 3] - both.trajectory[:, :3, 3], axis=1)
@@ -78,7 +78,7 @@ def test_two_walks_in_one_room_are_one_map(both) -> None:
     assert exit_status(both) == 0
 
 
-def test_the_world_is_that_of_the_first(both) -> None:
+def test_first_session_defines_the_world(both) -> None:
     np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
     first, second = both.sessions
     np.testing.assert_array_equal(first.T_main_session, np.eye(4))
@@ -86,7 +86,7 @@ def test_the_world_is_that_of_the_first(both) -> None:
     np.testing.assert_allclose(second.T_main_session, between, atol=0.005)
 
 
-def test_it_says_which_overlap_and_how_sure(both) -> None:
+def test_overlap_and_probability_are_reported(both) -> None:
     (pair,) = both.session_pairs
     assert (pair.a, pair.b, pair.joined, pair.before) == (0, 1, True, False)
     assert pair.links >= 2
@@ -98,7 +98,7 @@ def test_it_says_which_overlap_and_how_sure(both) -> None:
     assert "probability" in text
 
 
-def test_run_json_says_of_which_session_a_frame_is(both, results) -> None:
+def test_run_json_states_session_of_each_frame(both, results) -> None:
     data = run_json(both)
     assert [frame["session"] for frame in data["frames"]] == [0] * 12 + [1] * 12
     assert [s["name"] for s in data["sessions"]] == ["here", "there"]
@@ -107,7 +107,7 @@ def test_run_json_says_of_which_session_a_frame_is(both, results) -> None:
     assert data["session_pairs"][0]["joined"]
 
 
-def test_a_flat_of_the_same_plan_is_not_joined(results) -> None:
+def test_flat_of_same_plan_is_not_joined(results) -> None:
     found = merged(results["here"], results["elsewhere"], searches=4)
     assert found.has_pose.tolist() == [True] * 12 + [False] * 12
     (pair,) = found.session_pairs
@@ -123,8 +123,8 @@ def test_a_flat_of_the_same_plan_is_not_joined(results) -> None:
     assert exit_status(found) == 3
 
 
-def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_path) -> None:
-    """And a merged result can be merged again: what was joined stays so."""
+def test_first_session_stays_main_if_others_are_larger(results, tmp_path) -> None:
+    """And merged results can be merged again: joined sessions stay joined."""
     pair = merged(results["here"], results["there"])
     write_result(pair, OutputFolder(tmp_path / "pair"))
     found = merged(results["elsewhere"], tmp_path / "pair", searches=3)
@@ -143,7 +143,7 @@ def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_pat
     assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
 
 
-def test_loops_of_an_earlier_merge_are_registered_again(both, results, tmp_path) -> None:
+def test_loops_of_earlier_merge_are_registered_again(both, results, tmp_path) -> None:
     write_result(both, OutputFolder(tmp_path / "pair"))
     sessions = read_sessions([results["elsewhere"], tmp_path / "pair"], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < 12 <= p.j]
@@ -161,7 +161,7 @@ def test_loops_of_an_earlier_merge_are_registered_again(both, results, tmp_path)
     assert "loop_rejected" not in codes
 
 
-def test_threads_change_nothing(both, results) -> None:
+def test_result_is_independent_of_threads(both, results) -> None:
     sessions = read_sessions([results["here"], results["there"]], 1, Silent())
     config = quick(merged_config(sessions))
     joining = replace(config.joining, searches=6, tries=6)
@@ -171,7 +171,7 @@ def test_threads_change_nothing(both, results) -> None:
     assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
 
 
-def test_the_command_writes_a_result(results, tmp_path, monkeypatch, capsys) -> None:
+def test_command_writes_result(results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
     out = tmp_path / "all"
     words = ["merge", str(results["here"]), str(results["there"]), "--out", str(out)]
@@ -217,7 +217,7 @@ def test_bad_input_is_refused_in_one_line(results, tmp_path) -> None:
     refused([here, tmp_path / "out"], "same recording", "12 frames are in both")
 
 
-def test_a_recording_that_is_gone_is_named_with_a_remedy(results, tmp_path) -> None:
+def test_missing_recording_is_named_with_remedy(results, tmp_path) -> None:
     again = copied(results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
@@ -225,7 +225,7 @@ def test_a_recording_that_is_gone_is_named_with_a_remedy(results, tmp_path) -> N
     refused([results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back")
 
 
-def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
+def test_changed_recording_is_refused(results, tmp_path) -> None:
     again = copied(results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
@@ -251,8 +251,8 @@ def test_results_of_clouds_are_refused(results, tmp_path) -> None:
     refused([results["here"], again], "clouds", "pass their clouds together")
 
 
-def test_a_result_that_knows_its_recording_by_the_path_alone(results, tmp_path) -> None:
-    """As those of earlier versions do."""
+def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) -> None:
+    """As results of earlier versions do."""
     again = copied(results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     told = {k: run["input"][k] for k in ("path", "format", "frames")}
@@ -262,8 +262,8 @@ def test_a_result_that_knows_its_recording_by_the_path_alone(results, tmp_path) 
     assert len(session.posed) == 12
 
 
-def test_recordings_may_be_joined_and_selected(results, tmp_path) -> None:
-    """What was opened is opened again: both recordings of a run, and every other frame."""
+def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
+    """The same frames are opened again: both recordings of a run, every other frame."""
     paths = [Path(read_run_json(results[k] / "run.json")["input"]["path"]) for k in results][:2]
     opening = Opening(tuple(paths), every=2, start=1)
     recording = opening.open()
@@ -281,14 +281,14 @@ def test_recordings_may_be_joined_and_selected(results, tmp_path) -> None:
 @pytest.mark.parametrize(
     "changes", [{"frames": [{}]}, {"frames": 3}, {"input": {}}, {"components": [1]}]
 )
-def test_a_damaged_result_is_refused(results, tmp_path, changes) -> None:
+def test_damaged_result_is_refused(results, tmp_path, changes) -> None:
     again = copied(results["there"], tmp_path)
     changed_run_json(again, **changes)
     refused([results["here"], again], "damaged")
 
 
-def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -> None:
-    """And one that can't be located there leaves the map as it was."""
+def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> None:
+    """And one that cannot be located in the map leaves it unchanged."""
     monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
     monkeypatch.setattr(merging, "_report", lambda result, folder: None)
     into = copied(results["here"], tmp_path)
@@ -296,7 +296,7 @@ def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -
     told = reconstruct(session.recording.select(end=2), quick())
 
     def runs_to(folder: Path) -> None:
-        """Whatever is asked for, the run has this result."""
+        """Every run returns this result, whatever the arguments."""
         shutil.rmtree(tmp_path / "new", ignore_errors=True)
         shutil.copytree(folder, tmp_path / "new")
         monkeypatch.setattr(run_module, "run", lambda *_: told)
@@ -316,8 +316,8 @@ def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
 
 
-def test_parts_of_a_result_that_were_apart_stay_so_or_are_joined(results, tmp_path) -> None:
-    """A recording that goes on elsewhere after a dark frame; and the place where it went on."""
+def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path) -> None:
+    """A recording that continues elsewhere after a dark frame, and a session of that place."""
     first, second = HERE[5:], THERE[5:]
     frames = [
         *(seen(T, 400 + k) for k, T in enumerate(first)),

@@ -25,7 +25,7 @@ BOTH = (GravityEdges(), OdometryEdges())
 
 @pytest.fixture(scope="module")
 def beside(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The simulated room with an accelerometer and odometry; of the latter one pose is missing."""
+    """The simulated room with an accelerometer and odometry, which lacks one pose."""
     folder = tmp_path_factory.mktemp("beside") / "room"
     shutil.copytree(room_recording, folder)
     recording = open_recording(room_recording)
@@ -46,7 +46,7 @@ def made(folder: Path, *priors: object) -> Reconstruction:
     return reconstruct(open_recording(folder), config, threads=1)
 
 
-def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, room_recording):
+def test_priors_are_used_on_request_and_reported(beside, room_recording):
     alone, both = made(beside), made(beside, *BOTH)
     told = {record.sensor: record for record in both.diagnostics.priors}
     assert (told["gravity"].measured, told["gravity"].used) == (8, 8)
@@ -64,10 +64,10 @@ def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, roo
 
     assert 0 < np.abs(both.trajectory - alone.trajectory).max() < 0.02
     assert off(both) < off(alone) + 0.001
-    # How loosely the path is held is told with them, but the verdict is that of the images.
+    # The accuracy includes the priors, but the verdict is that of the images.
     assert both.diagnostics.verdict == alone.diagnostics.verdict
     stated, by_images = (r.diagnostics.accuracy for r in (both, alone))
-    # Tracking starts nearer to the solution, and the correction by the refinement is part of it.
+    # Tracking starts closer to the solution, and the correction by the refinement counts.
     assert 0.7 * by_images.rotation_rad < stated.rotation_rad < 1.05 * by_images.rotation_rad
     last = [r.diagnostics.frames[-1].covariance for r in (both, alone)]
     assert last[0] is not None
@@ -75,7 +75,7 @@ def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, roo
     assert np.trace(last[0][3:, 3:]) < np.trace(last[1][3:, 3:])
 
 
-def test_without_files_it_is_the_same_to_the_last_bit(room_recording):
+def test_missing_sensor_files_change_nothing(room_recording):
     asked, not_asked = made(room_recording, *BOTH), made(room_recording)
     assert asked.diagnostics.priors == ()
     np.testing.assert_array_equal(asked.trajectory, not_asked.trajectory)
@@ -83,7 +83,7 @@ def test_without_files_it_is_the_same_to_the_last_bit(room_recording):
     np.testing.assert_array_equal(asked.cloud.points, not_asked.cloud.points)
 
 
-def test_a_turned_object_knows_nothing_of_gravity(tmp_path):
+def test_rotating_object_has_no_gravity(tmp_path):
     from tofuse.pipeline.run import Options, resolve
 
     assert resolve(Options(tmp_path)).priors == (GravityEdges(),)

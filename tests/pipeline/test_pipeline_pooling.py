@@ -8,7 +8,7 @@ import pytest
 from tofuse.pipeline.pooling import pooled
 
 
-def test_equal_estimates_are_known_by_their_spread() -> None:
+def test_variance_of_equal_estimates_follows_their_spread() -> None:
     rng = np.random.default_rng(0)
     off, stated = [], []
     for _ in range(200):
@@ -20,7 +20,7 @@ def test_equal_estimates_are_known_by_their_spread() -> None:
     assert 0.90 < covered.mean() <= 1.0
 
 
-def test_precise_estimates_count_more_where_only_noise_differs() -> None:
+def test_precise_estimates_weigh_more_if_only_noise_differs() -> None:
     rng = np.random.default_rng(1)
     information = np.repeat([1.0, 400.0], 8)
     off = []
@@ -31,16 +31,16 @@ def test_precise_estimates_count_more_where_only_noise_differs() -> None:
     assert np.sqrt(np.mean(np.square(off))) < 1.5 * alone
 
 
-def test_precise_estimates_do_not_count_more_where_estimates_truly_differ() -> None:
-    """One estimate of sixty times the information is one draw of the population like any other."""
+def test_precise_estimates_do_not_weigh_more_if_estimates_truly_differ() -> None:
+    """An estimate with sixty times the information is still one draw of the population."""
     rng = np.random.default_rng(2)
     information = np.array([60.0, *[1.0] * 11])
     off = [pooled(rng.normal(0.3, 0.2, 12), information)[0] - 0.3 for _ in range(100)]
-    assert np.sqrt(np.mean(np.square(off))) < 0.5 * 0.2  # weighed by information: nearly 0.2
+    assert np.sqrt(np.mean(np.square(off))) < 0.5 * 0.2  # weighted by information: nearly 0.2
 
 
 @pytest.mark.parametrize("wild", [-4.0, 50.0])
-def test_an_outlier_hardly_moves_it(wild: float) -> None:
+def test_outlier_hardly_changes_estimate(wild: float) -> None:
     rng = np.random.default_rng(3)
     good = rng.normal(0.3, 0.05, 11)
     mean, deviation = pooled(np.r_[good, wild], np.ones(12))

@@ -33,7 +33,7 @@ def recording(room_recording: Path) -> Recording:
 
 
 def by_phone(recording: Recording, poses=None) -> Recording:
-    """The recording as if a phone had found its reference poses, or others."""
+    """The recording as if its reference poses, or others, were those of a phone."""
     frames = list(recording)
     found = recording.reference if poses is None else np.asarray(poses)
     source = ArraySource(frames, found, metadata={**recording.metadata, POSES_BY: "ARKit"})
@@ -44,17 +44,17 @@ def kinds(config) -> list[type]:
     return [type(sensor) for sensor in config.priors]
 
 
-def test_a_phone_knows_its_poses(recording) -> None:
+def test_device_poses_are_used_as_odometry(recording) -> None:
     phone = by_phone(recording)
     led, config = with_prior(phone, from_method("default"), "auto")
     assert kinds(config) == [GravityEdges, OdometryEdges]
     np.testing.assert_array_equal(led.odometry, recording.reference)
-    # They stay what the result is compared with.
+    # They remain the reference for comparison.
     np.testing.assert_array_equal(led.reference, recording.reference)
     assert led[0].index == phone[0].index
 
 
-def test_reference_poses_of_other_recordings_are_only_compared_with(recording) -> None:
+def test_reference_poses_are_used_for_comparison_only(recording) -> None:
     same, config = with_prior(recording, from_method("default"), "auto")
     assert same is recording
     assert kinds(config) == [GravityEdges]
@@ -62,8 +62,8 @@ def test_reference_poses_of_other_recordings_are_only_compared_with(recording) -
         with_prior(recording, from_method("default"), "device")
 
 
-def test_a_phone_knows_which_way_up_it_was(recording) -> None:
-    # Its world has y up, and is turned about that and moved against the result's.
+def test_device_poses_give_gravity_direction(recording) -> None:
+    # Its world has y up, and is rotated about y and translated relative to the result's.
     T_device_world = np.eye(4)
     T_device_world[:3, :3] = [[0.0, 0.0, 1.0], [-0.6, -0.8, 0.0], [0.8, -0.6, 0.0]]
     T_device_world[:3, 3] = [3.0, 1.0, -2.0]
@@ -78,37 +78,37 @@ def test_a_phone_knows_which_way_up_it_was(recording) -> None:
     assert device_up(phone, lost) is None
 
 
-def test_nothing_but_the_images(recording) -> None:
+def test_prior_none_uses_images_only(recording) -> None:
     same, config = with_prior(by_phone(recording), from_method("default"), "none")
     assert same.odometry is None
     assert config.priors == ()
 
 
-def test_the_thesis_listens_to_nothing_unless_asked(recording) -> None:
+def test_thesis_method_uses_no_priors_by_default(recording) -> None:
     phone, thesis = by_phone(recording), from_method("thesis")
     assert with_prior(phone, thesis, "auto") == (phone, thesis)
     assert kinds(with_prior(phone, thesis, "device")[1]) == [GravityEdges, OdometryEdges]
 
 
-def test_a_file_of_odometry_comes_before_the_poses_of_the_phone(recording) -> None:
+def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
     phone = by_phone(recording)
     odometry = np.tile(np.eye(4), (len(phone), 1, 1))
     phone.source.odometry = odometry
     led, config = with_prior(phone, from_method("default"), "device")
     np.testing.assert_array_equal(led.odometry, odometry)
     assert kinds(config) == [GravityEdges, OdometryEdges]
-    # What a configuration says of odometry stays.
+    # The odometry of a configuration is kept.
     said = replace(from_method("default"), priors=(OdometryEdges(relative=0.1),))
     assert with_prior(phone, said, "device")[1] is said
 
 
-def test_an_unknown_prior_is_refused(recording) -> None:
+def test_unknown_prior_is_refused(recording) -> None:
     with pytest.raises(InputError, match="auto, none or device"):
         with_prior(recording, from_method("default"), "some")
 
 
-def test_poses_of_another_place_do_not_count(recording) -> None:
-    """A phone that lost tracking: its poses disagree with the images."""
+def test_inconsistent_device_poses_are_ignored(recording) -> None:
+    """A phone that lost tracking: its poses contradict the images."""
     rng = np.random.default_rng(0)
     wrong = recording.reference.copy()
     wrong[:, :3, 3] = rng.uniform(-2, 2, (len(wrong), 3))
@@ -126,7 +126,7 @@ CAMERA = Pinhole(160, 120, 150.0, 150.0, 79.5, 59.5)
 
 
 def past_a_corner(covered: Collection[int] = ()) -> Recording:
-    """2 m along a bare wall and the floor, from a corner that is in view at first.
+    """2 m along a bare wall and the floor, from a corner that is visible at first.
 
     The lens is covered in some frames.
     """
@@ -150,8 +150,8 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
 
 
 @pytest.mark.parametrize("covered", [(), range(22, 32)])
-def test_the_poses_of_a_phone_bound_a_slide_along_a_wall(covered) -> None:
-    """Alone, the images leave the motion along it open."""
+def test_device_poses_bound_slide_along_wall(covered) -> None:
+    """The images alone do not constrain the motion along it."""
     recording = past_a_corner(covered)
     right = recording.reference
     alone = reconstruct(recording)
@@ -176,7 +176,7 @@ def test_the_poses_of_a_phone_bound_a_slide_along_a_wall(covered) -> None:
 @pytest.mark.parametrize(
     ("prior", "sensors"), [("auto", ["gravity"]), ("none", []), ("device", None)]
 )
-def test_the_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
+def test_prior_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
     given = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--prior", prior]
     assert main([*given, "--end", "4"]) == (2 if sensors is None else 0)
     if sensors is None:

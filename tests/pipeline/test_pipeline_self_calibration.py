@@ -35,7 +35,7 @@ def frame(camera=CAMERA, kind="z") -> RangeFrame:
 
 @pytest.mark.parametrize("camera", [CAMERA, RayTable(CAMERA.rays())])
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_points_are_put_where_they_are(camera, kind) -> None:
+def test_corrected_points_are_correct(camera, kind) -> None:
     before = frame(camera, kind)
     after = CameraErrors(focal=0.1, offset_m=0.05).start().apply(before)
     assert isinstance(after, RangeFrame)
@@ -49,13 +49,13 @@ def test_points_are_put_where_they_are(camera, kind) -> None:
         np.testing.assert_allclose(after.points, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_the_lens_keeps_its_distortion() -> None:
+def test_lens_distortion_is_kept() -> None:
     lens = BrownConrady(8, 6, 10.0, 11.0, 3.5, 2.5, k1=-0.1)
     true = CameraErrors(focal=0.25).camera(lens)
     assert true == replace(lens, fx=8.0, fy=8.8)
 
 
-def test_errors_add_up() -> None:
+def test_errors_are_composed() -> None:
     both = CameraErrors(0.1, 0.02, 0.004).and_then(CameraErrors(0.1, 0.01, 0.003, 0.005))
     assert both.sigmas == {"focal": 0.003, "offset": 0.005}
     assert CameraErrors(0.1, 0, 0.004).and_then(CameraErrors(offset_m=0.01)).focal_sigma == 0.004
@@ -64,20 +64,20 @@ def test_errors_add_up() -> None:
     assert in_words(both) == "a focal length 17.4% smaller and ranges 30 mm longer"
 
 
-def test_a_cloud_has_no_camera() -> None:
+def test_clouds_are_unchanged() -> None:
     cloud = CloudFrame.of(np.ones((5, 3)))
     assert CameraErrors(0.1, 0.1).start().apply(cloud) is cloud
 
 
 @pytest.mark.parametrize("wrong", [{"focal": 0.6}, {"offset_m": -2.0}, {"focal": np.nan}])
-def test_no_camera_is_that_far_off(wrong) -> None:
+def test_implausible_errors_are_refused(wrong) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         CameraErrors(**wrong)
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """Once round a room, with its true camera."""
+    """Once around a room, with its true camera."""
     folder = tmp_path_factory.mktemp("calibration") / "room"
     return open_recording(
         simulate("room", folder, every=16, seed=10, effects=Effects(multipath=False))
@@ -114,7 +114,7 @@ def wrong(recording):
     return seen_by(recording, 1.05)
 
 
-def test_a_wrong_focal_length_is_corrected(wrong) -> None:
+def test_wrong_focal_length_is_corrected(wrong) -> None:
     result = reconstruct(wrong)
     found = result.diagnostics.calibrated
     assert found is not None
@@ -143,8 +143,8 @@ def test_a_wrong_focal_length_is_corrected(wrong) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
-def test_a_wrong_focal_length_of_a_camera_that_measures_range_is_corrected(recording) -> None:
-    """Rotation scales with the focal length and all views agree: only the loop shows it."""
+def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
+    """Rotation scales with the focal length and all views agree: only the loop reveals it."""
     wrong = seen_by(recording, 1.05, "range")
     result = reconstruct(wrong)
     found = result.diagnostics.calibrated
@@ -153,7 +153,7 @@ def test_a_wrong_focal_length_of_a_camera_that_measures_range_is_corrected(recor
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
-def test_without_a_loop_the_bound_includes_what_a_wrong_focal_length_changes(recording) -> None:
+def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     half = replace(recording, indices=recording.indices[:12])
     wrong = seen_by(half, 1.05)
     result = reconstruct(wrong)
@@ -165,7 +165,7 @@ def test_without_a_loop_the_bound_includes_what_a_wrong_focal_length_changes(rec
     assert error_of(half, right) < right.diagnostics.accuracy.position_m
 
 
-def test_a_right_one_is_left_as_it_is(recording) -> None:
+def test_correct_focal_length_is_unchanged(recording) -> None:
     result = reconstruct(recording)
     assert result.diagnostics.calibrated is None
     assert run_json(result)["self_calibration"] is None
@@ -173,7 +173,7 @@ def test_a_right_one_is_left_as_it_is(recording) -> None:
 
 
 def said(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
-    """A result whose views show an error of the focal length."""
+    """A result whose views reveal an error of the focal length."""
     found = CalibrationCheck(
         error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal"
     )
@@ -194,7 +194,7 @@ def any_result(room_recording):
     return reconstruct(open_recording(room_recording).select(end=3))
 
 
-def test_without_an_alarm_nothing_is_done(any_result) -> None:
+def test_no_correction_without_alarm(any_result) -> None:
     first = said(any_result, None, 0.1)
 
     def never(config):
@@ -203,7 +203,7 @@ def test_without_an_alarm_nothing_is_done(any_result) -> None:
     assert self_calibrated(first, from_method("default"), never, Silent()) is first
 
 
-def test_a_correction_that_views_undo_is_dropped(any_result) -> None:
+def test_correction_undone_by_views_is_dropped(any_result) -> None:
     first = said(any_result, 0.1, 0.2)
     for left, kept in ((-0.05, False), (-0.005, True), (0.05, True)):
         undone = said(any_result, left, 0.05)
@@ -225,7 +225,7 @@ def test_a_correction_that_views_undo_is_dropped(any_result) -> None:
         ({"bound": np.inf, "support": 0.9}, False),
     ],
 )
-def test_a_correction_stays_only_where_it_helps(any_result, again, kept) -> None:
+def test_correction_is_kept_only_if_it_helps(any_result, again, kept) -> None:
     first = said(any_result, 0.05, 0.1)
     configs = []
 
@@ -239,7 +239,7 @@ def test_a_correction_stays_only_where_it_helps(any_result, again, kept) -> None
     assert (result is first) == (not kept)
 
 
-def test_where_nothing_is_bounded_the_views_decide(any_result) -> None:
+def test_support_decides_where_nothing_is_bounded(any_result) -> None:
     first = said(any_result, 0.05, np.inf)
     for support, kept in ((0.6, True), (0.4, False)):
         result = self_calibrated(
@@ -251,7 +251,7 @@ def test_where_nothing_is_bounded_the_views_decide(any_result) -> None:
         assert (result.diagnostics.calibrated is not None) == kept
 
 
-def test_a_second_estimate_is_added_to_the_first(any_result) -> None:
+def test_second_estimate_is_composed_with_first(any_result) -> None:
     results = iter([said(any_result, 0.01, 0.05), said(any_result, 0.01, 0.02)])
     configs = []
 
@@ -262,12 +262,12 @@ def test_a_second_estimate_is_added_to_the_first(any_result) -> None:
     result = self_calibrated(said(any_result, 0.04, 0.1), from_method("default"), once, Silent())
     assert result.diagnostics.calibrated is not None
     assert result.diagnostics.calibrated.focal == pytest.approx(1.04 * 1.01 - 1)
-    # Each time from the stated calibration, not on top of what was corrected.
+    # Each time relative to the stated calibration, not to the corrected one.
     assert [c.corrections[0].focal for c in configs] == pytest.approx([0.04, 1.04 * 1.01 - 1])
     assert len(configs[1].corrections) == len(configs[0].corrections)
 
 
-def test_no_camera_is_corrected_by_half(any_result) -> None:
+def test_excessive_correction_is_not_applied(any_result) -> None:
     first = said(any_result, 0.7, 0.1)
 
     def never(config):

@@ -37,11 +37,11 @@ def loop(i, j, accepted=True):
         ([join(6, 5), join(2, 3), join(1, 4)], [], (6, 7, 8)),
         ([join(2, 3), join(5, 6)], [loop(0, 8)], ()),
         ([join(2, 3), join(5, 6)], [loop(0, 8, accepted=False)], (3, 4, 5, 6, 7, 8)),
-        # The same two views once more, and a loop within a component.
+        # The same two views again, and a loop within a component.
         ([join(2, 3), join(5, 6)], [loop(3, 2), loop(6, 8), loop(4, 7)], (3, 4, 5, 6, 7, 8)),
         ([join(2, 3, "motion"), join(5, 6)], [], (6, 7, 8)),
     ],
 )
-def test_frames_on_a_single_link(joins, loops, expected) -> None:
+def test_frames_behind_a_single_link(joins, loops, expected) -> None:
     end = SimpleNamespace(_joins=joins, _posed=POSED)
     assert BackEnd._on_a_single_link(end, loops) == expected

@@ -92,7 +92,7 @@ FORGED: dict[str, tuple[str, Callable[[Any], None], str]] = {
 
 
 @pytest.mark.parametrize("name", FORGED)
-def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
+def test_invalid_objects_are_refused(kept: Kept, name: str) -> None:
     stage, forge, says = FORGED[name]
     state = kept.load(stage)
     through(state)
@@ -103,7 +103,7 @@ def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
+def test_view_with_inconsistent_images_is_refused(kept: Kept) -> None:
     view = kept.load("tracking").mapper.views[0].view
     assert isinstance(through(view), PreparedView)
     for name in ("rays", "z", "sigma", "planes", "plane_variance", "albedo"):
@@ -113,8 +113,8 @@ def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
                 through(replace(view, **{name: other}))
 
 
-def test_what_was_put_away_is_looked_at_too(kept: Kept) -> None:
-    """Views that exceed the memory budget are bytes in a file, with their shapes."""
+def test_spilled_views_are_checked_too(kept: Kept) -> None:
+    """Views beyond the memory budget are bytes in a file, with their shapes."""
     view = kept.load("tracking").mapper.views[0].view
     spill: Spill[PreparedView] = Scratch(0).part(1.0)
     for _ in range(2):
@@ -145,9 +145,7 @@ FOREIGN: dict[str, tuple[Callable[[Any], None], str]] = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_what_is_of_another_recording_is_refused(
-    kept: Kept, recording: Recording, name: str
-) -> None:
+def test_state_of_another_recording_is_refused(kept: Kept, recording: Recording, name: str) -> None:
     forge, says = FOREIGN[name]
     tracked = kept.load("tracking")
     check_tracked(tracked, recording)
@@ -156,8 +154,8 @@ def test_what_is_of_another_recording_is_refused(
         check_tracked(tracked, recording)
 
 
-def test_all_that_is_listed_takes_part_in_a_run(kept: Kept) -> None:
-    """Otherwise a class was renamed and is no longer checked."""
+def test_all_checked_types_occur_in_a_run(kept: Kept) -> None:
+    """Otherwise a class has been renamed and is no longer checked."""
     from tofuse.pipeline import state_checks
 
     told = "".join(nodes for nodes, _ in kept.states.values())
@@ -171,7 +169,7 @@ def test_all_that_is_listed_takes_part_in_a_run(kept: Kept) -> None:
         assert kind in state_checks._ARRAYS
 
 
-def test_replace_is_refused_where_a_constructor_would(kept: Kept) -> None:
+def test_replace_is_checked_like_a_constructor(kept: Kept) -> None:
     graph = kept.load("refinement")[0].graph
     with pytest.raises(tofuse.InputError):
         replace(graph, poses=graph.poses[:-1])

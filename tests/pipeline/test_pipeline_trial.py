@@ -40,7 +40,7 @@ def multipath_of(config: Config) -> Multipath:
     return found
 
 
-def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Recording) -> None:
+def test_compensation_is_disabled_without_multipath(straight: Recording) -> None:
     listener = Listener()
     config = adapted(from_method("default"), straight, 1, listener)
     part = multipath_of(config)
@@ -49,15 +49,15 @@ def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Record
     assert part.strength is not None
     assert abs(part.strength[0]) < 0.15
     assert [n for n in listener.notes if "multipath not applied" in n]
-    # Views pass as they are.
+    # Views pass unchanged.
     corrector, frame = part.start(), straight[0]
     assert corrector.apply(frame) is frame
     assert corrector.is_independent(frame)
-    # What has been decided is not tried again.
+    # A decision is not tried again.
     assert adapted(config, straight, 1) == config
 
 
-def test_compensation_stays_where_there_is_indirect_light() -> None:
+def test_compensation_is_kept_with_multipath() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
     recording = simulate_recording("empty-room", every=6, frames=40, effects=effects)
     listener = Listener()
@@ -67,7 +67,7 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
     assert part.strength is not None
     strength, error = part.strength
     assert 0.2 < strength < 1
-    # What is not known of the strength is in the error of each pixel.
+    # The uncertainty of the strength is part of each pixel's error.
     assert part.relative_sigma == pytest.approx(
         math.hypot(Multipath().relative_sigma, error / strength)
     )
@@ -75,7 +75,7 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
     assert adapted(config, recording, 1) == config
 
 
-def test_too_little_to_tell_leaves_the_data_as_they_are(straight: Recording) -> None:
+def test_correction_is_left_out_with_too_few_views(straight: Recording) -> None:
     listener = Listener()
     few = straight.select(end=5)
     config = adapted(from_method("default"), few, 1, listener)
@@ -87,14 +87,14 @@ def test_too_little_to_tell_leaves_the_data_as_they_are(straight: Recording) -> 
     assert "multipath" in said[0].text
 
 
-def test_what_is_given_or_asked_for_is_not_tried(straight: Recording) -> None:
+def test_explicit_settings_are_not_tried(straight: Recording) -> None:
     for part in (Multipath(gain=3000.0), Multipath(trial=False), Multipath(applied=False)):
         config = replace(from_method("default"), corrections=(part,))
         assert adapted(config, straight, 1).corrections == config.corrections
 
 
 def bent(by: float, at: float = 8.0) -> object:
-    """Bends images by a bump that is fixed to the camera."""
+    """Distorts images by a bump that is fixed to the camera."""
 
     def made(frame: Frame) -> Frame:
         assert isinstance(frame, RangeFrame)
@@ -110,17 +110,15 @@ def plain(frame: Frame) -> Frame:
 
 
 @pytest.mark.parametrize("there", [0.0, 0.5, 1.0])
-def test_the_strength_is_the_share_of_the_error_that_is_there(
-    straight: Recording, there: float
-) -> None:
-    """A correction takes off a bump of 2 %; so much of it is in the data, or nothing."""
+def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float) -> None:
+    """The correction removes a bump of 2 %, of which the data contain this fraction."""
     spoil, correct = bent(0.02 * there), bent(-0.02)
     found = trial(straight, spoil, lambda frame: correct(spoil(frame)))
     assert found.strength == pytest.approx(there, abs=max(3 * found.error, 0.1))
     assert found.helps == (there > 0)
 
 
-def test_a_correction_of_another_error_does_not_help(straight: Recording) -> None:
+def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     spoil, correct = bent(0.02, 8.0), bent(-0.02, 21.0)
     assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).helps
     worse = bent(0.02)  # the right shape, with the wrong sign
@@ -130,7 +128,7 @@ def test_a_correction_of_another_error_does_not_help(straight: Recording) -> Non
     assert not nothing.predicted
 
 
-def test_a_trial_needs_several_runs_that_agree() -> None:
+def test_trial_needs_several_consistent_runs() -> None:
     def of(*strengths: float) -> Trial:
         return Trial(strengths, (1.0,) * len(strengths))
 
@@ -138,14 +136,14 @@ def test_a_trial_needs_several_runs_that_agree() -> None:
     assert not of(0.5, 0.5, 0.5).helps
     assert of(0.5, 0.6, 0.4, 0.5).helps
     assert not of(1.5, -0.9, 1.4, -0.2).helps
-    assert not of(0.05, 0.05, 0.06, 0.05).helps  # sure, but too little
+    assert not of(0.05, 0.05, 0.06, 0.05).helps  # significant, but too small
     found = of(0.5, 0.6, 0.4, 0.5)
     assert found.strength == pytest.approx(0.5, abs=0.01)
     assert found.error == pytest.approx(np.std([0.5, 0.6, 0.4, 0.5], ddof=1) / 2, rel=0.5)
 
 
-def test_one_run_of_bad_poses_does_not_decide() -> None:
-    """Not even if most of what is predicted is in it."""
+def test_single_run_of_bad_poses_does_not_decide() -> None:
+    """Not even if it has most of the predicted effect."""
     strengths = np.array([0.2, 0.3, 0.25, 0.35, 0.2, 0.3, 0.25, -0.4])
     predicted = np.array([*[1.0] * 7, 12.0])
     assert Trial(tuple(strengths * predicted), tuple(predicted)).helps

@@ -47,8 +47,8 @@ def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
 
 
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
-def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -> None:
-    """With noise alone, which the covariance knows in full."""
+def test_coverage_of_error_bounds(loops, monkeypatch) -> None:
+    """With noise alone, which the covariance models completely."""
     monkeypatch.setattr(accuracy, "HIDDEN", 1.0)
     rng = np.random.default_rng(11)
     solve = LevenbergMarquardt(robust="none").optimise
@@ -66,14 +66,14 @@ def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -
     assert bound.unbounded == ()
 
 
-def test_without_loops_the_ends_are_known_least() -> None:
+def test_uncertainty_is_largest_at_ends_without_loops() -> None:
     a = accuracy_of(GraphCovariances(walk(loops=())), Shown(), 1.0)
     assert a.worst is not None
     assert a.worst.frame in (0, N - 1)
     assert a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), Shown(), 1.0).position_m
 
 
-def test_what_the_recording_shows_is_added() -> None:
+def test_errors_shown_by_recording_are_added() -> None:
     plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
     more = accuracy_of(GraphCovariances(walk()), Shown(0.03, 0.02, 0.04), 1.0)
     assert more.position_m > 0.05
@@ -89,14 +89,13 @@ def test_what_the_recording_shows_is_added() -> None:
     assert np.trace(C[5, :3, :3]) > 0.05**2
 
 
-def test_halves_of_the_images_replace_a_covariance_that_is_too_small() -> None:
+def test_split_half_errors_replace_too_small_covariance() -> None:
     plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
     stated = plain.position_m / accuracy.HIDDEN
     assert accuracy_of(GraphCovariances(walk()), Shown(split_m=0.3 * stated), 1.0) == plain
-    one, more = (
-        accuracy_of(GraphCovariances(walk()), Shown(split_m=k * stated), 1.0) for k in (2, 4)
-    )
-    # They are rms errors, and a bound on them is larger.
+    known = GraphCovariances(walk())
+    one, more = (accuracy_of(known, Shown(split_m=k * stated), 1.0) for k in (2, 4))
+    # They are rms errors, and a 95 % bound on them is larger.
     assert one.position_m > 2 * plain.position_m
     assert more.position_m == pytest.approx(2 * one.position_m)
     assert more.rotation_rad == plain.rotation_rad
@@ -105,8 +104,8 @@ def test_halves_of_the_images_replace_a_covariance_that_is_too_small() -> None:
     np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
 
 
-def test_the_refinement_and_halves_of_the_images_show_the_same_errors() -> None:
-    """The larger one counts, as both stand for errors that pairs of views share."""
+def test_larger_of_refinement_and_split_half_errors_counts() -> None:
+    """Both stand for errors that pairs of views share."""
     moved = accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5), 1.0)
     assert accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5, split_m=0.1), 1.0) == moved
     split = accuracy_of(GraphCovariances(walk()), Shown(split_m=0.5), 1.0)
@@ -114,8 +113,8 @@ def test_the_refinement_and_halves_of_the_images_show_the_same_errors() -> None:
 
 
 @pytest.mark.parametrize("direction", [X, TURN])
-def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
-    """However much information noise has made of it; frames on both sides stay bounded."""
+def test_unmeasured_direction_is_unbounded(direction) -> None:
+    """Whatever information noise has suggested; frames on both sides stay bounded."""
     graph = walk()
     slide = dict.fromkeys((4, 5, 6), direction)
     a = accuracy_of(GraphCovariances(bounded(graph, slide)), Shown(), 1.0)
@@ -125,15 +124,15 @@ def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
     worst = a.worst.position_m if direction is X else a.worst.rotation_rad
     assert np.isinf(worst)
     assert np.isinf(a.position_m if direction is X else a.rotation_rad)
-    # Edges of other frames are as they were.
+    # Edges of other frames are unchanged.
     others = [k for k, (i, j) in enumerate(graph.edges) if not {i, j} & {4, 5, 6}]
     np.testing.assert_array_equal(
         bounded(graph, slide).information[others], graph.information[others]
     )
 
 
-def test_directions_that_differ_slightly_do_not_bound_each_other() -> None:
-    """A slide along x, of which every pair of views knows the direction to a degree only."""
+def test_slightly_different_directions_do_not_bound_each_other() -> None:
+    """A slide along x, whose direction every pair of views knows to a degree only."""
     rng = np.random.default_rng(3)
     pairs = [(i, j) for i in range(N) for j in range(i + 1, min(i + 5, N))]
     steps = [
@@ -151,7 +150,7 @@ def test_directions_that_differ_slightly_do_not_bound_each_other() -> None:
     assert not set(range(5)) & set(a.unbounded)
 
 
-def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> None:
+def test_tracking_edge_is_degenerate_with_its_own_frame() -> None:
     """Degeneracy of its keyframe with an earlier one does not affect it."""
     graph = walk()
     own = {
@@ -164,7 +163,7 @@ def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> No
 
 
 @pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
-def test_what_a_pair_sees_decides(view, degenerate) -> None:
+def test_degeneracy_depends_on_views_of_pair(view, degenerate) -> None:
     """A frame that is degenerate with its keyframe need not be so with other views."""
     surface = flat_wall() if view == "wall" else surface_of_corner()
     steps = [Measured(0, 1, np.eye(4), np.eye(6) * 1e6)]
@@ -176,7 +175,7 @@ def test_what_a_pair_sees_decides(view, degenerate) -> None:
 
 
 @pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
-def test_pairs_over_a_degenerate_frame_are_aligned_again(view, degenerate) -> None:
+def test_pairs_across_degenerate_frame_are_aligned_again(view, degenerate) -> None:
     """After a slide in frame 1, frames 0 and 2 overlap wherever the slide ended."""
     surface = flat_wall() if view == "wall" else surface_of_corner()
     steps = [Measured(0, 2, np.eye(4), np.eye(6) * 1e6), Measured(2, 3, np.eye(4), np.eye(6) * 1e6)]
@@ -208,7 +207,7 @@ def as_frame(z, index) -> RangeFrame:
     return RangeFrame(index, float(index), CAMERA, (z + noise).astype(np.float32), "z")
 
 
-def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:
+def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
     graph = bounded(walk(), {5: X})
     C = covariances_of(GraphCovariances(graph), Shown())[5]
     sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
@@ -216,11 +215,10 @@ def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:
     assert sigma[2] > 1
 
 
-def test_a_degenerate_start_leaves_the_rest_bounded() -> None:
-    """What is relative to the first frame would all be unbounded."""
-    a = accuracy_of(
-        GraphCovariances(bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})), Shown(), 1.0
-    )
+def test_degenerate_start_leaves_rest_bounded() -> None:
+    """Relative to the first frame, all poses would be unbounded."""
+    graph = bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})
+    a = accuracy_of(GraphCovariances(graph), Shown(), 1.0)
     assert a.unbounded == (0, 1)
 
 
@@ -231,7 +229,7 @@ def test_extrapolated_motion_bounds_nothing() -> None:
     assert np.isinf(a.position_m)
 
 
-def test_parts_that_nothing_connects_are_not_bounded() -> None:
+def test_disconnected_parts_are_unbounded() -> None:
     graph = walk(loops=())
     keep = np.arange(N - 1) != 8
     columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
@@ -242,8 +240,8 @@ def test_parts_that_nothing_connects_are_not_bounded() -> None:
 
 
 @pytest.mark.parametrize("scene", ["wall", "corridor"])
-def test_a_slide_along_bare_walls_is_not_bounded_in_any_frame_concerned(scene) -> None:
-    """However small the error happens to be: nothing measured it."""
+def test_slide_along_bare_walls_is_unbounded(scene) -> None:
+    """Whatever the error happens to be: it was not measured."""
     effects = Effects.none(shot_noise=True)
     recording = simulate_recording(scene, frames=8, every=2, texture=False, effects=effects)
     result = tofuse.reconstruct(recording)
@@ -262,12 +260,12 @@ def test_a_slide_along_bare_walls_is_not_bounded_in_any_frame_concerned(scene) -
     assert displacement(recording.reference, textured.trajectory)[0] < a.position_m < 0.1
 
 
-def test_one_pose_is_not_assessed() -> None:
+def test_single_pose_is_not_assessed() -> None:
     one = build_graph([7], TRUE[:1], [])
     assert accuracy_of(GraphCovariances(one), Shown(), 1.0) == Accuracy()
 
 
-def test_displacement_ignores_a_motion_of_all() -> None:
+def test_displacement_ignores_common_motion() -> None:
     moved = se3.exp(np.array([1.0, 2, 3, 0.3, -0.2, 0.5])) @ TRUE
     np.testing.assert_allclose(displacement(TRUE, moved), 0, atol=1e-9)
     other = moved.copy()

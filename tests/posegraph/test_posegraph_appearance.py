@@ -31,7 +31,7 @@ BOXES = [
 
 
 def room(yaw, index, *, half=(2.5, 1.2, 2.0), boxes=BOXES, spots=60, noise=0.004):
-    """What a camera in the middle of a room sees when it has turned by `yaw`."""
+    """Image of a camera in the middle of a room, rotated by `yaw`."""
     rays = np.dstack([CAMERA.rays(), np.ones((72, 96))]).reshape(-1, 3)
     d = rays @ se3.so3_exp([0, yaw, 0]).T
     z = (np.array(half) / np.abs(d)).min(1)
@@ -79,7 +79,7 @@ def turning(count, step, **options):
 
 
 def drifted(truth, degrees):
-    """The same path with additional rotation drift, far beyond its covariance."""
+    """The same trajectory with additional rotation drift, far beyond its covariance."""
     T = [truth[0]]
     wrong = se3.exp(np.array([0, 0, 0, 0, np.radians(degrees) / (len(truth) - 1), 0]))
     for k in range(1, len(truth)):
@@ -94,19 +94,19 @@ def found_in(views, poses, appearance, sigma=0.0):
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)
         loops.push(replace(frame, index=view.index), T)
-    half = len(poses) // 2  # from there on the poses are off by this
+    half = len(poses) // 2  # the poses from here on have this uncertainty
     unsure = {k: sigma**2 * np.eye(6) * (k >= half) for k in range(len(poses))}
     return loops.finish(dict(enumerate(poses)), unsure)
 
 
 @pytest.fixture(scope="module")
-def once_round():
-    """A furnished room, 20 degrees at a time, all round and a little further."""
+def full_turn():
+    """A furnished room in steps of 20 degrees, once around and a little further."""
     return turning(20, np.radians(20.0))
 
 
-def test_a_loop_is_closed_where_the_trajectory_is_45_degrees_off(once_round):
-    views, truth = once_round
+def test_loop_is_closed_at_45_degrees_of_drift(full_turn):
+    views, truth = full_turn
     poses = drifted(truth, 45)
     blind = found_in(views, poses, Appearance(pairs=0))
     assert not any(c.record.accepted for c in blind)
@@ -123,37 +123,37 @@ def test_a_loop_is_closed_where_the_trajectory_is_45_degrees_off(once_round):
         assert np.linalg.eigvalsh(c.information).min() > 0
 
 
-def test_a_room_that_looks_the_same_four_times_gives_no_false_loop():
-    """Square, bare: each wall looks like the one before, and a pose that fits is found."""
+def test_ambiguous_room_gives_no_false_loop():
+    """Square and bare: all walls look alike, and a pose that fits is found."""
     views, truth = turning(12, np.radians(22.5), half=(2.0, 1.2, 2.0), boxes=[], spots=0)
     asked = found_in(views, truth, Appearance(pairs=2, min_difference=0.02))
     alike = [c for c in asked if "looks similar" in c.record.reason]
-    assert len(alike) >= 2  # they do look alike
+    assert len(alike) >= 2  # they do look similar
     assert sum("can't have drifted that far" in c.record.reason for c in alike) >= 2
     assert not any(c.record.accepted for c in asked)
     assert all(c.T_i_j is None for c in asked)
 
 
-def test_what_would_need_too_much_drift_is_another_place(once_round):
+def test_loop_that_implies_implausible_drift_is_rejected(full_turn):
     """The same views, with a trajectory in which the camera hardly rotates."""
-    views, truth = once_round
+    views, truth = full_turn
     still = truth.copy()
     still[:] = se3.exp(np.linspace(0, 1, len(truth))[:, None] * np.array([0.1, 0, 0, 0, 3.0, 0]))
     appearance = Appearance(pairs=2)
     reasons = [c.record.reason for c in found_in(views, still, appearance) if not c.record.accepted]
     assert any("can't have drifted that far" in reason for reason in reasons)
-    # Unless the poses say that they are so uncertain.
+    # Unless the stated uncertainty of the poses allows it.
     found = found_in(views, still, appearance, sigma=2.0)
     assert any(c.record.accepted and c.record.j - c.record.i >= 16 for c in found)
 
 
-# How alike
+# Dissimilarity of views
 
 
-def test_unlikeness_against_a_slow_twin(once_round):
-    views, _ = once_round
+def test_dissimilarity_matches_reference(full_turn):
+    views, _ = full_turn
     descriptors = [view_descriptor(view) for view in views[:7]]
-    descriptors[3][1] = np.nan  # a view without light
+    descriptors[3][1] = np.nan  # a view without amplitude
 
     def slow(a, b, shift=0.25):
         best = 1.0
@@ -179,17 +179,17 @@ def test_unlikeness_against_a_slow_twin(once_round):
         np.testing.assert_allclose(mutual_dissimilarity(descriptors, 0.25), expected, atol=1e-5)
 
 
-def test_the_same_place_is_more_alike_than_any_other(once_round):
-    views, _truth = once_round
+def test_revisited_place_is_most_similar(full_turn):
+    views, _truth = full_turn
     far = mutual_dissimilarity([view_descriptor(view) for view in views], 0.25)
-    # The last two views show again what the first two did.
+    # The last two views show the same as the first two.
     assert far[0, 18] < 0.1
     assert far[1, 19] < 0.1
     others = far[0, 3:16]
     assert far[0, 18] < 0.4 * others.min()
 
 
-def test_exposure_does_not_count():
+def test_exposure_does_not_affect_similarity():
     frame = room(0.3, 0)
     brighter = replace(frame, amplitude_image=3 * frame.amplitude_image)
     descriptors = [
@@ -198,8 +198,8 @@ def test_exposure_does_not_count():
     assert mutual_dissimilarity(descriptors, 0.25)[0, 1] < 0.01
 
 
-def test_candidates_left_and_came_back(once_round):
-    views, _truth = once_round
+def test_candidates_require_leaving_and_returning(full_turn):
+    views, _truth = full_turn
     descriptors = [view_descriptor(view) for view in views]
 
     def candidates(descriptors, possible=lambda i, j: True, known=(), **options):
@@ -212,18 +212,18 @@ def test_candidates_left_and_came_back(once_round):
     assert refused == []
     assert candidates(descriptors, pairs=0) == ([], [])
     assert candidates(descriptors[:2]) == ([], [])
-    # Standing still is no coming back, and where a loop is known none is looked for.
+    # A static camera does not return, and known loops are not searched again.
     assert candidates([descriptors[0]] * 8) == ([], [])
     assert all(j < 16 or i > 3 for i, j in candidates(descriptors, known=[(0, 18)], pairs=10)[0])
     assert len(candidates(descriptors, pairs=1)[0]) == 1
-    # What the trajectory forbids takes nobody's place.
+    # Pairs that the trajectory forbids do not count towards the limit.
     kept, refused = candidates(descriptors, lambda i, j: i > 0, pairs=1)
     assert kept == [(1, 19)]
     assert refused == [(0, 18)]
 
 
-def test_candidates_of_many_views_are_found_by_an_index() -> None:
-    """A walk past 300 places and back: too many views to compare all pairs."""
+def test_candidates_of_many_views_are_found_by_index() -> None:
+    """Past 300 places and back: too many views to compare all pairs."""
     rng = np.random.default_rng(4)
     places = rng.uniform(0.3, 1.0, (300, 2, 9, 12))
     views = np.concatenate([places, places[::-1]]) + rng.normal(0, 0.005, (600, 2, 9, 12))
@@ -234,7 +234,7 @@ def test_candidates_of_many_views_are_found_by_an_index() -> None:
     assert refused == []
 
 
-def test_drift_grows_with_the_path():
+def test_plausible_drift_grows_with_path_length():
     options = Appearance(drift=0.1)
     path = 4.0, 0.0  # m straight on
     assert options.plausible(se3.exp(np.array([0.3, 0, 0, 0, 0, 0])), *path, 2.0)
@@ -245,7 +245,7 @@ def test_drift_grows_with_the_path():
     assert options.plausible(off, *path, 2.0, unsure=0.1)
 
 
-def test_drift_may_be_larger_where_the_poses_are_uncertain() -> None:
+def test_plausible_drift_grows_with_uncertainty() -> None:
     options = Appearance(drift=0.1)
     path = 4.0, 0.0  # m straight on
     along = se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))

@@ -23,7 +23,7 @@ OPTIMISERS = [LevenbergMarquardt(), Castellani(), LuMilios(), Elch()]
 GRAPH, TRUTH, _ = walk(10, 4)
 
 
-def spoilt(name: str, k: int, value: object) -> PoseGraph:
+def corrupted(name: str, k: int, value: object) -> PoseGraph:
     values = getattr(GRAPH, name).copy()
     values[k] = value
     return replace(GRAPH, **{name: values})
@@ -32,30 +32,30 @@ def spoilt(name: str, k: int, value: object) -> PoseGraph:
 FAR = np.eye(4)
 FAR[0, 3] = 1e200
 MOTIONS = {
-    "pose 2 is not finite": spoilt("poses", 2, np.nan),
-    "measurement 3 is not finite": spoilt("measurements", 3, np.inf),
-    "pose 4 is not a rigid motion": spoilt("poses", 4, np.diag([2.0, 2, 2, 1])),
-    "pose 5 is not a rigid motion": spoilt("poses", 5, np.diag([1.0, 1, -1, 1])),
-    "measurement 6 is not a rigid motion": spoilt("measurements", 6, FAR),
+    "pose 2 is not finite": corrupted("poses", 2, np.nan),
+    "measurement 3 is not finite": corrupted("measurements", 3, np.inf),
+    "pose 4 is not a rigid motion": corrupted("poses", 4, np.diag([2.0, 2, 2, 1])),
+    "pose 5 is not a rigid motion": corrupted("poses", 5, np.diag([1.0, 1, -1, 1])),
+    "measurement 6 is not a rigid motion": corrupted("measurements", 6, FAR),
 }
 INFORMATION = {
-    "information 3 is not finite": spoilt("information", 3, np.nan),
-    "edge 3 4: the information matrix is not positive": spoilt("information", 3, -np.eye(6)),
+    "information 3 is not finite": corrupted("information", 3, np.nan),
+    "edge 3 4: the information matrix is not positive": corrupted("information", 3, -np.eye(6)),
 }
 
 
 @pytest.mark.parametrize("says", [*MOTIONS, *INFORMATION])
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
-def test_what_can_not_be_meant_is_refused(optimiser, says):
+def test_invalid_values_are_refused(optimiser, says):
     if says in INFORMATION and isinstance(optimiser, Castellani):
-        optimiser.optimise(INFORMATION[says])  # which does not look at it
+        optimiser.optimise(INFORMATION[says])  # which does not use it
         return
     with pytest.raises(InputError, match=says):
         optimiser.optimise({**MOTIONS, **INFORMATION}[says])
 
 
 @pytest.mark.parametrize(("ends", "says"), [((5, 5), "to itself"), ((5, 10), "not there")])
-def test_edges_that_join_nothing_are_refused(ends, says):
+def test_invalid_edges_are_refused(ends, says):
     edges = GRAPH.edges.copy()
     edges[3] = ends
     with pytest.raises(InputError, match=says):
@@ -63,7 +63,7 @@ def test_edges_that_join_nothing_are_refused(ends, says):
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
-def test_parts_do_not_disturb_each_other(optimiser):
+def test_disconnected_parts_are_independent(optimiser):
     n = len(GRAPH.ids)
     both = PoseGraph(
         np.concatenate([GRAPH.ids, 100 + GRAPH.ids, [500]]),
@@ -80,7 +80,7 @@ def test_parts_do_not_disturb_each_other(optimiser):
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda o: type(o).__name__)
-def test_what_can_not_be_improved_stays_and_is_told(optimiser):
+def test_optimal_graph_stays_and_is_not_improved(optimiser):
     i, j = GRAPH.edges.T
     exact = replace(GRAPH, poses=TRUTH, measurements=se3.inverse(TRUTH[i]) @ TRUTH[j])
     np.testing.assert_allclose(optimiser.optimise(exact).graph.poses, TRUTH, atol=1e-9)
@@ -95,7 +95,7 @@ def test_what_can_not_be_improved_stays_and_is_told(optimiser):
 
 
 @pytest.mark.parametrize("name", ["levenberg-marquardt", "lu-milios"])
-def test_the_command_says_that_nothing_better_was_found(name, tmp_path, capsys):
+def test_command_reports_no_improvement(name, tmp_path, capsys):
     best = minimise(GRAPH, Settings(tolerance=1e-15)).graph
     i, j = best.edges.T
     exact = replace(best, measurements=se3.inverse(best.poses[i]) @ best.poses[j])

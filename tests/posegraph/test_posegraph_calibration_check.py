@@ -15,15 +15,15 @@ from tofuse.posegraph.view_store import KeptView
 
 
 def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
-    """Views of a camera whose ranges are short by `offset`, refined as if they were right."""
+    """Views of a camera whose ranges are short by `offset`, refined as if they were correct."""
     truth = path(12)[:views]
     views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
     return views, refine(views, truth, OPTIONS)
 
 
-def test_a_camera_that_errs_is_suspected(monkeypatch):
+def test_range_offset_raises_alarm(monkeypatch):
     views, refined = kept(0.06)
-    # Where there are many pairs, some of them and of their points tell as much.
+    # With many pairs, a part of them and of their points is as conclusive.
     monkeypatch.setattr("tofuse.posegraph.calibration_check._ENOUGH_PAIRS", len(refined.pairs) // 2)
     some = check_calibration(views, refined, OPTIONS, Priors.none())
     monkeypatch.undo()
@@ -33,7 +33,7 @@ def test_a_camera_that_errs_is_suspected(monkeypatch):
     assert found.sigmas["offset"] < 0.01
     assert found.gap is not None
     assert (found.gap.i, found.gap.j) == (0, 11)
-    # This path is not bent by it.
+    # The offset does not bend this trajectory.
     assert found.gap.before[0] < 0.01
     assert found.moved == pytest.approx(displacement(path(12), refined.poses), rel=0.3)
     assert found.gap.closes
@@ -46,15 +46,15 @@ def test_a_camera_that_errs_is_suspected(monkeypatch):
     assert some.gap.before == found.gap.before
 
 
-def test_a_camera_that_does_not_err_is_not():
+def test_correct_camera_raises_no_alarm():
     views, refined = kept(0.0)
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert not found.alarm
     assert found.gap is None
 
 
-def test_a_focal_length_that_nothing_holds_is_not_known():
-    # Without rotation a wrong focal length makes everything wider alike: views agree all the same.
+def test_focal_length_without_rotation_is_undetermined():
+    # Without rotation a wrong focal length widens everything alike: the views still agree.
     truth = path(12)
     truth[:, :3, :3] = np.eye(3)
     views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
@@ -69,7 +69,7 @@ def test_a_focal_length_that_nothing_holds_is_not_known():
     assert sigma(turned, path(12)) < 0.02
 
 
-def test_without_rotation_a_percent_of_focal_length_is_one_of_sideways_motion() -> None:
+def test_focal_length_error_scales_sideways_motion() -> None:
     truth = path(12)
     truth[:, :3, :3] = np.eye(3)
     views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
@@ -80,25 +80,25 @@ def test_without_rotation_a_percent_of_focal_length_is_one_of_sideways_motion() 
     assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
 
 
-def test_few_views_suspect_nothing():
+def test_few_views_raise_no_alarm():
     views, refined = kept(0.06, views=5)
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert not found.alarm
     assert not found.errors
 
 
-def test_what_does_not_close_a_loop_is_no_cure():
+def test_correction_must_close_the_loop():
     assert Gap(0, 9, (0.3, 0.2), (0.1, 0.19)).closes
-    assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # not by half
+    assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # less than half closed
     assert not Gap(0, 9, (0.09, 0.048), (0.17, 0.059)).closes
-    assert not Gap(0, 9, (0.3, 0.02), (0.1, 0.04)).closes  # turned instead
-    # Of a turn on the spot the angle counts, a few centimetres more or less do not.
+    assert not Gap(0, 9, (0.3, 0.02), (0.1, 0.04)).closes  # the rotation opens instead
+    # For a rotation on the spot the angle counts, not a few centimetres.
     assert Gap(0, 9, (0.047, 0.18), (0.063, 0.046), 2.5).closes
     assert not Gap(0, 9, (0.047, 0.18), (0.063, 0.16), 2.5).closes
     assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
 
 
-def test_a_gap_contradicts_errors_that_change_it_in_vain() -> None:
+def test_unclosed_gap_contradicts_errors() -> None:
     changed, hardly = (0.12, 0.05), (0.02, 0.01)
     assert Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, changed).contradicts
     assert not Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, (0.12, 0.01)).contradicts
@@ -108,8 +108,8 @@ def test_a_gap_contradicts_errors_that_change_it_in_vain() -> None:
     assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
 
 
-def test_an_error_that_only_closes_a_loop_is_none(monkeypatch):
-    """Drift of odometry leaves a gap, too: views whose camera is right don't keep the error."""
+def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
+    """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
     truth = path(24)[:8]
     views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
     refined = refine(views, truth, OPTIONS)
@@ -130,24 +130,24 @@ def test_an_error_that_only_closes_a_loop_is_none(monkeypatch):
 
 
 @pytest.mark.parametrize("true", [0.0, 0.06])
-def test_views_keep_a_true_error_of_a_loop_only(true):
+def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
     loop = _Loop.longest(views, refined, OPTIONS)
     assert loop is not None
     assert loop.kept_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
 
 
-def test_the_longest_loop_goes_by_neighbours_alone():
+def test_longest_loop_uses_consecutive_views_only():
     pairs = np.array([(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (0, 5), (3, 5)])
-    assert longest_loop(pairs) == (0, 2)  # 2 and 3 are not joined, so 0 to 5 is none
+    assert longest_loop(pairs) == (0, 2)  # 2 and 3 are not connected, so 0 to 5 is no loop
     joined = np.concatenate([pairs, [(2, 3)]])
     assert longest_loop(joined) == (0, 5)
     assert longest_loop(pairs[[0, 1]]) is None
     assert longest_loop(pairs[:0]) is None
 
 
-def test_the_kinect_loop_raises_the_alarm(shared_data):
-    """Its intrinsics are wrong by 5 %, as box corners of 87 degrees say as well."""
+def test_kinect_loop_raises_alarm(shared_data):
+    """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
     from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
     from tofuse.recordings.open import open_recording
@@ -164,7 +164,7 @@ def test_the_kinect_loop_raises_the_alarm(shared_data):
     assert found.gap is not None
     assert found.gap.before[0] > 0.25
     assert found.gap.after[0] < 0.5 * found.gap.before[0]
-    # A proposal: nothing was changed by it.
+    # Only a proposal: nothing was changed.
     assert refinement.errors == {}
     assert se3.angle(result.trajectory[0]) == pytest.approx(0, abs=1e-12)
     # The correction itself is kept.

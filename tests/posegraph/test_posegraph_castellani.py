@@ -24,7 +24,7 @@ def turn(axis: int, angle: float) -> Float64:
 
 
 def circle(n: int, noise: float, seed: int = 0) -> tuple[PoseGraph, Float64]:
-    """A camera that walks once round a circle, measured with noise; and the true poses."""
+    """A camera on a circle, measured with noise; and the true poses."""
     rng = np.random.default_rng(seed)
     step = se3.exp([0.2, 0.0, 0.03, 0.01, 2 * np.pi / n, 0.0])
     truth = np.array([np.linalg.matrix_power(step, k) for k in range(n)])
@@ -34,7 +34,7 @@ def circle(n: int, noise: float, seed: int = 0) -> tuple[PoseGraph, Float64]:
 
 
 def random_graph(rng: np.random.Generator, n: int = 6) -> PoseGraph:
-    """Edges between many pairs, none of which agree."""
+    """Edges between many pairs, all inconsistent."""
     pairs = [(i, j) for i in range(n) for j in range(n) if i != j and rng.random() < 0.4]
     edges = [Measured(i, j, se3.exp(rng.normal(size=6)), np.eye(6)) for i, j in pairs]
     poses = se3.exp(0.7 * rng.normal(size=(n, 6)))
@@ -42,7 +42,7 @@ def random_graph(rng: np.random.Generator, n: int = 6) -> PoseGraph:
 
 
 def literal_objective(graph: PoseGraph, normalisation: str) -> float:
-    """Eqs 2.10 and 3.5's normalisation, written down one edge at a time."""
+    """Eqs 2.10 and 3.5's normalisation, evaluated one edge at a time."""
     T = graph.measurements
     sequential = [k for k in range(len(T)) if not graph.loop[k]]
 
@@ -66,7 +66,7 @@ def literal_objective(graph: PoseGraph, normalisation: str) -> float:
 
 
 @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-def test_the_residuals_squares_add_up_to_equation_2_10(normalisation):
+def test_squared_residuals_sum_to_equation_2_10(normalisation):
     rng = np.random.default_rng(1)
     for _ in range(10):
         graph = random_graph(rng)
@@ -74,13 +74,13 @@ def test_the_residuals_squares_add_up_to_equation_2_10(normalisation):
         q = quaternion.from_matrix(graph.poses[:, :3, :3])
         value = problem.objective(q, graph.poses[:, :3, 3])
         assert value == pytest.approx(literal_objective(graph, normalisation), rel=1e-9)
-        # Eq 2.11: the length and the sign of a quaternion don't matter.
+        # Eq 2.11: norm and sign of a quaternion are irrelevant.
         other = problem.objective(q * rng.uniform(-2, 2, (len(q), 1)), graph.poses[:, :3, 3])
         assert other == pytest.approx(value, rel=1e-9)
 
 
 @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-def test_the_jacobians_agree_with_finite_differences(normalisation):
+def test_jacobians_agree_with_finite_differences(normalisation):
     graph = random_graph(np.random.default_rng(2))
     problem = Problem.of(graph, normalisation)
     q = quaternion.from_matrix(graph.poses[:, :3, :3])
@@ -107,7 +107,7 @@ def test_the_jacobians_agree_with_finite_differences(normalisation):
 
 
 @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-def test_the_end_is_a_minimum_of_the_literal_objective(normalisation):
+def test_result_minimises_literal_objective(normalisation):
     graph, _ = circle(12, 0.03)
     optimised = Castellani(normalisation).optimise(graph).graph
     best = literal_objective(optimised, normalisation)
@@ -120,7 +120,7 @@ def test_the_end_is_a_minimum_of_the_literal_objective(normalisation):
 
 
 @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-def test_the_objective_is_logged_and_never_rises(normalisation):
+def test_objective_is_logged_and_never_rises(normalisation):
     graph, _ = circle(30, 0.05)
     result = Castellani(normalisation).optimise(graph)
     log = np.array(result.objective)
@@ -131,11 +131,11 @@ def test_the_objective_is_logged_and_never_rises(normalisation):
     assert log[-1] < 0.2 * log[0]
 
 
-def test_the_error_of_a_loop_is_spread_evenly():
-    """Castellani's claim: what the loop misses is shared by all its edges."""
+def test_loop_error_is_spread_evenly():
+    """Castellani's claim: the gap of a loop is shared by all its edges."""
     n = 20
     angle = 2 * np.pi / n
-    # Every step turns 1 degree too far: the sequence misses its start by 20 degrees.
+    # Every step rotates 1 degree too far: the sequence misses its start by 20 degrees.
     graph = chain(
         np.repeat(turn(1, angle + np.radians(1))[None], n - 1, axis=0),
         [Measured(n - 1, 0, turn(1, angle + np.radians(1)), np.eye(6))],
@@ -147,7 +147,7 @@ def test_the_error_of_a_loop_is_spread_evenly():
     np.testing.assert_allclose(after, 1, rtol=1e-6)
 
 
-def test_the_gap_of_a_straight_walk_is_spread_evenly():
+def test_gap_of_straight_trajectory_is_spread_evenly():
     n = 10
     step = np.eye(4)
     step[0, 3] = 1.0
@@ -156,12 +156,12 @@ def test_the_gap_of_a_straight_walk_is_spread_evenly():
     graph = chain(np.repeat(step[None], n - 1, axis=0), [Measured(0, n - 1, back, np.eye(6))])
     optimised = Castellani().optimise(graph).graph
     steps = se3.inverse(optimised.poses[:-1]) @ optimised.poses[1:]
-    # The half metre that is missing along the way has ten edges to go to.
+    # The missing half metre is shared by ten edges.
     np.testing.assert_allclose(optimised.poses[-1, 0, 3], 9 + 0.5 * 0.9, atol=5e-3)
     np.testing.assert_allclose(steps[:, 0, 3], 1 + 0.05, atol=5e-3)
 
 
-def test_noise_in_a_loop_does_less_harm_afterwards():
+def test_optimisation_reduces_effect_of_noise():
     gains = []
     for seed in range(8):
         graph, truth = circle(24, 0.02, seed)
@@ -173,8 +173,8 @@ def test_noise_in_a_loop_does_less_harm_afterwards():
     assert np.mean(gains) < 0.75
 
 
-def test_two_edges_meet_as_the_closed_form_says():
-    """Two measurements of one motion, pure rotations: the minimum lies half way between."""
+def test_two_edges_match_closed_form():
+    """Two measurements of one motion, pure rotations: the minimum is half way between."""
     first, second = turn(2, 0.3), turn(2, 0.5)
     first[:3, 3], second[:3, 3] = [1, 0, 0], [1, 0, 0.4]
     graph = chain(first[None], [Measured(0, 1, second, np.eye(6))])
@@ -183,8 +183,8 @@ def test_two_edges_meet_as_the_closed_form_says():
     np.testing.assert_allclose(optimised[:3, 3], [1, 0, 0.2], atol=1e-9)
 
 
-def test_the_edges_information_does_not_count():
-    """All motions are assumed to have the same error (chapter 7): so it is in the paper."""
+def test_information_is_ignored():
+    """All motions are assumed to have the same error (chapter 7), as in the paper."""
     graph, _ = circle(10, 0.05)
     heavy = PoseGraph(
         graph.ids,
@@ -198,7 +198,7 @@ def test_the_edges_information_does_not_count():
     np.testing.assert_array_equal(a.graph.poses, b.graph.poses)
 
 
-def test_an_exact_graph_stays_and_the_first_pose_never_moves():
+def test_exact_graph_stays_and_first_pose_is_fixed():
     graph, _ = circle(15, 0.0)
     result = Castellani().optimise(graph)
     np.testing.assert_allclose(result.graph.poses, graph.poses, atol=1e-7)
@@ -207,12 +207,12 @@ def test_an_exact_graph_stays_and_the_first_pose_never_moves():
     elsewhere = noisy.with_poses(start @ noisy.poses)
     optimised = Castellani().optimise(elsewhere).graph
     np.testing.assert_array_equal(optimised.poses[0], elsewhere.poses[0])
-    # The answer does not depend on where the world is.
+    # The result does not depend on the frame of reference.
     reference = Castellani().optimise(noisy).graph.poses
     np.testing.assert_allclose(optimised.poses, start @ reference, atol=1e-6)
 
 
-def test_parts_that_no_edge_joins_are_optimised_by_themselves():
+def test_disconnected_parts_are_optimised_separately():
     one, _ = circle(8, 0.05, seed=1)
     two, _ = circle(9, 0.05, seed=2)
     there = se3.exp([5.0, 0, 0, 0, 1.0, 0])
@@ -232,7 +232,7 @@ def test_parts_that_no_edge_joins_are_optimised_by_themselves():
     np.testing.assert_allclose(poses[8:], there @ tight.optimise(two).graph.poses, atol=1e-6)
 
 
-def test_normalisation_takes_only_sequential_motions():
+def test_normalisation_uses_sequential_motions_only():
     graph, _ = circle(10, 0.05)
     sigma_a, sigma_t = normalisation_factors(graph, "thesis")
     angles = se3.angle(graph.measurements[:-1])
@@ -246,7 +246,7 @@ def test_normalisation_takes_only_sequential_motions():
 
 
 @pytest.mark.parametrize("normalisation", NORMALISATIONS)
-def test_a_camera_that_only_turns_or_stands_still_is_no_division_by_zero(normalisation):
+def test_rotation_only_or_static_camera_is_handled(normalisation):
     for step in (turn(1, 0.1), np.eye(4)):
         graph = chain(np.repeat(step[None], 5, axis=0), [Measured(0, 5, turn(1, 0.4), np.eye(6))])
         result = Castellani(normalisation).optimise(graph)
@@ -254,7 +254,7 @@ def test_a_camera_that_only_turns_or_stands_still_is_no_division_by_zero(normali
         assert result.objective[-1] < result.objective[0]
 
 
-def test_graphs_with_nothing_to_do():
+def test_trivial_graphs_are_unchanged():
     for graph in (PoseGraph.empty(), chain(np.zeros((0, 4, 4)))):
         result = Castellani().optimise(graph)
         assert result.converged
@@ -262,7 +262,7 @@ def test_graphs_with_nothing_to_do():
         np.testing.assert_array_equal(result.graph.poses, graph.poses)
 
 
-def test_a_number_that_is_not_finite_is_refused():
+def test_non_finite_value_is_refused():
     graph, _ = circle(5, 0.0)
     poses = graph.poses.copy()
     poses[2, 0, 3] = np.nan
@@ -270,11 +270,11 @@ def test_a_number_that_is_not_finite_is_refused():
         Castellani().optimise(graph.with_poses(poses))
 
 
-def test_it_closes_real_benchmark_graphs(shared_data):
+def test_benchmark_graph_is_optimised(shared_data):
     graph = read_g2o(shared_data / "pose_graphs" / "parking-garage.g2o")
     result = Castellani().optimise(graph)
     assert result.converged
     assert result.objective[-1] < 2e-4 * result.objective[0]
-    # The squared error weighted by the information, which the optimiser does not even see,
+    # The squared error weighted by the information, which the optimiser does not use,
     # falls from 16727 as well.
     assert result.graph.chi2() < 1.5

@@ -40,7 +40,7 @@ def solved(drawn) -> list[PoseGraph]:
     return [LevenbergMarquardt(robust="none").optimise(graph).graph for graph in drawn]
 
 
-def test_covariances_are_those_of_many_draws(solved) -> None:
+def test_covariances_match_repeated_solutions(solved) -> None:
     C = pose_covariances(walk())
     np.testing.assert_array_equal(C[0], 0)
     errors = np.stack([se3.log(se3.inverse(TRUE) @ g.poses) for g in solved])
@@ -54,19 +54,19 @@ def test_covariances_are_those_of_many_draws(solved) -> None:
         assert ratio.mean() == pytest.approx(1, abs=0.2)
 
 
-def test_loops_miss_as_a_chi_square_variable(drawn) -> None:
+def test_loop_errors_are_chi_square_distributed(drawn) -> None:
     d = np.stack([loop_errors(g, g.poses) for g in drawn])
     assert d.shape == (len(drawn), 2)
     assert d.mean(0) == pytest.approx(6, abs=1.2)
     assert 0.84 < np.mean(d < 10.64) < 0.96  # nine in ten
-    # An error that all views share is no noise.
+    # A systematic error is no noise.
     graph = drawn[0]
     bent = graph.measurements.copy()
     bent[graph.loop] = bent[graph.loop] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
     assert (loop_errors(replace(graph, measurements=bent), graph.poses) > 30).all()
 
 
-def test_loops_between_parts_that_odometry_does_not_join_say_nothing() -> None:
+def test_loops_between_parts_without_odometry_have_no_error() -> None:
     graph = walk()
     keep = np.arange(len(graph.edges)) != 4
     torn = replace(
@@ -77,12 +77,12 @@ def test_loops_between_parts_that_odometry_does_not_join_say_nothing() -> None:
         loop=graph.loop[keep],
     )
     assert np.isnan(loop_errors(torn, torn.poses)).all()
-    assert np.isfinite(pose_covariances(torn)).all()  # the loops join them
+    assert np.isfinite(pose_covariances(torn)).all()  # the loops connect them
     alone = replace(torn, information=torn.information * ~torn.loop[:, None, None])
     assert np.isnan(pose_covariances(alone)[1:]).all()
 
 
-def test_parts_that_nothing_joins_are_not_known() -> None:
+def test_disconnected_parts_have_no_covariance() -> None:
     steps = [Measured(k, k + 1, STEP, np.eye(6)) for k in (0, 1, 3, 4)]
     graph = build_graph(range(6), TRUE[:6], steps)
     C = pose_covariances(graph)
@@ -92,7 +92,7 @@ def test_parts_that_nothing_joins_are_not_known() -> None:
     np.testing.assert_array_equal(pose_covariances(one), np.zeros((1, 6, 6)))
 
 
-def test_left_out_edges_are_gone() -> None:
+def test_left_out_edges_are_removed() -> None:
     graph = walk()
     weights = np.ones(len(graph.edges))
     assert accepted_only(Optimisation(graph, (), True)).graph is graph
@@ -104,7 +104,7 @@ def test_left_out_edges_are_gone() -> None:
     assert kept.weights[-1] == 2 * MIN_WEIGHT
 
 
-def test_the_covariance_between_two_poses_of_a_chain_is_that_of_the_edges_between() -> None:
+def test_relative_covariance_of_chain_is_that_of_edges_between() -> None:
     rng = np.random.default_rng(3)
     motions = se3.exp(0.3 * rng.standard_normal((6, 6)))
     poses = [np.eye(4)]
@@ -118,6 +118,6 @@ def test_the_covariance_between_two_poses_of_a_chain_is_that_of_the_edges_betwee
     far = relative_covariance(se3.inverse(poses[2]) @ poses[6], C[2], C[6])
     assert np.linalg.eigvalsh(far - np.diag(sigmas[5] ** 2)).min() > 0
     assert not relative_covariance(np.eye(4), np.full((6, 6), np.nan), C[3]).any()
-    # An uncertain branch does not make what is beside it negative.
+    # An uncertain branch does not give an indefinite covariance.
     branch = relative_covariance(np.eye(4), C[6], C[1])
     assert np.linalg.eigvalsh(branch).min() > -1e-15

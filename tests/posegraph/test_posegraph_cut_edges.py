@@ -19,5 +19,5 @@ from tofuse.posegraph.cut_edges import cut_edges
         ([(0, 1), (1, 1), (8, 9)], {0: ({0}, {1}), 2: ({8}, {9})}),
     ],
 )
-def test_edges_without_which_a_graph_falls_apart(edges, expected) -> None:
+def test_cut_edges_of_graphs(edges, expected) -> None:
     assert cut_edges(edges) == expected

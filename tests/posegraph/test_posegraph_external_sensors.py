@@ -46,7 +46,7 @@ def truth() -> np.ndarray:
 def tracked(
     poses: np.ndarray, bias: np.ndarray, seed: int = 0, stated: np.ndarray = SIGMA
 ) -> PoseGraph:
-    """A chain whose every step errs by noise and by a bias, and states its errors."""
+    """A chain whose steps have noise and a bias, and state their errors."""
     rng = np.random.default_rng([7, seed])
     chain, steps = [poses[0]], []
     for k, (a, b) in enumerate(itertools.pairwise(poses)):
@@ -77,7 +77,7 @@ def seen_down(poses: np.ndarray, sigma: float = 0.02, seed: int = 1) -> np.ndarr
 
 
 def tilt(poses: np.ndarray, right: np.ndarray) -> float:
-    """Rms angle between the vertical by the poses and the true one, rad."""
+    """Rms angle between the estimated vertical and the true one, rad."""
     d = np.einsum("kij,klj,l->ki", poses[:, :3, :3], right[:, :3, :3], DOWN)
     return float(np.sqrt(((d - DOWN) ** 2).sum(1).mean()))
 
@@ -93,7 +93,7 @@ def solved(graph: PoseGraph, told: SensorPriors) -> np.ndarray:
     return LevenbergMarquardt().optimise(with_sensors(graph, told)).graph.poses
 
 
-def test_gravity_takes_out_the_drift_of_roll_and_pitch():
+def test_gravity_removes_roll_and_pitch_drift():
     right = truth()
     graph = tracked(right, NODDING, stated=STATED)
     told = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
@@ -105,14 +105,14 @@ def test_gravity_takes_out_the_drift_of_roll_and_pitch():
     up = told.up(graph.with_poses(held))
     assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
     assert SensorPriors().up(graph) is None
-    # It says nothing of the heading, nor of where the cameras are.
+    # Gravity does not constrain heading or position.
     C, free = pose_covariances(with_sensors(graph, told)), pose_covariances(graph)
     assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])
     assert C[-1, 4, 4] > 0.5 * free[-1, 4, 4]
 
 
-def test_an_accelerometer_in_motion_does_not_count_for_gravity():
-    """A third of the time the camera is pushed to one side with a third of g."""
+def test_accelerated_motion_is_not_taken_for_gravity():
+    """For a third of the time the camera is accelerated sideways by a third of g."""
     right = truth()
     graph = tracked(right, NODDING, stated=STATED)
     lying = seen_down(right)
@@ -129,7 +129,7 @@ def test_an_accelerometer_in_motion_does_not_count_for_gravity():
     assert 35 <= record.used <= 45
 
 
-def test_the_vertical_is_never_known_better_than_the_error_that_all_frames_share():
+def test_systematic_error_limits_accuracy_of_vertical():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     told = measure_all((GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph)
@@ -143,7 +143,7 @@ def test_the_vertical_is_never_known_better_than_the_error_that_all_frames_share
 
 
 def odometer(right: np.ndarray, share: float = 0.01) -> np.ndarray:
-    """Poses in another frame, of steps that err by a share."""
+    """Poses in another frame, with relative errors of the steps."""
     rng = np.random.default_rng(5)
     out = [se3.exp(np.array([1.0, 2, 3, 0.5, -1, 0.2]))]
     for a, b in itertools.pairwise(right):
@@ -153,7 +153,7 @@ def odometer(right: np.ndarray, share: float = 0.01) -> np.ndarray:
     return np.stack(out)
 
 
-def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
+def test_good_odometry_helps_and_wrong_odometry_is_rejected():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     before = ate(graph.poses, right)
@@ -162,7 +162,7 @@ def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
     )
     assert len(good.steps) == N - 1
     assert ate(solved(graph, good), right) < 0.6 * before
-    # Of another camera: in other axes, and half as long again.
+    # Of another camera: other axes, and a scale of 1.5.
     other = odometer(right) @ se3.exp(np.array([0, 0, 0, 0, 1.2, 0]))
     other[:, :3, 3] *= 1.5
     wrong = measure_all((OdometryEdges(),), sensed(other), graph)
@@ -171,8 +171,8 @@ def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
     assert with_sensors(graph, wrong) is graph
 
 
-def test_odometry_counts_with_the_errors_that_it_has():
-    """Ten times the noise that is stated: it is taken for that, and spoils nothing."""
+def test_odometry_is_weighted_by_its_actual_errors():
+    """Ten times the stated noise: it is weighted accordingly, and does no harm."""
     right = truth()
     graph = tracked(right, 0 * NODDING)
     noisy = odometer(right, 0.1)
@@ -183,8 +183,8 @@ def test_odometry_counts_with_the_errors_that_it_has():
     assert ate(solved(graph, told), right) < 1.1 * ate(graph.poses, right)
 
 
-def test_errors_of_odometry_are_measured_where_images_constrain_the_motion():
-    """Frames along a wall: what they state about the motion along it is extrapolated."""
+def test_odometry_errors_are_estimated_from_constrained_motion():
+    """Frames along a wall: their motion along it is extrapolated."""
     right = truth()
     graph = tracked(right, 0 * NODDING)
     wall = (np.arange(N) >= 10) & (np.arange(N) < 48)
@@ -195,10 +195,10 @@ def test_errors_of_odometry_are_measured_where_images_constrain_the_motion():
     told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), wrong)
     assert told.verified
     assert told.records[0].scale == 1
-    # Without knowing which frames are degenerate, their errors count as those of the odometry.
+    # If degenerate frames are unknown, their errors are attributed to the odometry.
     blind = measure_all((OdometryEdges(),), sensed(odometer(right)), wrong)
     assert blind.records[0].scale is None or blind.records[0].scale > 1
-    # With degenerate frames only, nothing verifies it.
+    # With degenerate frames only, the odometry is not verified.
     nearly_all = np.arange(N) >= 8
     told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=nearly_all), graph)
     assert told.steps
@@ -208,7 +208,7 @@ def test_errors_of_odometry_are_measured_where_images_constrain_the_motion():
 @pytest.mark.parametrize(
     ("factor", "motion", "metric"), [(1.0, 1.0, True), (0.5, 1.0, False), (1.0, 0.01, False)]
 )
-def test_odometry_verifies_the_unit_of_the_depths(factor, motion, metric):
+def test_odometry_verifies_depth_unit(factor, motion, metric):
     """If the camera moved, and its tracked path is as long as that of the odometry."""
     right = truth()
     right[:, :3, 3] *= motion
@@ -221,7 +221,7 @@ def test_odometry_verifies_the_unit_of_the_depths(factor, motion, metric):
     assert record.metric is metric
 
 
-def test_a_jump_of_the_odometry_is_left_out():
+def test_jump_of_odometry_is_left_out():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     jumped = odometer(right)
@@ -229,7 +229,7 @@ def test_a_jump_of_the_odometry_is_left_out():
     jumped[30:, :3, 3] += [0.5, 0, 0.2]
     told = measure_all((OdometryEdges(),), sensed(jumped), graph)
     assert {step.i for step in told.steps} == set(range(N - 1)) - {29}
-    # Nor are steps made up where odometry is missing, or another recording begins.
+    # Nor are there steps across missing odometry or the start of another recording.
     holes = odometer(right)
     holes[10] = np.nan
     parts = (np.arange(N) >= 40).astype(np.intp)
@@ -241,7 +241,7 @@ def test_a_jump_of_the_odometry_is_left_out():
     np.testing.assert_allclose(steps[1].T_i_j, expected, atol=1e-9)
 
 
-def test_without_files_nothing_changes():
+def test_missing_sensors_change_nothing():
     graph = tracked(truth(), NODDING)
     told = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)
     assert not told
@@ -259,12 +259,12 @@ def test_without_files_nothing_changes():
         (OdometryEdges, {"limit": 0.5}),
     ],
 )
-def test_options_that_make_no_sense_are_refused(part, options):
+def test_invalid_options_are_refused(part, options):
     with pytest.raises(ValueError, match=next(iter(options))):
         part(**options)
 
 
-def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
+def test_refinement_takes_unconstrained_tilt_from_gravity():
     """Views of a bare wall, invariant to rotation about its normal and translation along it."""
     poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))
     views = []
@@ -304,7 +304,7 @@ def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
 
     assert off(free.poses) > 0.05
     assert off(held.poses) < 0.01
-    # Nothing priors them: the same to the last bit.
+    # Without priors: the same to the last bit.
     same = refine(views, rolled, options, priors=Priors.none(), calibrate=[kernels.FOCAL])
     again = refine(views, rolled, options, calibrate=[kernels.FOCAL])
     np.testing.assert_array_equal(same.poses, again.poses)

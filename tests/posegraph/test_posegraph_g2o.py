@@ -29,7 +29,7 @@ def some_graph(seed: int = 0) -> PoseGraph:
     return build_graph(ids, poses, edges[:-1], edges[-1:])
 
 
-def test_what_is_written_comes_back_with_all_its_digits(tmp_path):
+def test_round_trip_preserves_all_digits(tmp_path):
     graph = some_graph()
     write_g2o(tmp_path / "a.g2o", graph)
     back = read_g2o(tmp_path / "a.g2o")
@@ -47,7 +47,7 @@ def test_what_is_written_comes_back_with_all_its_digits(tmp_path):
     assert back.chi2() == pytest.approx(graph.chi2(), rel=1e-9)
 
 
-def test_the_same_graph_gives_the_same_bytes(tmp_path):
+def test_same_graph_gives_same_bytes(tmp_path):
     write_g2o(tmp_path / "a.g2o", some_graph())
     write_g2o(tmp_path / "b.g2o", some_graph())
     assert (tmp_path / "a.g2o").read_bytes() == (tmp_path / "b.g2o").read_bytes()
@@ -55,7 +55,7 @@ def test_the_same_graph_gives_the_same_bytes(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.g2o", "b.g2o"]
 
 
-def test_the_conventions_of_a_line(tmp_path):
+def test_conventions_of_a_line(tmp_path):
     """Columns, the order (t, r) of the information, and the error log(Z^-1 T_i^-1 T_j)."""
     file = tmp_path / "a.g2o"
     information = np.diag([1.0, 2, 3, 4, 5, 6])
@@ -110,7 +110,7 @@ def test_fixed_vertices_comments_and_order_are_tolerated(tmp_path):
         (VERTICES + "VERTEX_SE2 1 0 0 0\n", 3, "'VERTEX_SE2'"),
     ],
 )
-def test_bad_files_get_one_clear_line(tmp_path, text, line, problem):
+def test_invalid_files_give_one_line_errors(tmp_path, text, line, problem):
     file = tmp_path / "bad.g2o"
     file.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -121,7 +121,7 @@ def test_bad_files_get_one_clear_line(tmp_path, text, line, problem):
     assert "\n" not in message
 
 
-def test_files_that_are_not_there_or_not_text(tmp_path):
+def test_missing_and_binary_files(tmp_path):
     with pytest.raises(InputError, match=r"missing\.g2o"):
         read_g2o(tmp_path / "missing.g2o")
     (tmp_path / "a.g2o").write_bytes(bytes(range(256)))
@@ -129,7 +129,7 @@ def test_files_that_are_not_there_or_not_text(tmp_path):
         read_g2o(tmp_path / "a.g2o")
 
 
-def test_writing_refuses_what_could_not_be_read(tmp_path):
+def test_invalid_graphs_are_not_written(tmp_path):
     graph = some_graph()
     poses = graph.poses.copy()
     poses[1, 0, 0] = np.nan
@@ -152,7 +152,7 @@ def test_benchmark_graphs(shared_data, tmp_path, name, vertices, edges):
     back = read_g2o(tmp_path / "out.g2o")
     np.testing.assert_allclose(back.poses, graph.poses, atol=1e-14)
     np.testing.assert_array_equal(back.information, graph.information)
-    # Against the numbers as they stand in the file.
+    # Compared with the numbers in the file.
     first = source.read_text().split("EDGE", 1)[0].splitlines()[:50]
     np.testing.assert_allclose(
         graph.poses[:50, :3, 3], [[float(w) for w in line.split()[2:5]] for line in first]

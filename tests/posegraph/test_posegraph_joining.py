@@ -20,7 +20,7 @@ from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
 SPARSELY = Joining(searches=2, bridge=False)
-# A camera that walks round and turns.
+# A camera that moves on a circle and rotates.
 PATH = [at(0.3 * np.sin(0.2 * k), 0.3 * np.cos(0.2 * k), 0.08 * k) for k in range(40)]
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
 
@@ -40,7 +40,7 @@ def stretch(component, frames, path=PATH, every=3, dark=False, late=0.0, **scene
 
 
 def linked(first, second, certain=True, off=None):
-    """A true link between frames of two components, or one with an error."""
+    """A correct link between frames of two components, or one with an error."""
     a, b = first.views[-1], second.views[0]
     T = se3.inverse(PATH[a.index]) @ PATH[b.index]
     return link_of(a, b, T if off is None else T @ off, certain)
@@ -62,7 +62,7 @@ def elsewhere():
 
 
 def assert_joined(group, stretches, path=PATH, metres=0.02, degrees=0.5):
-    """Components of a group are where they are, in the frame of the first one."""
+    """Components of a group have their true poses in the frame of the first one."""
     first, *_ = group.T_group_component
     np.testing.assert_allclose(group.T_group_component[first], np.eye(4), atol=1e-12)
     began = {s.component: int(s.frames[0]) for s in stretches}
@@ -77,20 +77,20 @@ def members(groups):
     return [sorted(group.T_group_component) for group in groups]
 
 
-def test_one_component_is_a_group(three) -> None:
+def test_single_component_is_a_group(three) -> None:
     (group,) = Joining().join(three[:1], [])
     np.testing.assert_array_equal(group.T_group_component[0], np.eye(4))
     assert (group.frames, group.joins, group.bridged) == (10, (), {})
     assert group.joined(0) == "links"
 
 
-def test_stretches_of_one_path_are_joined_without_links(three) -> None:
+def test_components_of_one_path_are_joined_without_given_links(three) -> None:
     (group,) = Joining().join(three, [])
     assert group.frames == 30
     assert_joined(group, three)
     assert not group.bridged
     assert [group.joined(c) for c in range(3)] == ["links"] * 3
-    # Each join hangs on one link; the others say the same.
+    # Each join needs one link; the others confirm it.
     assert sum(join.needed for join in group.joins) == 2
     assert len(group.joins) > 2
     for join in group.joins:
@@ -100,7 +100,7 @@ def test_stretches_of_one_path_are_joined_without_links(three) -> None:
         assert np.linalg.norm(off[:3, 3]) < 0.02
 
 
-def test_links_that_are_given_are_used(three) -> None:
+def test_given_links_are_used(three) -> None:
     links = [linked(three[0], three[1]), linked(three[1], three[2])]
     (group,) = Joining().join(three, links)
     assert_joined(group, three)
@@ -108,7 +108,7 @@ def test_links_that_are_given_are_used(three) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_order_of_links_does_not_matter(three, seed) -> None:
+def test_order_of_links_does_not_matter(three, seed) -> None:
     links = [linked(three[0], three[1]), linked(three[1], three[2]), linked(three[0], three[2])]
     links += [linked(three[0], three[1], certain=False, off=se3.exp([0.7, 0, 0, 0, 0.4, 0]))]
     (expected,) = SPARSELY.join(three, links)
@@ -120,7 +120,7 @@ def test_the_order_of_links_does_not_matter(three, seed) -> None:
     assert_joined(group, three)
 
 
-def test_threads_change_nothing(three) -> None:
+def test_result_is_independent_of_threads(three) -> None:
     found = []
     for count in (1, 2):
         with threads(count):
@@ -129,14 +129,14 @@ def test_threads_change_nothing(three) -> None:
     assert found[0] == found[1]
 
 
-def test_views_of_two_scenes_stay_apart(three, elsewhere) -> None:
+def test_views_of_two_scenes_stay_separate(three, elsewhere) -> None:
     both = [three[0], elsewhere]
     groups = SPARSELY.join(both, [])
     assert members(groups) == [[0], [1]]
     assert all(not group.joins for group in groups)
 
 
-def test_a_stretch_of_another_scene_does_not_keep_the_others_apart(three, elsewhere) -> None:
+def test_component_of_another_scene_does_not_separate_others(three, elsewhere) -> None:
     path = [*PATH[:22], *PATH[4:14]]
     parts = [three[0], elsewhere, stretch(2, range(22, 32), path)]
     groups = SPARSELY.join(parts, [])
@@ -144,14 +144,14 @@ def test_a_stretch_of_another_scene_does_not_keep_the_others_apart(three, elsewh
     assert_joined(groups[0], parts, path)
 
 
-def test_the_largest_group_comes_first(elsewhere, three) -> None:
+def test_largest_group_comes_first(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = SPARSELY.join([strange, three[1], three[2]], [])
     assert members(groups) == [[1, 2], [0]]
     assert [group.frames for group in groups] == [20, 4]
 
 
-def test_a_wrong_link_is_outvoted_even_if_it_is_certain(three) -> None:
+def test_certain_but_wrong_link_is_outvoted(three) -> None:
     wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
     right = [
         link_of(a, b, se3.inverse(PATH[a.index]) @ PATH[b.index], certain=False)
@@ -165,7 +165,7 @@ def test_a_wrong_link_is_outvoted_even_if_it_is_certain(three) -> None:
     assert all(link is not wrong for link in pairs.values())
 
 
-def test_two_certain_links_that_contradict_each_other_decide_nothing(three, monkeypatch) -> None:
+def test_contradictory_certain_links_are_not_used(three, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
     right = linked(three[0], three[1])
@@ -176,19 +176,17 @@ def test_two_certain_links_that_contradict_each_other_decide_nothing(three, monk
 @pytest.mark.parametrize(
     "off", [[0, 0, -0.5, 0, 0, 0], [0, 0, 0.5, 0, 0, 0], [0.4, 0, 0, 0, 0.3, 0]]
 )
-def test_a_link_that_free_space_contradicts_is_refused(three, off, monkeypatch) -> None:
+def test_link_contradicted_by_free_space_is_rejected(three, off, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     wrong = linked(three[0], three[1], off=se3.exp(np.array(off)))
     assert members(SPARSELY.join(three[:2], [wrong])) == [[0], [1]]
 
 
-def test_one_link_that_is_not_certain_needs_another_view_that_says_the_same(
-    three, elsewhere, monkeypatch
-) -> None:
+def test_uncertain_link_needs_confirmation_by_another_view(three, elsewhere, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     (group,) = SPARSELY.join(three[:2], [linked(three[0], three[1], certain=False)])
     assert_joined(group, three)
-    # Nothing else can be registered where the scene is another.
+    # No confirmation is found if the scene is another one.
     unlike = linked(three[0], elsewhere, certain=False)
     assert members(SPARSELY.join([three[0], elsewhere], [unlike])) == [[0], [1]]
 
@@ -204,8 +202,8 @@ def turned_back(late):
 
 
 @pytest.mark.parametrize(("late", "joined"), [(0.0, False), (5.0, True)])
-def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) -> None:
-    """It rotated at 0.5 rad/s, and would have to rotate by 1.5 rad at once."""
+def test_link_must_imply_feasible_motion(late, joined, monkeypatch) -> None:
+    """The camera rotated at 0.5 rad/s, and would have to rotate by 1.5 rad at once."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(late)
     groups = SPARSELY.join(parts, [link])
@@ -214,11 +212,11 @@ def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) 
         assert_joined(groups[0], parts, path)
 
 
-def two_rooms_that_look_alike():
-    """A walk in a room, and later one that begins in its double, 6 m away, and comes back."""
+def similar_rooms():
+    """One session in a room, and one that starts in its duplicate, 6 m away, and returns."""
     away = np.eye(4)
     away[0, 3] = 6.0
-    # Where the camera is, and where it would see the same in the first room.
+    # True camera poses, and poses with the same view in the first room.
     local = [*PATH[:10], *PATH[9:13], *PATH[:8]]
     path = [*PATH[:10], *(away @ T for T in PATH[9:13]), *PATH[:8]]
     parts = []
@@ -232,22 +230,22 @@ def two_rooms_that_look_alike():
     return path, parts
 
 
-def test_a_single_link_waits_for_links_elsewhere() -> None:
+def test_single_link_waits_for_links_elsewhere() -> None:
     """The views at the gap are similar, and a link between them would be certain."""
-    path, parts = two_rooms_that_look_alike()
+    path, parts = similar_rooms()
     a, b = parts[0].views[-1], parts[1].views[0]
     wrong = link_of(a, b, np.eye(4))
     (group,) = Joining().join(parts, [wrong])
     assert_joined(group, parts, path)
-    # Had the camera no time to get away, it would be accepted.
+    # If the camera had no time to move away, it would be accepted.
     soon = replace(parts[1], times=parts[1].times - 60.0)
     (group,) = Joining().join([parts[0], soon], [wrong])
     with pytest.raises(AssertionError):
         assert_joined(group, parts, path)
 
 
-def views_in_no_order(off):
-    """A few frames of a walk, then single ones; a certain link between the first two is wrong."""
+def unordered_views(off):
+    """A few consecutive frames, then single ones; a certain link between the first two is wrong."""
     order = [0, 1, 2, 14, 4, 16, 6, 18, 8, 12, 10]
     path = [PATH[k] for k in order]
     frames = [range(3), *([k] for k in range(3, len(order)))]
@@ -257,16 +255,16 @@ def views_in_no_order(off):
     return path, parts, link_of(a, b, T)
 
 
-def test_what_hangs_on_a_single_link_is_reconsidered() -> None:
-    """When the two views were joined there was nothing else to compare them with."""
-    path, parts, wrong = views_in_no_order(se3.exp([0.8, 0, -0.9, 0, 1.8, 0]))
+def test_join_by_single_link_is_reconsidered() -> None:
+    """When the two views were joined, there was nothing else to compare them with."""
+    path, parts, wrong = unordered_views(se3.exp([0.8, 0, -0.9, 0, 1.8, 0]))
     (group,) = Joining().join(parts, [wrong])
     assert_joined(group, parts, path)
     assert all(join.link is not wrong for join in group.joins)
 
 
-def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) -> None:
-    """Without motion between them, a single link is used at once; but not if it implies motion."""
+def test_short_gap_does_not_support_distant_pose(three, monkeypatch) -> None:
+    """A single link is used at once if it implies no motion; but not if it implies motion."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
     joiner = joining._Joiner(Joining(), three[:2], SearchOptions())
@@ -277,7 +275,7 @@ def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) ->
     assert not joiner._is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), joining.IN_SIGHT)
 
 
-def test_between_recordings_no_motion_is_known(monkeypatch) -> None:
+def test_motion_between_recordings_is_unconstrained(monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(0.0)
     (group,) = SPARSELY.join([parts[0], replace(parts[1], recording=1)], [link])
@@ -297,7 +295,7 @@ def along_a_wall(shake=0.0):
     return path, [stretch(0, range(10), path, **BARE), stretch(1, range(13, 24), path, **BARE)]
 
 
-def test_a_gap_in_a_steady_motion_is_bridged_and_says_so() -> None:
+def test_gap_in_steady_motion_is_bridged_and_reported() -> None:
     path, parts = along_a_wall()
     (group,) = Joining(searches=0).join(parts, [])
     assert_joined(group, parts, path)
@@ -310,7 +308,7 @@ def test_a_gap_in_a_steady_motion_is_bridged_and_says_so() -> None:
     assert np.linalg.eigvalsh(join.link.information).min() > 0
 
 
-def test_a_gap_is_not_bridged_where_the_motion_says_little() -> None:
+def test_gap_in_irregular_motion_is_not_bridged() -> None:
     _, parts = along_a_wall()
     assert members(replace(SPARSELY, searches=0).join(parts, [])) == [[1], [0]]
     _, restless = along_a_wall(shake=0.03)
@@ -321,7 +319,7 @@ def test_a_gap_is_not_bridged_where_the_motion_says_little() -> None:
 
 
 def with_odometry(parts, path, sigma, seed=4):
-    """The stretches with poses of odometry whose steps have errors, m and rad."""
+    """The components with odometry whose steps have errors, m and rad."""
     rng = np.random.default_rng(seed)
     poses = [np.eye(4)]
     for a, b in itertools.pairwise(path):
@@ -329,7 +327,7 @@ def with_odometry(parts, path, sigma, seed=4):
     return [replace(p, odometry=np.stack(poses)[p.frames]) for p in parts]
 
 
-def test_a_gap_in_a_restless_motion_is_bridged_by_odometry() -> None:
+def test_gap_in_irregular_motion_is_bridged_by_odometry() -> None:
     path, parts = along_a_wall(shake=0.03)
     (group,) = Joining(searches=0).join(with_odometry(parts, path, 0.002), [])
     assert group.joined(1) == "odometry"
@@ -340,11 +338,11 @@ def test_a_gap_in_a_restless_motion_is_bridged_by_odometry() -> None:
     assert np.linalg.norm(off) < 0.03
 
 
-def test_odometry_that_disagrees_with_the_tracked_motion_bridges_nothing() -> None:
+def test_odometry_inconsistent_with_tracking_bridges_nothing() -> None:
     path, parts = along_a_wall(shake=0.03)
     for odometry in (with_odometry(parts, path, 0.2), [replace(p, odometry=None) for p in parts]):
         assert members(Joining(searches=0).join(odometry, [])) == [[1], [0]]
-    # Nor does odometry that is missing at an end of the gap.
+    # Nor does odometry that is missing at one end of the gap.
     first, second = with_odometry(parts, path, 0.002)
     unknown = second.odometry.copy()
     unknown[0] = np.nan
@@ -352,14 +350,14 @@ def test_odometry_that_disagrees_with_the_tracked_motion_bridges_nothing() -> No
     assert members(Joining(searches=0).join(missing, [])) == [[1], [0]]
 
 
-def test_links_to_frames_without_a_pose_are_left_out(three) -> None:
+def test_links_to_frames_without_pose_are_left_out(three) -> None:
     stray = replace(linked(three[0], three[1]), j=999)
     (group,) = SPARSELY.join(three[:2], [stray])
     assert all(999 not in (join.link.i, join.link.j) for join in group.joins)
 
 
-def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
-    """As relocalization on the way finds them."""
+def test_links_of_real_searches_and_alignments_are_used(three, monkeypatch) -> None:
+    """As relocalization finds them during tracking."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     a, b, c = three
     ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
@@ -373,7 +371,7 @@ def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
 
 
 def probable(first, second, p, T=None):
-    """A true link that states how probable it is."""
+    """A correct link with a stated probability."""
     a, b = first, second
     T = se3.inverse(PATH[a.index]) @ PATH[b.index] if T is None else T
     link = link_of(a, b, T)
@@ -395,11 +393,11 @@ def min_probability(three, monkeypatch):
     return joined
 
 
-def test_links_of_other_views_make_a_join_surer(three, min_probability) -> None:
+def test_independent_links_raise_probability(three, min_probability) -> None:
     a, b = three[0].views, three[1].views
     one = min_probability([probable(a[-1], b[0], 0.95)])
     assert one == pytest.approx(0.95)
-    # The same views again say little more: here the turns are 0.24 rad.
+    # The same views again add little: here the rotations are 0.24 rad.
     same = min_probability([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
     odds = 19 ** (1 + 0.24 / joining.IN_SIGHT) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
@@ -407,7 +405,7 @@ def test_links_of_other_views_make_a_join_surer(three, min_probability) -> None:
     assert other > same
 
 
-def test_who_tries_often_finds_something_by_chance(three, monkeypatch) -> None:
+def test_failed_tries_lower_probability(three, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
     a, b = three[0].views, three[1].views
     right = probable(a[-1], b[0], 0.96)
@@ -420,13 +418,13 @@ def test_who_tries_often_finds_something_by_chance(three, monkeypatch) -> None:
     assert len(joiner.groups()) == 2
 
 
-def test_no_single_link_is_certain(three, min_probability) -> None:
+def test_single_link_is_never_certain(three, min_probability) -> None:
     a, b = three[0].views, three[1].views
     assert min_probability([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MAX_PROBABILITY)
     assert min_probability([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
 
 
-def test_the_main_group_is_the_first_one_where_asked_for(elsewhere, three) -> None:
+def test_first_group_is_main_on_request(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])
     assert members(groups) == [[0], [1, 2]]

@@ -28,7 +28,7 @@ def swing():
     return kept, truth
 
 
-def test_drift_is_taken_out_by_all_views_together(swing):
+def test_drift_is_removed_by_joint_refinement(swing):
     views, truth = swing
     start = drifted(truth)
     found = refine(views, start, OPTIONS)
@@ -37,26 +37,26 @@ def test_drift_is_taken_out_by_all_views_together(swing):
     assert np.array_equal(found.poses[0], start[0])
     assert found.moved[-1] < found.moved[0] / 20
     assert found.after.of_views(12).min() > found.before.of_views(12).max() - 0.05
-    # What a pair says by itself is near what all say together.
+    # The measurement of each pair is near the joint solution.
     i, j = found.pairs.T
     together = se3.inverse(found.poses[i]) @ found.poses[j]
     assert np.abs(se3.log(se3.inverse(found.measured) @ together)).max() < 0.02
     assert np.linalg.eigvalsh(found.information).min() > 0
 
 
-def test_only_pairs_that_are_given_are_compared(swing):
+def test_only_given_pairs_are_compared(swing):
     views, truth = swing
     start = drifted(truth)
     chain = np.stack([np.arange(11), np.arange(1, 12)], 1)
     found = refine(views, start, OPTIONS, pairs=chain)
     np.testing.assert_array_equal(found.pairs, chain)
     assert away(found.poses, truth) < 0.2 * away(start, truth)
-    # A view that nothing is compared with stays.
+    # A view without pairs stays.
     alone = refine(views, start, OPTIONS, pairs=chain[:-1])
     np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
 
 
-def test_threads_change_nothing(swing):
+def test_result_is_independent_of_threads(swing):
     views, truth = swing
     results = []
     for count in (1, 2, 3):
@@ -66,7 +66,7 @@ def test_threads_change_nothing(swing):
     np.testing.assert_array_equal(results[0], results[2])
 
 
-def test_errors_of_the_camera_are_found_where_the_views_hold_them():
+def test_camera_errors_are_estimated_where_observable():
     truth = path(12)
     views = [KeptView.of(s, 1500) for s in surfaces(truth, offset=0.05)]
     start = drifted(truth)
@@ -74,13 +74,13 @@ def test_errors_of_the_camera_are_found_where_the_views_hold_them():
     found = refine(views, start, OPTIONS, calibrate=[kernels.OFFSET])
     assert found.errors[kernels.OFFSET] == pytest.approx(0.05, abs=0.01)
     assert away(found.poses, truth) < 0.5 * away(plain.poses, truth)
-    # A camera without errors is found to have none.
+    # A correct camera is found to have no errors.
     good = [KeptView.of(s, 1500) for s in surfaces(truth)]
     none = refine(good, start, OPTIONS, calibrate=[kernels.OFFSET, kernels.FOCAL])
     assert np.abs(none.errors).max() < 0.01
 
 
-def test_points_are_put_where_they_are_without_the_errors():
+def test_camera_errors_are_removed_from_points():
     T = np.eye(4)
     right, wrong = corner(T), corner(T, offset=0.05)
     found = without_errors(wrong.points.astype(np.float32), {"offset": 0.05})
@@ -93,7 +93,7 @@ def test_points_are_put_where_they_are_without_the_errors():
     np.testing.assert_allclose(without_errors(half, {"scale": 0.01}), right.points, atol=1e-5)
 
 
-def test_overlaps_are_those_of_views_that_look_at_the_same_side(swing):
+def test_overlapping_views_show_the_same_side(swing):
     views, truth = swing
     pairs, shares = overlaps(views, truth, 0.3)
     assert (pairs[:, 0] < pairs[:, 1]).all()
@@ -113,7 +113,7 @@ def test_partners_are_spread_evenly():
     assert len(spread_evenly(pairs[:0], 3)) == 0
 
 
-def test_frames_in_between_follow():
+def test_frames_in_between_are_interpolated():
     before = path(9)
     at = np.array([0, 4, 8])
     step = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
@@ -135,7 +135,7 @@ def refiner(part, views, poses):
     return out.finish(list(range(len(poses))), poses)
 
 
-def test_a_refinement_is_kept_only_where_the_views_support_it():
+def test_refinement_is_kept_only_if_views_support_it():
     truth = path(12)
     views = surfaces(truth, noise=0.005)
     start = drifted(truth)
@@ -145,7 +145,7 @@ def test_a_refinement_is_kept_only_where_the_views_support_it():
     assert away(better.poses, truth) < 0.006
     assert better.moved_m > 0.03
     assert {(e.i, e.j) for e in better.edges} >= {(0, 1), (1, 2)}
-    # Views of which nothing overlaps stay where they are.
+    # Views without overlap stay where they are.
     apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(12)])
     same = refiner(Joint(), views, apart)
     assert not same.kept
@@ -154,8 +154,8 @@ def test_a_refinement_is_kept_only_where_the_views_support_it():
     np.testing.assert_array_equal(refiner(NoRefinement(), views, start).poses, start)
 
 
-def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
-    """One alignment would take it for motion; of many views each has another one."""
+def test_shared_pixel_error_counts_once_in_joint_refinement():
+    """A single alignment would take it for motion; over many views it differs."""
     truth = path(4)
     shared = np.full(corner(truth[0]).depth.shape, 0.01, np.float32)
     frames = [replace(corner(T), index=k, shared_sigma_image=shared) for k, T in enumerate(truth)]
@@ -164,7 +164,7 @@ def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
     np.testing.assert_array_equal(whole[0].plane_variance, views[0].pixel_variance)
     assert whole[0].with_pixel_variance() is whole[0]
     found = refiner(Joint(), views, truth)
-    # A hundred pixels that share their error are not worth one, but no less than they are alone.
+    # A hundred pixels that share their error weigh more than one pixel.
     wary = refine([KeptView.of(view, 1500) for view in views], truth, OPTIONS)
     once = refine([KeptView.of(view, 1500) for view in whole], truth, OPTIONS)
     np.testing.assert_allclose(found.poses, once.poses, atol=1e-12)
@@ -172,8 +172,8 @@ def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
     assert gained.min() > 10
 
 
-def test_a_view_that_loses_support_stays_with_its_neighbours():
-    """One view is of another place: it must not be dragged about to fit what it can't."""
+def test_view_that_loses_support_stays_with_neighbours():
+    """One view is of another place: it must not be moved to fit what it cannot."""
     truth = path(12)
     views = surfaces(truth, noise=0.002)
     strange = surfaces(truth @ se3.exp(np.array([0, 0, -0.5, 0.3, 0, 0])))[6]
@@ -183,7 +183,7 @@ def test_a_view_that_loses_support_stays_with_its_neighbours():
     assert away(found.poses[others], truth[others]) < 0.012
 
 
-def test_the_store_never_holds_more_than_it_may():
+def test_view_store_is_bounded():
     view = surfaces(path(1))[0]
     store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10, loosest=1e6))
     for k in range(400):
@@ -211,8 +211,8 @@ def test_options_are_checked(cls, options):
         cls(**options)
 
 
-def test_pairs_of_a_view_do_not_add_up_to_more_than_it_knows():
-    """However many pairs a view has, the information of all together is that of a few."""
+def test_pairs_of_a_view_do_not_accumulate_information():
+    """However many pairs a view has, their joint information is that of a few."""
     truth = path(12)
     views = surfaces(truth, noise=0.005)
     known = {}
@@ -228,8 +228,8 @@ def test_pairs_of_a_view_do_not_add_up_to_more_than_it_knows():
     assert known[10][1] > 0.7 * known[2][1]
 
 
-def test_views_that_are_fixed_to_each_other_move_together():
-    """Two cameras back to back see the corner one after the other; each instant has one pose."""
+def test_rigidly_mounted_views_move_together():
+    """Two cameras on a rig see the corner one after the other; each instant has one pose."""
     instants = path(8)
     mounted = se3.exp(np.array([[0.0] * 6, [0.05, 0.02, -0.03, 0.1, 0.25, -0.05]]))
     truth = (instants[:, None] @ mounted[None]).reshape(-1, 4, 4)
@@ -239,13 +239,13 @@ def test_views_that_are_fixed_to_each_other_move_together():
     found = refine(views, start, OPTIONS, bodies=bodies)
     assert away(start, truth) > 0.03
     assert away(found.poses, truth) < 0.005
-    # No pair is of one instant, and cameras are where the rig has them.
+    # No pair is of one instant, and cameras keep their poses in the rig.
     assert (found.pairs[:, 0] // 2 != found.pairs[:, 1] // 2).all()
     assert {(i % 2, j % 2) for i, j in found.pairs.tolist()} == {(0, 0), (0, 1), (1, 0), (1, 1)}
     between = se3.inverse(found.poses[::2]) @ found.poses[1::2]
     np.testing.assert_allclose(between, np.tile(mounted[1], (8, 1, 1)), atol=1e-12)
     np.testing.assert_array_equal(found.poses[0], start[0])
-    # Half as many unknowns: better than each view by itself.
+    # Half as many unknowns: more accurate than independent views.
     free = refine(views, start, OPTIONS)
     error = [np.linalg.norm((p - truth)[:, :3, 3], axis=1) for p in (found.poses, free.poses)]
     assert np.sqrt((error[0] ** 2).mean()) < np.sqrt((error[1] ** 2).mean())

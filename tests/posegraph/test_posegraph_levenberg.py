@@ -21,7 +21,7 @@ from walked_graph import SIGMA, walk
 
 
 def ate(poses: Float64, truth: Float64) -> float:
-    """Position error without alignment: the first pose is the truth's."""
+    """Position error without alignment: the first pose is exact."""
     return float(np.sqrt(((poses - truth)[:, :3, 3] ** 2).sum(1).mean()))
 
 
@@ -30,7 +30,7 @@ def objective(graph: PoseGraph, poses: Float64) -> float:
 
 
 @pytest.mark.parametrize("rotation", ["tangent", "quaternion", "cosines"])
-def test_the_minimum_is_a_minimum_in_every_direction(rotation):
+def test_result_is_minimum_in_every_direction(rotation):
     """At the solution no small motion of any pose lowers the objective, and slopes are zero."""
     graph, _, _ = walk(20, 10)
     done = minimise(graph, Settings("none", rotation=rotation, tolerance=1e-14))
@@ -62,8 +62,8 @@ def dense(system: PairSystem, matrix: Blocks) -> Float64:
     return out.reshape(n * k, n * k)
 
 
-def test_gradient_and_curvature_are_those_of_the_objective():
-    """The assembled system against numerical derivatives, far from the minimum."""
+def test_gradient_and_curvature_match_objective():
+    """The assembled system agrees with numerical derivatives, far from the minimum."""
     graph, _, _ = walk(8, 5)
     rng = np.random.default_rng(1)
     poses = graph.poses @ se3.exp(rng.normal(size=(8, 6)) * 0.3)
@@ -91,7 +91,7 @@ def test_gradient_and_curvature_are_those_of_the_objective():
     np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-7 * np.abs(expected).max())
 
 
-def test_one_step_solves_the_damped_system():
+def test_one_step_solves_damped_system():
     graph, _, _ = walk(12, 8)
     rng = np.random.default_rng(2)
     m = len(graph.edges)
@@ -106,7 +106,7 @@ def test_one_step_solves_the_damped_system():
         expected = np.linalg.solve(damped, -gradient.ravel())
         np.testing.assert_allclose(step[system.free].ravel(), expected, rtol=1e-8, atol=1e-12)
         assert (step[0] == 0).all()
-    # What single poses add, here enough to hold a pose that no pair reaches.
+    # Terms of single poses, here enough to constrain a pose that no pair reaches.
     lonely = PairSystem(13, graph.edges, np.zeros(13, bool))
     single = np.tile(np.eye(6), (13, 1, 1)), np.tile(np.arange(6.0), (13, 1))
     np.testing.assert_allclose(
@@ -115,8 +115,8 @@ def test_one_step_solves_the_damped_system():
     assert lonely.solve(H, g, graph.measurements) is None
 
 
-def test_covariances_are_those_of_repeated_measurements():
-    """Marginals of the dense inverse, and the spread over many graphs, are the same."""
+def test_covariances_match_repeated_measurements():
+    """Marginals of the dense inverse, and the spread over many graphs, agree."""
     graph, truth, _ = walk(16, 8)
     solution = solve(graph.poses, graph.edges, graph.measurements, graph.information)
     factor = solution.factor()
@@ -148,7 +148,7 @@ def test_covariances_are_those_of_repeated_measurements():
     assert mahalanobis.mean() == pytest.approx(6, abs=1)
 
 
-def test_information_decides_which_edge_gives_way():
+def test_information_weights_edges():
     """Two measurements of one motion: the mean, weighted by the whole matrix."""
     rng = np.random.default_rng(3)
     roots = rng.normal(size=(2, 6, 6))
@@ -164,7 +164,7 @@ def test_information_decides_which_edge_gives_way():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_false_loops_are_left_out_and_true_ones_kept(seed):
+def test_false_loops_are_left_out_and_true_loops_kept(seed):
     clean, truth, _ = walk(seed=seed)
     graph, _, false = walk(false=12, seed=seed)
     done = LevenbergMarquardt().optimise(graph)
@@ -176,8 +176,8 @@ def test_false_loops_are_left_out_and_true_ones_kept(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 4, 5])
-def test_a_false_loop_can_not_hide_where_odometry_is_weak(seed):
-    """It bends the odometry and fits then; but the other loops contradict it."""
+def test_false_loop_is_found_despite_weak_odometry(seed):
+    """It bends the odometry and then fits; but the other loops contradict it."""
     rng = np.random.default_rng(7)
     graph, truth, false = walk(loops=5, false=2, seed=seed)
     i, j = graph.edges[:59].T
@@ -194,10 +194,10 @@ def test_a_false_loop_can_not_hide_where_odometry_is_weak(seed):
     assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
 
 
-def test_few_loops_that_hardly_matter_are_no_reason_to_leave_any_out():
+def test_uncritical_outlier_loop_is_kept():
     graph, _, _ = walk(60, 600)
     measurements = graph.measurements.copy()
-    # One that is 11 standard deviations off, among 600 that share a squared error of 3600.
+    # One is off by 11 standard deviations, among 600 that share a squared error of 3600.
     off = np.zeros(6)
     off[0] = 11 * SIGMA[0]
     measurements[-1] = measurements[-1] @ se3.exp(off)
@@ -210,21 +210,21 @@ def test_few_loops_that_hardly_matter_are_no_reason_to_leave_any_out():
     assert LevenbergMarquardt().optimise(graph).weights[-1] == 0
 
 
-def test_without_false_loops_it_is_least_squares():
+def test_without_false_loops_result_is_least_squares():
     graph, _, _ = walk()
     plain = LevenbergMarquardt(robust="none").optimise(graph)
     done = LevenbergMarquardt().optimise(graph)
     np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
     assert done.objective == plain.objective
     assert (done.weights == 1).all()
-    # Standard deviations that are three times too small do not make true loops false.
+    # Standard deviations that are too small by a factor of three do not make true loops false.
     boast = replace(graph, information=9 * graph.information)
     assert (LevenbergMarquardt().optimise(boast).weights == 1).all()
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs", "switchable"])
-def test_kernels(kernel):
-    """Weights are the slope of the cost; small errors count in full, large ones less."""
+def test_robust_kernels(kernel):
+    """Weights are the slope of the cost; small errors have full weight, large ones less."""
     x = np.array([1e-6, 0.5, 3.9, 4.1, 7.0, 40.0, 1e4])
     h = 1e-6 * x
     slope = (robust.cost(kernel, x + h, 4.0) - robust.cost(kernel, x - h, 4.0)) / (2 * h)
@@ -238,15 +238,15 @@ def test_kernels(kernel):
     assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
 
 
-def test_a_switch_at_its_best_costs_what_the_kernel_says():
+def test_optimal_switch_cost_equals_kernel():
     x = np.array([0.1, 4.0, 100.0])
     s = np.linspace(0, 1, 200001)[:, None]
     best = (s**2 * x + 4.0 * (1 - s) ** 2).min(axis=0)
     np.testing.assert_allclose(robust.cost("switchable", x, 4.0), best, rtol=1e-6)
 
 
-def test_gravity_holds_the_tilt_of_a_chain():
-    """Without loops the tilt drifts; edges to the vertical stop it, the heading stays as it was."""
+def test_gravity_stabilises_tilt_of_chain():
+    """Without loops the tilt drifts; gravity edges stop it, the heading is unchanged."""
     graph, truth, _ = walk(60, 0)
     down = np.swapaxes(truth[:, :3, :3], 1, 2) @ np.array([0.1, 0.9, np.sqrt(1 - 0.82)])
     for world in (None, np.array([0.1, 0.9, np.sqrt(1 - 0.82)])):
@@ -263,7 +263,7 @@ def test_gravity_holds_the_tilt_of_a_chain():
         np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
 
 
-def test_anchors_hold_the_path_in_a_frame_of_their_own():
+def test_anchors_constrain_path_in_their_own_frame():
     graph, truth, _ = walk(60, 0)
     elsewhere = se3.exp([5.0, -3.0, 1.0, 0.3, 2.0, -0.4])
     k = np.arange(0, 60, 10)
@@ -274,7 +274,7 @@ def test_anchors_hold_the_path_in_a_frame_of_their_own():
     assert done.graph.poses.shape == (60, 4, 4)
 
 
-def test_parts_are_solved_by_themselves_and_told_apart():
+def test_parts_are_solved_and_reported_separately():
     a, _, _ = walk(20, 8)
     b, _, _ = walk(12, 5, seed=1)
     n, m = len(a.ids), len(a.edges)
@@ -299,7 +299,7 @@ def test_parts_are_solved_by_themselves_and_told_apart():
     assert done.objective[-1] == pytest.approx(sum(p.after for p in done.parts))
 
 
-def test_where_nothing_is_better_the_input_stays():
+def test_optimal_input_is_unchanged():
     graph, truth, _ = walk(10, 4)
     i, j = graph.edges.T
     exact = replace(graph, poses=truth, measurements=se3.inverse(truth[i]) @ truth[j])
@@ -311,7 +311,7 @@ def test_where_nothing_is_better_the_input_stays():
     assert (len(empty.graph.ids), empty.converged) == (0, True)
 
 
-def test_what_can_not_be_meant_is_refused():
+def test_invalid_graphs_and_options_are_refused():
     graph, _, _ = walk(8, 2)
     poses = graph.poses.copy()
     poses[2, 0, 3] = np.nan
@@ -330,7 +330,7 @@ def test_what_can_not_be_meant_is_refused():
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
 )
-def test_benchmark_graphs_end_where_gtsam_does(shared_data, name, least):
+def test_benchmark_graphs_match_gtsam(shared_data, name, least):
     """Half the squared error, as GTSAM 4.3's Levenberg-Marquardt reports it from the same start."""
     graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o")
     done = LevenbergMarquardt().optimise(graph)
@@ -339,7 +339,7 @@ def test_benchmark_graphs_end_where_gtsam_does(shared_data, name, least):
     assert (done.weights == 1).all()
 
 
-def test_settings_of_the_part_are_those_of_the_function():
+def test_options_match_settings():
     part, function = LevenbergMarquardt(), Settings()
     for name in ("robust", "gate"):
         assert getattr(part, name) == getattr(function, name)

@@ -23,7 +23,7 @@ from tofuse.registration.icp import algorithm_1
 
 
 def pose(x: float = 0.0, z: float = 0.0, *, heading: float = 0.0, pitch: float = 0.0) -> Float64:
-    """Camera at (x, 0, z), turned about its y axis, then about its x axis."""
+    """Camera at (x, 0, z), rotated about its y axis, then about its x axis."""
     T = se3.exp([0, 0, 0, 0, heading, 0]) @ se3.exp([0, 0, 0, pitch, 0, 0])
     T[:3, 3] = [x, 0, z]
     return T
@@ -34,14 +34,14 @@ def turning(n: int) -> Float64:
     return np.array([pose(heading=2 * np.pi * k / n) for k in range(n + n // 4)])
 
 
-def test_yaw_is_the_rotation_about_the_cameras_y_axis():
+def test_yaw_is_rotation_about_camera_y_axis():
     angles = np.linspace(-3, 3, 13)
     measured = [yaw(pose(heading=a, pitch=0.4)) for a in angles]
     np.testing.assert_allclose(measured, angles, atol=1e-12)
     np.testing.assert_allclose(yaw(se3.exp([1, 2, 3, 0, 0, 0.7])), 0, atol=1e-12)
 
 
-def test_candidates_are_near_look_the_same_way_and_are_not_too_recent():
+def test_candidates_are_near_similar_in_heading_and_not_recent():
     poses = np.array(
         [
             pose(0.0),  # 0: too far
@@ -64,7 +64,7 @@ def test_candidates_are_near_look_the_same_way_and_are_not_too_recent():
     assert detector.candidates(poses[:1]).tolist() == []
 
 
-def test_a_full_turn_meets_its_beginning_and_nothing_else():
+def test_full_turn_revisits_its_start_only():
     poses = turning(40)
     detector = Nearby(max_yaw_rad=np.radians(5), min_gap=10, per_frame=5)
     found = {(int(i), k) for k in range(len(poses)) for i in detector.candidates(poses[: k + 1])}
@@ -73,7 +73,7 @@ def test_a_full_turn_meets_its_beginning_and_nothing_else():
 
 @dataclass(frozen=True)
 class Scripted:
-    """A registrar with scripted results, by the error of its guess."""
+    """A registrar with scripted results that depend on the error of the guess."""
 
     truth: Float64
     reach: float = 1.0
@@ -100,7 +100,7 @@ def view(index: int) -> CloudFrame:
     return CloudFrame(index, float(index), np.zeros((5, 3), np.float32))
 
 
-def test_a_good_fit_is_accepted_with_its_measurement():
+def test_good_fit_is_accepted_with_its_measurement():
     truth = pose(0.3, heading=0.1)
     registrar = Scripted(truth)
     closed = Confirmation((registrar,)).confirm(view(9), view(2), np.eye(4), seed=4)
@@ -125,7 +125,7 @@ def test_a_good_fit_is_accepted_with_its_measurement():
         (Scripted(pose(20.0)), "not registered: frame 9: no points correspond"),
     ],
 )
-def test_a_bad_fit_is_rejected_and_the_record_says_why(registrar, reason):
+def test_bad_fit_is_rejected_with_reason(registrar, reason):
     closed = Confirmation((registrar,)).confirm(view(9), view(2), np.eye(4), seed=0)
     assert not closed.record.accepted
     assert closed.record.reason == reason
@@ -133,8 +133,8 @@ def test_a_bad_fit_is_rejected_and_the_record_says_why(registrar, reason):
     assert closed.information is None
 
 
-def test_fewer_partners_at_the_same_distance_do_not_look_better():
-    """E falls when points lose their partners; the error that is judged does not."""
+def test_fewer_correspondences_do_not_improve_the_error():
+    """E falls when points lose their partners; the mean error does not."""
     many = Registration(np.eye(4), True, 1, 80, 100, 0.8 * 0.7, 0.1, np.eye(6))
     few = replace(many, correspondences=40, error=0.4 * 0.7)
     assert few.error < many.error
@@ -143,7 +143,7 @@ def test_fewer_partners_at_the_same_distance_do_not_look_better():
     assert Confirmation().objection(many)
 
 
-def test_both_the_guess_and_the_identity_are_tried_and_the_better_counts():
+def test_better_of_guess_and_identity_is_used():
     near_identity = pose(0.2)
     drifted = pose(3.0)
     registrar = Scripted(near_identity)
@@ -156,7 +156,7 @@ def test_both_the_guess_and_the_identity_are_tried_and_the_better_counts():
     assert Confirmation((registrar,)).confirm(view(9), view(2), far, seed=0).record.accepted
 
 
-def test_registrations_follow_one_another_and_the_seed_decides_the_draws():
+def test_registrations_are_chained_and_seeded():
     truth = pose(0.8)
     coarse, fine = Scripted(truth, reach=2.0), Scripted(truth, reach=0.1)
     first = Confirmation((coarse, fine)).confirm(view(9), view(2), np.eye(4), seed=0)
@@ -169,7 +169,7 @@ def test_registrations_follow_one_another_and_the_seed_decides_the_draws():
     assert coarse.draws[-1] != draws[-1]
 
 
-def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
+def test_candidates_are_recorded_and_given_loops_used():
     poses = turning(20)
     motion = se3.inverse(poses[0]) @ poses[20]
     confirmation = Confirmation((Scripted(motion),))
@@ -189,12 +189,12 @@ def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
     assert pairs[1, 21].record.accepted
     assert pairs[5, 21].record == replace(pairs[5, 21].record, accepted=False)
     assert pairs[5, 21].record.reason == "frame 5 has no pose"
-    # Given without its motion: registered from where the trajectory has it.
+    # Given without its motion: registered starting from the trajectory.
     starts = confirmation.registrations[0].calls
     assert any(np.allclose(s, se3.inverse(poses[3]) @ poses[17]) for s in starts)
 
 
-def test_real_registrations_tell_a_loop_from_another_place():
+def test_real_registrations_distinguish_loop_from_other_place():
     """Views 0 and 1 of the synthetic case overlap; views 0 and 10 see opposite sides."""
     views, truth = peaks_views(0.02, 0)
     confirmation = Confirmation((algorithm_1(1.0), algorithm_1(0.25)), min_fraction=0.4)
@@ -207,7 +207,7 @@ def test_real_registrations_tell_a_loop_from_another_place():
     assert not other.record.accepted
 
 
-def test_the_detector_is_a_part():
+def test_detector_is_configurable():
     data = parts.to_dict(Nearby(min_gap=30))
     assert data["part"] == "nearby"
     parts.discover("tofuse.registration")
@@ -217,7 +217,7 @@ def test_the_detector_is_a_part():
             parts.from_dict(LoopDetector, {"part": "nearby", **bad}, where="x")
 
 
-def test_loops_given_in_a_file(tmp_path):
+def test_loops_from_file(tmp_path):
     file = tmp_path / "loops.txt"
     file.write_text(
         f"# seen by eye\n\n0 56\n12 3   # the other way round\n"
@@ -252,7 +252,7 @@ def test_loops_given_in_a_file(tmp_path):
         ("1 2 0 0 0 0 0 x 1", "is not understood"),
     ],
 )
-def test_a_bad_line_is_named(tmp_path, line, problem):
+def test_invalid_line_is_named(tmp_path, line, problem):
     file = tmp_path / "loops.txt"
     file.write_text(f"0 3\n{line}\n")
     with pytest.raises(InputError) as caught:
@@ -261,12 +261,12 @@ def test_a_bad_line_is_named(tmp_path, line, problem):
     assert problem in str(caught.value)
 
 
-def test_a_missing_file_of_loops_is_named(tmp_path):
+def test_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         read_loops(tmp_path / "nowhere.txt")
 
 
-def test_a_chain_is_the_product_of_its_motions():
+def test_chain_is_product_of_motions():
     rng = np.random.default_rng(0)
     relative = se3.exp(rng.normal(size=(9, 6)))
     T = np.eye(4)
@@ -279,7 +279,7 @@ def test_a_chain_is_the_product_of_its_motions():
     np.testing.assert_array_equal(graph.information[-1], np.eye(6) * 3)
 
 
-def test_edges_name_frames_and_a_frame_without_a_pose_is_refused():
+def test_edges_refer_to_frames_with_pose():
     poses = np.array([np.eye(4), pose(1.0), pose(2.0)])
     edges = [Measured(4, 7, pose(1.0), np.eye(6)), Measured(7, 9, pose(1.0), np.eye(6))]
     graph = build_graph([4, 7, 9], poses, edges, [Measured(4, 9, pose(2.0), np.eye(6))])

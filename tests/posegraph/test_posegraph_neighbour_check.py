@@ -25,20 +25,20 @@ def displaced_from(truth, k):
     return np.concatenate([truth[:k], truth[k:] @ SIDEWAYS])
 
 
-def test_neighbours_pulled_apart_are_found_where_registrations_are_uncertain(posed_views) -> None:
+def test_separated_neighbours_are_found_where_registrations_are_uncertain(posed_views) -> None:
     posed, truth = posed_views
     pulled = displaced_from(truth, 3)
     everywhere = frozenset(range(len(truth)))
     assert list(worse_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
     assert list(worse_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
     assert not list(worse_neighbours(posed, truth, pulled, everywhere - {3}))
-    # A loop that mends a pair is right, and so is one that changes nothing.
+    # A loop that repairs a pair is accepted, and so is one that changes nothing.
     assert not list(worse_neighbours(posed, pulled, truth, everywhere))
     assert not list(worse_neighbours(posed, truth, truth, everywhere))
 
 
 def chain(posed, truth, inflation, wrong):
-    """A back end whose registrations are true, but for that of the frame `wrong`."""
+    """A back end whose registrations are correct, except that of the frame `wrong`."""
     entries, poses = [], {}
     information = np.diag(SIGMA**-2)
     T = np.eye(4)
@@ -61,7 +61,7 @@ def chain(posed, truth, inflation, wrong):
     return BackEnd(from_method("default"), log, poses, (), (), kept, progress, Stopwatch())
 
 
-def test_the_gap_of_a_loop_does_not_go_where_the_images_fit(posed_views) -> None:
+def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
     posed, truth = posed_views
     n = len(truth)
     wrong, unusual = 2, n - 2
@@ -76,7 +76,7 @@ def test_the_gap_of_a_loop_does_not_go_where_the_images_fit(posed_views) -> None
         T = se3.inverse(graph.poses[k - 1]) @ graph.poses[k]
         return np.linalg.norm((se3.inverse(T) @ se3.inverse(truth[k - 1]) @ truth[k])[:3, 3])
 
-    # Least squares alone pulls the uncertain pair apart, which was right.
+    # Least squares alone separates the uncertain pair, which was correct.
     plain = end._config.optimiser.optimise(end.graph([loop])).graph
     assert moved(plain, unusual) > 0.07
     optimisation, confirmed = end._optimise(end.graph([loop]), [loop], SensorPriors())
@@ -85,7 +85,7 @@ def test_the_gap_of_a_loop_does_not_go_where_the_images_fit(posed_views) -> None
     assert moved(optimisation.graph, wrong) < moved(plain, wrong)
 
 
-def test_a_registration_that_the_images_contradict_stays_uncertain(posed_views) -> None:
+def test_registration_contradicted_by_images_stays_uncertain(posed_views) -> None:
     posed, truth = posed_views
     n, wrong = len(truth), 3
     loop = ClosedLoop(

@@ -9,7 +9,7 @@ from tofuse.kernels.threads import threads
 from tofuse.posegraph.pair_measurements import measured_pairs
 
 
-def test_pairs_measure_the_true_motion_from_poses_that_are_off(posed_views) -> None:
+def test_pairs_measure_true_motion_from_inexact_poses(posed_views) -> None:
     posed, truth = posed_views
     rng = np.random.default_rng(0)
     start = truth @ se3.exp(0.01 * rng.standard_normal((len(truth), 6)))
@@ -24,11 +24,11 @@ def test_pairs_measure_the_true_motion_from_poses_that_are_off(posed_views) -> N
     right = graph.with_poses(truth)
     e = right.residuals()
     assert np.median(np.linalg.norm(e[:, :3], axis=1)) < 0.004
-    # Six for errors as large as stated.
+    # Six if errors are as large as stated.
     assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12
 
 
-def test_threads_change_nothing(posed_views) -> None:
+def test_result_is_independent_of_threads(posed_views) -> None:
     posed, truth = posed_views
     found = []
     for count in (1, 2):

@@ -1,4 +1,4 @@
-"""The largest set of measurements that agree pairwise, against all subsets."""
+"""The maximum set of pairwise consistent measurements, compared with all subsets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_consistent(consistent, some):
 
 
 def brute_force(consistent, weights):
-    """Weight of the heaviest subset that agrees pairwise."""
+    """Weight of the heaviest pairwise consistent subset."""
     n = len(consistent)
     return max(
         sum(weights[k] for k in some)
@@ -37,7 +37,7 @@ def graphs(draw):
 
 
 @given(graphs())
-def test_it_is_the_heaviest_of_all_subsets(graph) -> None:
+def test_result_is_heaviest_consistent_subset(graph) -> None:
     consistent, weights = graph
     found = maximum_consistent_set(consistent, weights)
     assert found == sorted(set(found))
@@ -46,14 +46,14 @@ def test_it_is_the_heaviest_of_all_subsets(graph) -> None:
 
 
 @given(graphs())
-def test_without_weights_it_is_the_largest(graph) -> None:
+def test_unweighted_result_is_largest_subset(graph) -> None:
     consistent, _ = graph
     found = maximum_consistent_set(consistent)
     assert len(found) == brute_force(consistent, np.ones(len(consistent)))
 
 
 @given(graphs(), st.randoms(use_true_random=False))
-def test_the_order_of_measurements_does_not_change_its_weight(graph, random) -> None:
+def test_order_of_measurements_does_not_change_weight(graph, random) -> None:
     consistent, weights = graph
     order = list(range(len(weights)))
     random.shuffle(order)
@@ -65,7 +65,7 @@ def test_the_order_of_measurements_does_not_change_its_weight(graph, random) -> 
 
 
 @pytest.mark.parametrize("diagonal", [True, False])
-def test_the_diagonal_does_not_matter(diagonal) -> None:
+def test_diagonal_is_ignored(diagonal) -> None:
     consistent = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]], bool)
     np.fill_diagonal(consistent, diagonal)
     assert maximum_consistent_set(consistent) == [0, 1]
@@ -73,7 +73,7 @@ def test_the_diagonal_does_not_matter(diagonal) -> None:
     assert maximum_consistent_set(consistent, [1, 1, 1.5]) == [0, 1]
 
 
-def test_of_equals_the_first_is_taken() -> None:
+def test_first_of_equal_sets_is_returned() -> None:
     consistent = np.zeros((4, 4), bool)
     consistent[0, 1] = consistent[1, 0] = consistent[2, 3] = consistent[3, 2] = True
     assert maximum_consistent_set(consistent) == [0, 1]
@@ -82,8 +82,8 @@ def test_of_equals_the_first_is_taken() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_wrong_measurements_that_contradict_each_other_are_left_out(seed) -> None:
-    """The few that are right all say the same; most are wrong, each in its own way."""
+def test_inconsistent_outliers_are_left_out(seed) -> None:
+    """The few inliers agree; most measurements are outliers, each different."""
     rng = np.random.default_rng(seed)
     truth = np.array([1.0, -2.0, 0.5])
     right = truth + rng.normal(0, 0.02, (6, 3))
@@ -95,6 +95,6 @@ def test_wrong_measurements_that_contradict_each_other_are_left_out(seed) -> Non
     assert sorted(order[found]) == list(range(6))
 
 
-def test_tens_of_measurements_that_all_agree_take_no_time() -> None:
+def test_many_consistent_measurements_are_fast() -> None:
     consistent = np.ones((60, 60), bool)
     assert maximum_consistent_set(consistent) == list(range(60))

@@ -26,8 +26,8 @@ def nudged(poses, size, seed=0):
 
 
 @pytest.mark.parametrize("sigma", [0.04, 0.1])
-def test_peaks_are_found_nearly_as_well_as_the_surface_allows(sigma):
-    """From where the noise has driven the thesis's method, and the drift of another."""
+def test_peaks_error_is_near_bound(sigma):
+    """From the drift of the thesis's method, and from random errors."""
     views, truth = peaks_views(sigma, 1)
     thesis = run_peaks(sigma, 1)
     start = thesis.poses_optimised if sigma < 0.05 else nudged(truth, 0.3)
@@ -36,14 +36,14 @@ def test_peaks_are_found_nearly_as_well_as_the_surface_allows(sigma):
     assert error < 1.5 * peaks_bound(sigma)
     assert error < thesis.optimised.position.mean() / 4
     assert found.after.mean() > found.before.mean()
-    # It knows the noise, and how good its poses are.
+    # It estimates the noise, and the uncertainty of its poses.
     assert found.sigma == pytest.approx(sigma, rel=0.1)
     alone = found.pairs[:, 0] == 0
     rms = np.sqrt(np.trace(found.covariance[alone][:, :3, :3], axis1=1, axis2=2)).mean()
     assert 0.7 < rms / peaks_bound(sigma) < 2
 
 
-def test_threads_change_nothing():
+def test_result_is_independent_of_threads():
     views, truth = peaks_views(0.05, 0)
     clouds, start = [v.points[::2] for v in views[:8]], nudged(truth[:8], 0.05)
     found = []
@@ -74,8 +74,8 @@ def cells_of(rng, poses, cells=6, points=60):
     return p, x, view, np.array(start)
 
 
-def test_the_planes_are_eliminated_exactly():
-    """Twin: one dense system of all poses and all planes, the planes solved for."""
+def test_planes_are_eliminated_exactly():
+    """Reference: one dense system of all poses and planes, with the planes eliminated."""
     rng = np.random.default_rng(4)
     poses = nudged(np.tile(np.eye(4), (3, 1, 1)), 1.0)
     p, x, view, start = cells_of(rng, poses)
@@ -88,7 +88,7 @@ def test_the_planes_are_eliminated_exactly():
     number[pairs[:, 0], pairs[:, 1]] = np.arange(3)
     own, gradient, mixed = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((3, 6, 6))
     variance, robust = spread[:, 0].copy(), 2.0
-    variance[-1] = 0  # takes no part
+    variance[-1] = 0  # is excluded
     kernels.plane_equations(
         p,
         x,
@@ -144,7 +144,7 @@ def refined(part, views, poses):
     return out.finish([v.index for v in views], poses)
 
 
-def test_a_refinement_is_kept_only_where_the_views_support_it():
+def test_refinement_is_kept_only_if_views_support_it():
     views, truth = peaks_views(0.05, 2)
     start = nudged(truth, 0.1)
     better = refined(Planes(), views, start)
@@ -155,7 +155,7 @@ def test_a_refinement_is_kept_only_where_the_views_support_it():
     assert {(e.i, e.j) for e in better.edges} == {(k, k + 1) for k in range(19)}
     for edge in better.edges:
         assert np.linalg.eigvalsh(edge.information).min() > 0
-    # Clouds that nothing joins stay, and so does one alone.
+    # Disconnected clouds stay, and so does a single one.
     apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(20)])
     same = refined(Planes(), views, apart)
     assert not same.kept
@@ -163,7 +163,7 @@ def test_a_refinement_is_kept_only_where_the_views_support_it():
     assert not refined(Planes(), views[:1], truth[:1]).kept
 
 
-def test_a_view_of_another_place_is_not_dragged_about():
+def test_view_of_another_place_does_not_drag_others():
     views, truth = peaks_views(0.02, 0)
     noise = np.random.default_rng(5).uniform(-8, 8, (2500, 3)).astype(np.float32)
     views[7] = CloudFrame(7, 7.0, noise + np.float32([0, 0, 10]))
@@ -173,8 +173,8 @@ def test_a_view_of_another_place_is_not_dragged_about():
     assert error.mean() < 2 * peaks_bound(0.02)
 
 
-def test_the_two_sides_of_a_wall_stay_apart():
-    """Two rooms, each seen from within, with a thin wall between them; the rest is seen by both."""
+def test_two_sides_of_wall_stay_separate():
+    """Two rooms with a thin wall between them, each seen from inside; the rest is seen by both."""
     rng = np.random.default_rng(0)
 
     def seen(from_x, wall_x):
@@ -195,7 +195,7 @@ def test_the_two_sides_of_a_wall_stay_apart():
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
 
 
-def test_frames_that_are_not_kept_follow():
+def test_frames_that_are_not_kept_follow_the_others():
     views, truth = peaks_views(0.03, 0)
     part = Planes(max_views=12)
     drift = np.cumsum(np.tile([0.01, 0.01, 0.0, 0.001, -0.001, 0.0], (20, 1)), axis=0)
@@ -206,7 +206,7 @@ def test_frames_that_are_not_kept_follow():
     assert error.mean() < PoseErrors.of(start, truth).position.mean() / 2
 
 
-def test_the_bound_of_a_cube_seen_twice():
+def test_bound_of_cube_seen_twice():
     """Difference of two noisy heights, averaged over the samples that face each axis."""
     corners = np.array([[0, 0.5, 0.5], [0, 0.5, -0.5], [0, -0.5, 0.5], [0, -0.5, -0.5]])
     points, normals = [], []
@@ -219,9 +219,9 @@ def test_the_bound_of_a_cube_seen_twice():
     poses = np.tile(np.eye(4), (2, 1, 1))
     C = pose_covariances(points, normals, seen, poses, 0.1)
     np.testing.assert_array_equal(C[0], 0)
-    # 8 samples face each axis; 16 of them, with a lever of 0.5 m, hold each rotation.
+    # 8 samples face each axis; 16 of them, with a lever of 0.5 m, constrain each rotation.
     np.testing.assert_allclose(np.diag(C[1]), [2 * 0.01 / 8] * 3 + [2 * 0.01 / 4] * 3)
-    # A third view of the unknown surface makes it better known.
+    # A third view of the unknown surface improves its accuracy.
     third = pose_covariances(
         points, normals, np.ones((24, 3), bool), np.tile(np.eye(4), (3, 1, 1)), 0.1
     )
@@ -231,16 +231,16 @@ def test_the_bound_of_a_cube_seen_twice():
     )
 
 
-def test_the_bound_of_the_peaks_grows_with_the_noise():
+def test_bound_of_peaks_grows_with_noise():
     assert peaks_bound(0.1) == pytest.approx(0.046, abs=0.001)
     assert peaks_bound(0.02) == pytest.approx(peaks_bound(0.1) / 5)
 
 
-def test_single_recordings_differ_as_the_first_view_moves_all_others():
+def test_bound_of_single_recordings_varies_with_first_view():
     low, high = peaks_bound_of_one(0.1, (0.05, 0.95))
     assert low < peaks_bound(0.1) < high
     assert high > 2 * low
-    # Two views: the distance of the second one alone, halved.
+    # Two views: half the distance of the second one.
     C = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
     assert mean_distances(C).mean() == pytest.approx(np.sqrt(8 / np.pi) / 2, rel=0.02)
 

@@ -23,7 +23,7 @@ from tofuse.registration.verification import Assessment
 turn = revisited_path.turn  # the fixture
 
 
-def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
+def test_revisited_place_is_measured_despite_drift(turn):
     frames, truth, start = turn
     found = pushed(Revisits(searches=0), frames, start)
     closed = [c for c in found if c.record.accepted]
@@ -40,16 +40,16 @@ def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
         assert c.record.overlap > 0.3
 
 
-def test_views_that_never_left_each_other_are_no_loop(turn):
+def test_continuously_overlapping_views_are_no_loop(turn):
     frames, _truth, start = turn
     half = 6
     assert pushed(Revisits(), frames[:half], start[:half]) == []
-    # Standing still sees the same all the time, and never left it.
+    # A static camera sees the same all the time, and never left it.
     still = [replace(frames[0], index=k) for k in range(5)]
     assert pushed(Revisits(), still, np.stack([np.eye(4)] * 5)) == []
 
 
-def test_a_view_of_something_else_is_refused_with_a_reason(turn):
+def test_view_of_another_place_is_rejected_with_reason(turn):
     """The last views show another place, but overlap with the first by the trajectory."""
     frames, truth, start = turn
     strange = [
@@ -69,7 +69,7 @@ def test_a_view_of_something_else_is_refused_with_a_reason(turn):
         assert c.T_i_j is None
 
 
-def test_what_a_person_gives_counts(turn):
+def test_given_loops_are_used(turn):
     frames, truth, start = turn
     T = se3.inverse(truth[0]) @ truth[12]
     given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
@@ -97,10 +97,10 @@ def registered(T, probability):
     ("probable", "wrong", "accepted"),
     [
         ((0.99, 0.99), (), 2),  # each is accepted
-        ((0.7, 0.7), (), 2),  # both say the same
-        ((0.7, 0.7), (1,), 0),  # each says something else
-        ((0.7, 0.99), (0,), 1),  # only the one that is accepted counts
-        ((0.3, 0.3), (), 0),  # hardly probable at all
+        ((0.7, 0.7), (), 2),  # both agree
+        ((0.7, 0.7), (1,), 0),  # they contradict each other
+        ((0.7, 0.99), (0,), 1),  # only the accepted one is used
+        ((0.3, 0.3), (), 0),  # improbable
     ],
 )
 def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong, accepted):
@@ -119,7 +119,7 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
         return registered(T, probable[k])
 
     monkeypatch.setattr(revisits, "register_pair", scripted)
-    # Nothing fits from the drifted pose, so all is left to the search.
+    # Nothing fits from the drifted pose, so that only the search can succeed.
     monkeypatch.setattr(
         revisits.UsualFit, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
     )
@@ -139,7 +139,7 @@ def test_options_are_checked(options):
         Revisits(**options)
 
 
-def test_loops_are_looked_for_again_where_views_have_moved(turn):
+def test_loops_are_searched_again_after_views_moved(turn):
     frames, truth, start = turn
     # Drift that bends the path so far that no candidate is left.
     far = [truth[0]]

@@ -1,4 +1,4 @@
-"""Patch-correlated errors in a refinement: their sums, size, and cost."""
+"""Patch-correlated errors in a refinement: their sums, size, and effect."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def view(frame) -> KeptView:
 
 
 def bent(frame, rng, size: float):
-    """The frame with errors of the depth that vary over some 15 pixels, other ones in each."""
+    """The frame with depth errors that vary over some 15 pixels, different in each frame."""
     v, u = np.indices(frame.depth.shape) / 15.0
     waves = rng.standard_normal((4, 2))
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -54,13 +54,13 @@ def sums_of(source, target, T):
     return sums, row
 
 
-def test_patches_cut_the_image_into_rows_of_equal_ones(pair):
+def test_patches_divide_image_into_equal_cells(pair):
     source, _, _ = pair
     u, v = source.patches % shared_error.ACROSS, source.patches // shared_error.ACROSS
     x, y = (source.points[:, :2] / source.points[:, 2:3]).T
     assert set(u) == set(range(shared_error.ACROSS))
     assert set(v) == set(range(shared_error.DOWN))
-    # Neighbours meet where one ends.
+    # Neighbouring cells do not overlap.
     for k in range(1, shared_error.ACROSS):
         assert x[u == k - 1].max() < x[u == k].min()
     for k in range(1, shared_error.DOWN):
@@ -70,12 +70,12 @@ def test_patches_cut_the_image_into_rows_of_equal_ones(pair):
     assert np.linalg.eigvalsh(alike).min() > 0
 
 
-def test_sums_of_all_patches_are_the_normal_equations(pair):
+def test_sums_of_patches_match_normal_equations(pair):
     source, target, T = pair
     sums, row = sums_of(source, target, T)
     H, g = unpack(row)
     response = sums[:, patch_kernels.RESPONSE :]
-    # A patch of its own for each point would give all of H; here its mean goes into each patch.
+    # One patch for each point would give all of H; here only the mean of each patch counts.
     R = response / np.sqrt(np.maximum(sums[:, :1], 1e-12))
     assert np.linalg.eigvalsh(H[:6, :6] - R.T @ R).min() > -1e-6 * np.trace(H)
     middle = len(source.points) // 2
@@ -89,12 +89,12 @@ def test_sums_of_all_patches_are_the_normal_equations(pair):
     np.testing.assert_allclose(g[:6], weight * r * J, atol=1e-5 * np.abs(weight * r * J).max())
 
 
-def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
+def test_kernel_eliminates_one_unknown_per_patch(pair):
     source, target, T = pair
     sums, row = sums_of(source, target, T)
     alike, variance = shared_error.alike(target.surface), 0.004**2
     H, g = unpack(row.copy())
-    # The same by the whole system: pose, then the errors of the patches with their prior.
+    # Reference by the full system: pose, then the errors of the patches with their prior.
     D, h, M = sums[:, 0], sums[:, 1], sums[:, 2:]
     big = np.diag(D) + np.linalg.inv(variance * alike)
     H[:6, :6] -= M.T @ np.linalg.solve(big, M)
@@ -104,7 +104,7 @@ def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
     found_H, found_g = unpack(allowed)
     np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
     np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
-    # What is counted stays, and without errors everything does.
+    # Counts are unchanged, and without errors everything is.
     np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
     same = row.copy()
     patch_kernels.discount_shared_errors(sums, alike, 0.0, same)
@@ -112,8 +112,8 @@ def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
 
 
 @pytest.mark.parametrize("size", [0.0, 0.01])
-def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
-    """None are found with pixel noise only; otherwise their size is estimated."""
+def test_size_of_shared_errors_is_estimated_from_residuals(size):
+    """It is zero for pixel noise only."""
     rng = np.random.default_rng(5)
     T = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
     seen = []
@@ -129,7 +129,7 @@ def test_the_size_of_shared_errors_is_seen_in_the_residuals(size):
         found = shared_error.disagreement(sums[None], row[None], alike)
         seen.append((found.seen - found.noise) / found.expected)
     sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
-    # Two views err, and along their rays, which surfaces meet at an angle.
+    # Both views have errors along their rays, which meet surfaces at an angle.
     assert sigma < 0.002 if size == 0 else 0.5 * size < sigma < 2 * size
 
 
@@ -146,8 +146,8 @@ def bent_views(seed: int, size: float, *, lit: bool = True) -> tuple[list[KeptVi
     return views, truth
 
 
-def test_albedo_counts_for_more_where_patches_err():
-    """Errors of each view of its own drag a refinement that takes all pixels for independent."""
+def test_albedo_weighs_more_with_shared_errors():
+    """Shared errors bias a refinement that assumes all pixels to be independent."""
     errors = []
     for seed in (1, 2, 3, 4):
         views, truth = bent_views(seed, 0.01)
@@ -158,7 +158,7 @@ def test_albedo_counts_for_more_where_patches_err():
     assert allowed < 0.92 * without
 
 
-def test_all_pixels_count_where_nothing_is_shared_or_nothing_else_tells():
+def test_pixels_are_not_discounted_without_shared_errors_or_albedo():
     views, truth = bent_views(1, 0.0)
     some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
     assert np.abs(some - none).max() < 2e-3

@@ -29,7 +29,7 @@ def errors(
     upper
         Whether the upper half of the images has depth.
     """
-    truth = path(48)[:12]  # one way, so that errors add up
+    truth = path(48)[:12]  # one direction only, so that errors accumulate
     rng = np.random.default_rng(5)
     views = []
     for k, T in enumerate(truth):
@@ -46,7 +46,7 @@ def errors(
     return displacement(truth, refined.poses), found
 
 
-def test_errors_by_the_position_in_the_image_show():
+def test_systematic_errors_are_revealed():
     true, found = errors(bend=0.01)
     assert true[0] > 2 * errors()[0][0]
     assert found[0] > true[0]
@@ -54,13 +54,13 @@ def test_errors_by_the_position_in_the_image_show():
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.01])
-def test_noise_shows_as_no_more_than_it_is(noise):
+def test_noise_is_not_overestimated(noise):
     true, found = errors(noise=noise)
     assert found[0] < 2 * true[0]
 
 
-def test_an_empty_half_shows_nothing():
-    """Poses stay where they are without any measurement, so the other half does not count twice."""
+def test_empty_half_reveals_nothing():
+    """Without measurements poses stay where they are, and the other half does not count twice."""
     _, found = errors(bend=0.01, upper=False)
     assert 0 < found[0] < 0.1
     assert np.isfinite(found).all()

@@ -31,7 +31,7 @@ def swing() -> tuple[list, np.ndarray]:
     return surfaces(truth, noise=0.005), truth
 
 
-def test_submaps_find_what_all_views_at_once_find(swing) -> None:
+def test_submaps_match_refinement_of_all_views(swing) -> None:
     views, truth = swing
     start = drifted(truth)
     whole, parts = (refined(Joint(submap=n), views, start) for n in (COUNT, 14))
@@ -43,12 +43,12 @@ def test_submaps_find_what_all_views_at_once_find(swing) -> None:
     assert parts.support[1] > parts.support[0]
     assert abs(parts.support[1] - whole.support[1]) < 0.02
     np.testing.assert_array_equal(parts.poses[0], start[0])
-    # All look at one place: of the pairs across submaps some are left out.
+    # All views show one place: some pairs across submaps are left out.
     assert 0.5 * whole.pairs < parts.pairs < whole.pairs
     assert {i for e in parts.edges for i in (e.i, e.j)} == set(range(COUNT))
 
 
-def test_memory_does_not_change_what_is_found(swing, tmp_path: Path) -> None:
+def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
     views, truth = swing
     start = drifted(truth)
     some = [views[:20], start[:20]]
@@ -59,7 +59,7 @@ def test_memory_does_not_change_what_is_found(swing, tmp_path: Path) -> None:
         assert [e.i for e in much.edges] == [e.i for e in little.edges]
 
 
-def test_a_store_keeps_views_on_disk_and_spaces_them_by_motion_alone(swing, tmp_path: Path) -> None:
+def test_store_spills_to_disk_and_spaces_views_by_motion(swing, tmp_path: Path) -> None:
     views, _ = swing
     spacing = Spacing(angle=1e-3, distance=1e-3, most=8, loosest=4)
     little, much = (
@@ -71,7 +71,7 @@ def test_a_store_keeps_views_on_disk_and_spaces_them_by_motion_alone(swing, tmp_
             store.push(view, T)
     kept = [p.index for p in little.views]
     assert kept == [p.index for p in much.views]
-    assert max(np.diff(kept)) <= 4  # and not every 8th or 16th, to be 8 in all
+    assert max(np.diff(kept)) <= 4  # not every 8th or 16th, for a total of 8
     assert len(kept) > 8
     for a, b in zip(little.views, much.views, strict=True):
         assert a.index == a.view.index
@@ -82,20 +82,20 @@ def test_a_store_keeps_views_on_disk_and_spaces_them_by_motion_alone(swing, tmp_
         assert a.depth == a.view.depth
 
 
-def test_places_are_cut_into_parts_of_like_size() -> None:
+def test_places_are_divided_into_equal_parts() -> None:
     rng = np.random.default_rng(0)
     places = rng.random((1000, 3)) * [40, 10, 2]
     label = cut(places, 300)
     counts = np.bincount(label)
     assert len(counts) == 4
     assert counts.max() - counts.min() <= 2
-    # Each is a piece of the path: as wide as a quarter of it.
+    # Each is a section of the path: as wide as a quarter of it.
     assert max(np.ptp(places[label == k, 0]) for k in range(4)) < 12
     assert (cut(places[:300], 300) == 0).all()
     np.testing.assert_array_equal(cut(np.zeros((10, 3)), 4), cut(np.zeros((10, 3)), 4))
 
 
-def test_every_pair_is_in_one_submap_at_most() -> None:
+def test_every_pair_is_in_at_most_one_submap() -> None:
     rng = np.random.default_rng(1)
     places = np.stack([np.linspace(0, 50, 500), rng.random(500), rng.random(500)], 1)
     i, j = np.triu_indices(500, 1)
@@ -112,7 +112,7 @@ def test_every_pair_is_in_one_submap_at_most() -> None:
     assert len(np.unique(np.concatenate([s.views for s in found]))) == 500
 
 
-def test_of_many_views_those_of_near_places_are_compared(monkeypatch) -> None:
+def test_views_of_nearby_places_are_compared(monkeypatch) -> None:
     for name, number in (("_ALL", 50), ("_NEAREST", 12), ("_JUST_BEFORE", 5)):
         monkeypatch.setattr(of_views, name, number)
     rng = np.random.default_rng(2)
@@ -124,14 +124,14 @@ def test_of_many_views_those_of_near_places_are_compared(monkeypatch) -> None:
     pairs = set(zip(i.tolist(), j.tolist(), strict=True))
     assert all((k, 399 - k) in pairs for k in range(190))  # the way back
     assert all((j - n, j) in pairs for j in range(5, 400) for n in range(1, 6))
-    # Of the newest view alone it is the same, but for those that ask for it from further away.
+    # The same for the newest view alone, except for distant views that select it.
     a, b = nearby(middles, 399)
     assert set(b.tolist()) == {399}
     assert {(0, 399), (398, 399), (394, 399)} <= set(zip(a.tolist(), b.tolist(), strict=True))
     assert len(nearby(middles[:50])[0]) == 50 * 49 // 2
 
 
-def test_the_nearest_views_are_those_that_overlap(swing, monkeypatch) -> None:
+def test_nearest_views_are_overlapping_views(swing, monkeypatch) -> None:
     views, truth = swing
     kept = [KeptView.of(view, 600) for view in views]
     every, shares = overlaps(kept, truth, 0.6)
@@ -143,10 +143,10 @@ def test_the_nearest_views_are_those_that_overlap(swing, monkeypatch) -> None:
     assert len(some) > 0.6 * len(every)
 
 
-def test_the_index_of_descriptors_finds_the_most_similar_views() -> None:
+def test_descriptor_index_finds_most_similar_views() -> None:
     rng = np.random.default_rng(4)
     places = rng.normal(0, 0.3, (200, 2, 15, 24)).astype(np.float32)
-    # 200 places, each seen again later, turned by two cells and with noise.
+    # 200 places, each revisited later, rotated by two cells and with noise.
     first, again = places[:, :, 3:12, 6:18], places[:, :, 3:12, 4:16]
     noise = 0.02 * rng.standard_normal(again.shape).astype(np.float32)
     descriptors = np.concatenate([first, again + noise])
@@ -161,7 +161,7 @@ def test_the_index_of_descriptors_finds_the_most_similar_views() -> None:
     assert far[true].max() < far[~true].min()
 
 
-def test_submaps_share_their_camera() -> None:
+def test_submaps_share_camera_errors() -> None:
     quiet, alarm = (
         CalibrationCheck(),
         CalibrationCheck(alarm=True, errors={"focal": 0.05}, best="focal"),

@@ -97,16 +97,16 @@ def test_python_in_documents_runs(
 ) -> None:
     shutil.copytree(room_recording, tmp_path / "recording")
     monkeypatch.chdir(tmp_path)
-    registered_parts()  # imported now, so that only what the document makes up goes away with it
+    registered_parts()  # imported now, so that only parts of the document are removed afterwards
     known = {kind: dict(known) for kind, known in parts._registry.items()}
     monkeypatch.setattr(parts, "_registry", known)
-    # What docs/formats.md takes for given: depth images of the camera that it shows.
+    # docs/formats.md assumes depth images of the camera that it shows.
     names: dict[str, Any] = {"depth_images": np.ones((2, 424, 512), np.float32)}
     for k, code in enumerate(blocks(name, "python")):
         exec(compile(code, f"{name}, python block {k}", "exec", dont_inherit=True), names)
 
 
-def test_worked_pose_is_the_line_that_the_document_gives(tmp_path: Path) -> None:
+def test_worked_pose_matches_document(tmp_path: Path) -> None:
     (line,) = re.findall(r"^12\.5 .*$", text_of("docs/conventions.md"), re.MULTILINE)
     (tmp_path / "trajectory.txt").write_text(line + "\n")
     times, (T,) = read_tum(tmp_path / "trajectory.txt")
@@ -151,7 +151,7 @@ def anchors(name: str) -> set[str]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_links_lead_somewhere(name: str) -> None:
+def test_links_are_valid(name: str) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", text_of(name)):
         if target.startswith(("http://", "https://")):
             continue
@@ -164,7 +164,7 @@ def test_links_lead_somewhere(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_files_that_documents_name_exist(name: str) -> None:
+def test_files_named_in_documents_exist(name: str) -> None:
     """Paths in backticks that look like this project's own files."""
     bases = [ROOT, ROOT / "src" / "tofuse"]
     rooms = {p.name for p in bases[1].iterdir() if p.is_dir()} | {"benchmarks", "tests", "docs"}
@@ -286,7 +286,7 @@ def registered_parts() -> dict[str, dict[str, type]]:
     for package in PART_PACKAGES:
         parts.discover(package)
     found = {kind: parts.known(kind) for kind in parts._registry}
-    # Parts that other tests have made up are not the package's.
+    # Parts that other tests define do not belong to the package.
     ours = {
         kind: {n: c for n, c in known.items() if c.__module__.startswith("tofuse.")}
         for kind, known in found.items()
@@ -310,14 +310,14 @@ def test_every_part_is_listed_with_its_label() -> None:
     assert listed - registered == set(), "only in docs/methods.md"
 
 
-def test_tables_of_the_thesis_are_those_of_the_script() -> None:
-    """It also fails where a row names a module, a part or a test that is not there."""
+def test_tables_of_thesis_match_script() -> None:
+    """It also fails where a row names a module, a part or a test that does not exist."""
     script = [sys.executable, str(ROOT / "website" / "thesis.py"), "--check"]
     done = subprocess.run(script, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr or "run python website/thesis.py"
 
 
-def test_every_work_that_the_thesis_cites_is_listed() -> None:
+def test_every_work_cited_by_thesis_is_listed() -> None:
     text = sections("docs/thesis.md")["Works that it cites"]
     missing = [name for name in CITED if name not in text]
     assert not missing
@@ -333,7 +333,7 @@ def test_every_option_of_a_part_is_listed() -> None:
             assert not missing, f"{kind} {name}"
 
 
-def test_every_table_of_options_of_a_part_is_listed() -> None:
+def test_options_of_nested_dataclasses_are_listed() -> None:
     """Options that are plain dataclasses have options themselves, as those of keyframes."""
     text = codes(text_of("docs/methods.md"))
     for kind, known in registered_parts().items():
@@ -361,7 +361,7 @@ def numbers_of(options: Any) -> dict[str, float]:
     return {n: v for n, v in values.items() if isinstance(v, int | float)}
 
 
-def test_stated_defaults_are_those_of_the_parts() -> None:
+def test_stated_defaults_match_parts() -> None:
     checked = 0
     for kind, known in documented_parts().items():
         for name, row in known.items():
@@ -373,7 +373,7 @@ def test_stated_defaults_are_those_of_the_parts() -> None:
     assert checked > 40
 
 
-def test_stated_defaults_are_those_of_keyframes() -> None:
+def test_stated_defaults_match_keyframes() -> None:
     numbers: dict[str, float] = {}
     for constants in (UncertaintyOptions, ProjectiveOptions, SurfaceOptions):
         numbers |= numbers_of(constants)
@@ -385,7 +385,7 @@ def test_stated_defaults_are_those_of_keyframes() -> None:
     assert len(checked) > 15
 
 
-def test_constants_of_the_covariance_are_those_of_the_tracker() -> None:
+def test_constants_of_covariance_match_tracker() -> None:
     numbers = numbers_of(UncertaintyOptions)
     table = [row for row in rows(text_of("docs/uncertainty.md")) if codes(row[0]) & set(numbers)]
     stated = {option: float(row[1]) for row in table for option in codes(row[0])}
@@ -409,12 +409,12 @@ def options_of(data: Any, path: str = "") -> dict[str, str]:
 
 
 @pytest.mark.parametrize("kind", ["range", "cloud"])
-def test_the_default_configuration_has_few_options(kind: ViewKind) -> None:
-    """What no user has a reason to set should be a constant."""
+def test_default_configuration_has_few_options(kind: ViewKind) -> None:
+    """What users have no reason to set should be a constant."""
     assert len(options_of(from_method("default", kind).to_dict())) <= 60
 
 
-def test_options_of_the_default_configuration_are_listed_with_their_defaults() -> None:
+def test_options_of_default_configuration_are_listed_with_defaults() -> None:
     tables = {
         name: {row[0].strip("`"): row[1].strip("`") for row in rows(text)}
         for name, text in sections("docs/options.md").items()
@@ -426,7 +426,7 @@ def test_options_of_the_default_configuration_are_listed_with_their_defaults() -
     assert not clouds.items() & images.items()
 
 
-def test_every_field_of_a_configuration_is_described() -> None:
+def test_every_field_of_configuration_is_described() -> None:
     table = rows(sections("docs/methods.md")["Configurations"])
     described = {row[0].strip("`") for row in table} - set(methods())
     fields = {f.name for f in dataclasses.fields(Config)} - {"method"}
@@ -444,7 +444,7 @@ def parts_named(data: Any) -> set[str]:
     ("column", "method", "kind"),
     [(2, "default", "range"), (3, "default", "cloud"), (4, "thesis", "range")],
 )
-def test_table_of_configurations_tells_their_parts(
+def test_table_of_configurations_names_their_parts(
     column: int, method: str, kind: ViewKind
 ) -> None:
     config = from_method(method, kind).to_dict()
@@ -455,7 +455,7 @@ def test_table_of_configurations_tells_their_parts(
             assert names == parts_named(config[field]), f"{method}, {kind}: {field}"
 
 
-def test_every_room_is_described_in_the_order_of_imports() -> None:
+def test_packages_are_described_in_order_of_imports() -> None:
     project = tomllib.loads(text_of("pyproject.toml"))
     layers = project["tool"]["importlinter"]["contracts"][0]["layers"]
     ranks = {room.strip(): rank for rank, layer in enumerate(layers) for room in layer.split("|")}
@@ -519,14 +519,14 @@ def test_notebooks_run(
 ) -> None:
     shutil.copytree(room_recording, tmp_path / "scan")
     monkeypatch.chdir(tmp_path)
-    # Effects of the camera take most of the time, and what the notebooks show needs none.
+    # Camera effects take most of the time, and the notebooks do not need them.
     plain = partial(demo.simulate_to, without=("all",))
     monkeypatch.setattr(demo, "simulate_to", plain)
     names = run_notebook(path)
     assert len(names["recording"]) > 1
 
 
-def test_the_notebook_on_phones_runs_on_a_phone_scan(
+def test_phone_notebook_runs_on_phone_scan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_data: Path
 ) -> None:
     scan = shared_data / "iphone_record3d"
@@ -537,9 +537,7 @@ def test_the_notebook_on_phones_runs_on_a_phone_scan(
     assert np.isfinite(names["result"].trajectory).all()
 
 
-def test_the_notebook_on_judging_tells_drift_from_truth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_judging_notebook_detects_drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_notebook(JUDGING)
     moved = {k: float(np.nanmax(j.displacement_m)) for k, j in names["judgements"].items()}

@@ -23,7 +23,7 @@ def _python(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-def test_import_pulls_in_nothing_heavy() -> None:
+def test_import_loads_no_heavy_packages() -> None:
     done = _python("import json, sys, tofuse; print(json.dumps(sorted(sys.modules)))")
     assert done.stderr == ""
     loaded = set(json.loads(done.stdout))
@@ -32,7 +32,7 @@ def test_import_pulls_in_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["--version"], ["run"], []])
-def test_help_pulls_in_nothing_heavy(words) -> None:
+def test_help_loads_no_heavy_packages(words) -> None:
     done = _python(
         "import json, sys\n"
         "from tofuse.cli import main\n"
@@ -46,7 +46,7 @@ def test_help_pulls_in_nothing_heavy(words) -> None:
     assert not loaded & (HEAVY | {"numpy"})
 
 
-def test_every_public_name_is_there() -> None:
+def test_public_names_exist() -> None:
     for name in tofuse.__all__:
         assert getattr(tofuse, name) is not None, name
     assert dir(tofuse) == sorted(tofuse.__all__)
@@ -55,7 +55,7 @@ def test_every_public_name_is_there() -> None:
         tofuse.nonsense  # noqa: B018
 
 
-def test_errors_say_what_where_and_what_to_do_on_one_line() -> None:
+def test_errors_state_place_problem_and_remedy_on_one_line() -> None:
     error = tofuse.InputError("is\n broken", where="a.txt", remedy="mend\tit")
     assert str(error) == "a.txt: is broken; mend it"
     assert (error.where, error.problem, error.remedy) == ("a.txt", "is\n broken", "mend\tit")
@@ -64,8 +64,8 @@ def test_errors_say_what_where_and_what_to_do_on_one_line() -> None:
         assert issubclass(kind, tofuse.TofuseError)
 
 
-def test_all_extras_go_together() -> None:
-    """`make lock` resolves the package with every extra at once: one version of each serves all."""
+def test_extras_are_compatible() -> None:
+    """`make lock` resolves the package with all extras: one version of each serves all."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"].values()
     wanted = [*project["dependencies"], *(line for extra in extras for line in extra)]
@@ -80,7 +80,7 @@ def test_all_extras_go_together() -> None:
         assert all(version in requirement.specifier for version in versions), line
 
 
-def test_the_reference_shows_every_public_name() -> None:
+def test_reference_shows_every_public_name() -> None:
     page = (DOCS / "api.md").read_text(encoding="utf-8")
     shown = re.findall(r"^::: tofuse\.(\S+)$", page, re.MULTILINE)
     assert sorted(shown) == sorted(set(tofuse.__all__) - {"__version__"})

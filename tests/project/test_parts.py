@@ -40,7 +40,7 @@ def read(data):
 
 
 @pytest.mark.parametrize("method", methods())
-def test_methods_survive_the_way_through_json(method) -> None:
+def test_methods_survive_json_round_trip(method) -> None:
     config = from_method(method)
     text = json.dumps(config.to_dict(), allow_nan=False)
     back = parts.from_dict(Config, json.loads(text), where="run.json")
@@ -48,7 +48,7 @@ def test_methods_survive_the_way_through_json(method) -> None:
     assert json.dumps(back.to_dict()) == text
 
 
-def test_nested_parts_survive() -> None:
+def test_nested_parts_survive_round_trip() -> None:
     shape = Square((1.0, 2.0), (Round(0.5, "ball"), Square((0.0, 0.0))), count=3)
     data = parts.to_dict(shape)
     assert data["part"] == "square"
@@ -63,7 +63,7 @@ def test_labels_and_names() -> None:
     assert (Round.part_label, Square.part_label) == ("validated", "experimental")
 
 
-def test_two_parts_of_one_name_are_refused() -> None:
+def test_duplicate_part_names_are_refused() -> None:
     with pytest.raises(ValueError, match="two parts are called test-shape 'round'"):
 
         @parts.part("test-shape", "round")
@@ -106,13 +106,13 @@ def test_errors_name_the_field(data, message) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_whole_numbers_are_fine_where_a_float_is_asked_for() -> None:
+def test_integers_are_accepted_as_floats() -> None:
     assert read({"part": "round", "radius": 2}) == Round(2.0)
     assert isinstance(read({"part": "round", "radius": 2}).radius, float)
     assert read({"part": "square", "corner": [1, 2], "count": None}).count is None
 
 
-def test_changes_are_merged_into_a_configuration() -> None:
+def test_changes_are_merged_into_configuration() -> None:
     config = from_method("thesis")
     new = changed(config, {"odometry": {"registration": {"resolution": 0.07}}}, where="c.toml")
     assert new.odometry.registration.resolution == 0.07
@@ -120,7 +120,7 @@ def test_changes_are_merged_into_a_configuration() -> None:
     assert new.filters == config.filters
 
 
-def test_another_part_starts_from_its_own_defaults_and_a_list_replaces_the_list() -> None:
+def test_other_part_has_own_defaults_and_lists_are_replaced() -> None:
     config = from_method("thesis")
     every = {"odometry": {"registration": {"source": {"part": "all"}}}, "filters": []}
     new = changed(config, every, where="c.toml")
@@ -130,7 +130,7 @@ def test_another_part_starts_from_its_own_defaults_and_a_list_replaces_the_list(
     assert [parts.name_of(f) for f in two.filters] == ["median", "distance"]
 
 
-def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> None:
+def test_configuration_errors_name_file_and_field() -> None:
     with pytest.raises(InputError, match=r"^c\.toml: filters\[1\]\.k: is 'x'"):
         changed(
             from_method("thesis"),
@@ -152,7 +152,7 @@ def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> 
         ({"outside": []}, "outside"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], field: str) -> None:
+def test_invalid_options_are_refused(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError, match=field) as refused:
         changed(from_method("default"), changes, where="c.toml")
     assert str(refused.value).startswith("c.toml: ")
@@ -180,14 +180,14 @@ class _Limits(Bounded):
         ({"channels": ()}, r"channels must be non-empty, not \(\)"),
     ],
 )
-def test_values_outside_of_declared_bounds_are_refused(wrong, message) -> None:
+def test_values_outside_declared_bounds_are_refused(wrong, message) -> None:
     with pytest.raises(ValueError, match=f"^{message}$"):
         _Limits(**wrong)
     with pytest.raises(InputError, match=message):
         parts.from_dict(_Limits, wrong, where="test.toml")
 
 
-def test_other_values_than_the_declared_choices_are_refused() -> None:
+def test_undeclared_choices_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^kind must be one of disc, ball, not 'cube'$"):
         _Limits(kind="cube")
     assert _Limits(kind="ball").kind == "ball"

@@ -9,9 +9,9 @@ import pytest
 
 from paths import SOURCE
 
-# What some systems lack. A use counts as guarded inside of an `if` (or after one that returns) that
-# asks for it by `hasattr`, or for the system by `sys.platform` or `os.name`; or in a `try` that
-# catches what its lack gives.
+# Features that some systems lack. A use counts as guarded inside of an `if` (or after one that
+# returns) that checks with `hasattr`, or for the system by `sys.platform` or `os.name`; or in a
+# `try` that catches the resulting error.
 MODULES = {"fcntl", "msvcrt", "resource", "pwd", "grp", "termios", "tty", "pty", "winreg", "syslog",
            "posix", "nt", "_winapi", "spwd", "crypt"}  # fmt: skip
 ATTRIBUTES = {
@@ -29,11 +29,11 @@ ATTRIBUTES = {
     "time": {"tzset", "clock_gettime", "CLOCK_BOOTTIME"},
     "subprocess": {"STARTUPINFO", "CREATE_NEW_PROCESS_GROUP"},
 }  # fmt: skip
-KEYWORDS = {"pass_fds", "preexec_fn"}  # of subprocess, which Windows refuses
+KEYWORDS = {"pass_fds", "preexec_fn"}  # of subprocess, not supported on Windows
 
 
 def needs(node: ast.AST) -> list[str]:
-    """What a node uses that some systems lack."""
+    """Names used by a node that some systems lack."""
     if isinstance(node, ast.Import):
         return [a.name for a in node.names if a.name.split(".")[0] in MODULES]
     if isinstance(node, ast.ImportFrom):
@@ -99,7 +99,7 @@ def unguarded(tree: ast.AST) -> Iterator[tuple[int, str]]:
     yield from walk(tree, False)
 
 
-def test_what_some_systems_lack_is_looked_for_first() -> None:
+def test_uses_of_missing_features_are_guarded() -> None:
     found = [
         f"{path.relative_to(SOURCE)}:{line}: {name}"
         for path in sorted(SOURCE.rglob("*.py"))
@@ -129,5 +129,5 @@ def test_what_some_systems_lack_is_looked_for_first() -> None:
         ("import signal\nsignal.signal(signal.SIGINT, f)", []),
     ],
 )  # fmt: skip
-def test_the_look_itself(text: str, names: list[str]) -> None:
+def test_detection_of_unguarded_uses(text: str, names: list[str]) -> None:
     assert [name for _, name in unguarded(ast.parse(text))] == names

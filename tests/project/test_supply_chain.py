@@ -39,7 +39,7 @@ def test_every_pin_has_hashes(check) -> None:
         )
 
 
-def test_pins_of_users_and_developers_agree(check) -> None:
+def test_pins_of_runtime_and_development_agree(check) -> None:
     """One version of each package, which satisfies the requirements of tofuse and its extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = {k: v for k, v in project["optional-dependencies"].items() if k != "bench"}
@@ -57,13 +57,13 @@ def test_pins_of_users_and_developers_agree(check) -> None:
         assert not same or pin.version in same, pin
 
 
-def test_notice_names_all_packages_of_users(check) -> None:
+def test_notice_names_all_runtime_packages(check) -> None:
     names = {pin.name for pin in check.pins(FOLDER / "runtime.txt")}
     assert list(check.unnamed(names, check.NOTICE.read_text(encoding="utf-8"))) == []
     assert list(check.unnamed({"numpy", "left-pad"}, "NumPy.")) == ["NOTICE: left-pad is missing"]
 
 
-def test_licences_of_packages_of_users(check, monkeypatch) -> None:
+def test_licences_of_runtime_packages(check, monkeypatch) -> None:
     names = {pin.name for pin in check.pins(FOLDER / "runtime.txt")}
     assert list(check.unlicensed(names)) == []
     stated = {
@@ -100,7 +100,7 @@ def test_pins_are_read(check, tmp_path: Path) -> None:
         check.pins(path)
 
 
-def test_a_bill_of_materials_lists_every_pin_with_its_hashes(check) -> None:
+def test_bill_of_materials_lists_every_pin_with_hashes(check) -> None:
     """`make sbom` completes and checks the bill with the same functions."""
     import sbom
 

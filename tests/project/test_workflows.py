@@ -13,7 +13,7 @@ from paths import ROOT
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
-# Paths in commands that are in the repository; what is built lies in dist, build and .venv.
+# Paths in commands that are in the repository; built files are in dist, build and .venv.
 PATH = re.compile(r"(?<![\w./-])((?:benchmarks|docs|requirements|src|tests|website)/[\w./-]+)")
 
 
@@ -90,7 +90,7 @@ def test_files_in_commands_exist() -> None:
     assert [path for path in sorted(paths - made) if not (ROOT / path).exists()] == []
 
 
-def test_files_that_a_release_publishes_are_built() -> None:
+def test_files_published_by_release_are_built() -> None:
     built = {path for text in commands() for path in re.findall(r"\bbuild/[\w.-]+\.json", text)}
     assert built == {"build/sbom.json"}
     assert all(f"-o {path}" in MAKEFILE for path in built)

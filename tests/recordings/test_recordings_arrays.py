@@ -15,7 +15,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
 
-def test_npz_gives_all_that_was_saved(tmp_path: Path) -> None:
+def test_npz_round_trip(tmp_path: Path) -> None:
     given = made.arrays()
     np.savez_compressed(tmp_path / "a.npz", **given)
     recording = open_recording(tmp_path / "a.npz")
@@ -41,7 +41,7 @@ def test_npz_gives_all_that_was_saved(tmp_path: Path) -> None:
     assert recording.warnings == []
 
 
-def test_npz_of_metres_and_rays(tmp_path: Path) -> None:
+def test_npz_with_metres_and_rays(tmp_path: Path) -> None:
     rays = np.random.default_rng(1).normal(size=(12, 16, 2))
     depth = np.full((12, 16), 2.0)
     depth[3, 3] = np.nan
@@ -72,7 +72,7 @@ def test_npz_of_metres_and_rays(tmp_path: Path) -> None:
         ({"confidence_max": -1}, "confidence_max: isn't a positive number"),
     ],
 )
-def test_npz_says_what_is_wrong(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_npz_errors_name_the_problem(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "a.npz", **made.arrays(**changes))
     with pytest.raises(InputError, match=message):
         open_recording(tmp_path / "a.npz")
@@ -102,7 +102,7 @@ def test_real_zense(shared_data: Path) -> None:
         assert isinstance(frame, RangeFrame)
         assert frame.camera == Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)
         depths.append(np.where(frame.valid, frame.z, np.nan))
-    # A still scene: the documented standard deviations over time, in metres.
+    # A static scene: the documented standard deviations over time, in metres.
     stack = np.stack(depths)
     sigma = stack.std(0)[np.isfinite(stack).all(0)]
     np.testing.assert_allclose(np.percentile(sigma, [5, 50, 95]), [0.005, 0.010, 0.053], rtol=0.2)

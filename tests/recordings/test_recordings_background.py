@@ -22,7 +22,7 @@ def frame(z: np.ndarray, index: int = 0) -> RangeFrame:
 
 
 def turning_box(angle: float, background: np.ndarray | float = 3.0) -> tuple[np.ndarray, ...]:
-    """z and mask of a square pillar about a vertical axis at 1.2 m, before a background."""
+    """z and mask of a square pillar with a vertical axis at 1.2 m, before a background."""
     rays = CAMERA.rays()[..., 0].astype(float)
     corners = 0.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     c, s = np.cos(angle), np.sin(angle)
@@ -54,8 +54,8 @@ def agreement(found: np.ndarray, true: np.ndarray) -> float:
     return float((found & true).sum() / (found | true).sum())
 
 
-def test_the_far_surface_is_the_farthest_depth_that_some_frames_agree_on() -> None:
-    """Against a search through all runs of depths, pixel by pixel."""
+def test_far_surface_is_farthest_repeated_depth() -> None:
+    """Compared with a search through all runs of depths, pixel by pixel."""
     rng = np.random.default_rng(0)
     count = 12
     z = 2 + rng.normal(0, 0.005, (count, ROWS, COLUMNS))
@@ -64,9 +64,9 @@ def test_the_far_surface_is_the_farthest_depth_that_some_frames_agree_on() -> No
     nearer = rng.uniform(0.5, 1.5, (count, 8))
     stripe = U[0] // 10
     z = np.where(hidden[:, None, stripe], nearer[:, None, stripe], z)
-    z[3, :, :40] = 4.0  # once is no surface
+    z[3, :, :40] = 4.0  # a single depth is no surface
     z[:, :5] = 0
-    z[:4, :5] = 1.0  # mostly nothing
+    z[:4, :5] = 1.0  # mostly invalid
     far = far_surface([frame(image, k) for k, image in enumerate(z)])
     assert np.isinf(far.z[:5]).all()
     assert np.allclose(far.static_fraction[:5], 8 / 12)
@@ -83,7 +83,7 @@ def test_the_far_surface_is_the_farthest_depth_that_some_frames_agree_on() -> No
     assert 2 <= sum(behind[:, 0, stripe == s][:, 0].sum() >= 3 for s in range(8)) <= 8
 
 
-def test_the_object_is_found_with_what_it_always_hides() -> None:
+def test_object_includes_pixels_it_always_hides() -> None:
     frames, masks = recording()
     found = moving_object(frames)
     middle = np.zeros((ROWS, COLUMNS), bool)
@@ -95,8 +95,8 @@ def test_the_object_is_found_with_what_it_always_hides() -> None:
     assert 0.85 < found.reach[0] < 1.1 < found.reach[1] < 1.3
 
 
-def test_what_stands_in_front_and_does_not_move_is_background() -> None:
-    # A shelf as near as the object, at the left border, and a floor that comes near.
+def test_static_objects_in_front_are_background() -> None:
+    # A shelf as near as the object, at the left border, and a floor that extends to near range.
     shelf = np.where(U < 14, 1.1, np.where(V > 52, 1.6, 3.0))
     frames, masks = recording(background=shelf)
     found = moving_object(frames)
@@ -107,14 +107,14 @@ def test_what_stands_in_front_and_does_not_move_is_background() -> None:
     ) > 0.97  # fmt: skip
 
 
-def test_a_background_without_depth_is_one_as_well() -> None:
+def test_background_without_depth() -> None:
     frames, masks = recording(background=0.0)
     found = moving_object(frames)
     for image, mask in zip(frames, masks, strict=True):
         assert agreement(found.mask(image.z), mask) > 0.95
 
 
-def test_a_wall_that_flickers_gives_no_foreground() -> None:
+def test_flickering_wall_gives_no_foreground() -> None:
     frames, masks = recording(sigma=0.03)
     rng = np.random.default_rng(1)
     frames = [
@@ -127,7 +127,7 @@ def test_a_wall_that_flickers_gives_no_foreground() -> None:
 
 
 def sideways(k: int) -> np.ndarray:
-    """A camera that passes pillars before a wall that it moves along."""
+    """A camera that moves along a wall with pillars in front."""
     return np.where((U + 5 * k) % 40 < 18, 1.5, 3.0)
 
 
@@ -143,11 +143,11 @@ def turning(k: int) -> np.ndarray:
         (sideways, "image borders change"),
         (turning, "image borders change"),
         (lambda _k: np.full((ROWS, COLUMNS), 2.0), "nothing moves in front"),
-        # A pillar that turns in a wall: of its faces only what comes out of the wall is seen.
+        # A rotating pillar embedded in a wall: only the parts in front of the wall are visible.
         (lambda k: np.minimum(turning_box(0.37 * k)[0], 1.02), "can't be separated"),
     ],
 )
-def test_what_is_no_moving_object_is_refused(scene: Callable[[int], np.ndarray], why: str) -> None:
+def test_invalid_scenes_are_refused(scene: Callable[[int], np.ndarray], why: str) -> None:
     rng = np.random.default_rng(2)
     frames = [frame(scene(k) + rng.normal(0, 0.004, (ROWS, COLUMNS)), k) for k in range(16)]
     with pytest.raises(InputError, match=why) as caught:
@@ -155,7 +155,7 @@ def test_what_is_no_moving_object_is_refused(scene: Callable[[int], np.ndarray],
     assert "--max-depth" in str(caught.value)
 
 
-def test_few_frames_and_several_sizes_are_refused() -> None:
+def test_few_frames_and_mixed_sizes_are_refused() -> None:
     frames, _ = recording(5)
     with pytest.raises(InputError, match="needs 6 frames"):
         moving_object(frames)

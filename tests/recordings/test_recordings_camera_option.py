@@ -55,7 +55,7 @@ def npz_metres(folder: Path) -> Path:
 
 
 def own_lenses(folder: Path) -> Path:
-    """A native folder in which each frame has a lens, or rays, of its own."""
+    """A native folder in which each frame has its own lens or rays."""
     make_native(folder / "a")
     (folder / "a" / "frames.csv").write_text("fx,fy,cx,cy\n" + "35,35,19.5,14.5\n" * 3)
     (folder / "a" / "correction.npz").unlink()
@@ -130,15 +130,15 @@ def camera_file(
     return folder / "camera.json", lens
 
 
-def test_every_reader_is_here() -> None:
+def test_every_reader_is_covered() -> None:
     # TIFF images have no camera but the given one: see test_recordings_exports.py.
-    # One PNG hasn't, either: see test_cli_register.py.
+    # Nor does a single PNG: see test_cli_register.py.
     here = {name for name, _, _ in TAKES.values()} | set(REFUSES) | {"tiff", "depth-png"}
     assert here == set(readers())
 
 
 @pytest.mark.parametrize("case", TAKES)
-def test_lens_unit_and_kind_are_taken(tmp_path: Path, case: str) -> None:
+def test_lens_unit_and_kind_are_used(tmp_path: Path, case: str) -> None:
     name, make, counted = TAKES[case]
     path = make(tmp_path)
     own = open_recording(path, format=name)[0]
@@ -151,15 +151,15 @@ def test_lens_unit_and_kind_are_taken(tmp_path: Path, case: str) -> None:
     assert isinstance(frame, RangeFrame)
     assert frame.camera == lens
     assert frame.depth_kind == recording.metadata["depth_kind"] == other
-    scale = 1.0  # metres are metres
+    scale = 1.0  # metres are not scaled
     if counted:
         unit = open_recording(path, format=name).metadata.get("depth_unit_m")
-        # Depth in mm that are no whole numbers has no smallest step.
+        # Depth in mm that is not integer has no unit.
         assert recording.metadata.get("depth_unit_m") == (None if unit is None else 0.003)
         scale = 0.003 / (0.001 if unit is None else unit)
         assert scale > 1.5
     np.testing.assert_allclose(frame.depth, own.depth * scale, rtol=1e-5)
-    # The points follow: along the given rays, and as far as the given kind says.
+    # Points are along the given rays, at distances of the given kind.
     lengths = np.linalg.norm(frame.points, axis=1) if other == "range" else frame.points[:, 2]
     np.testing.assert_allclose(lengths, frame.depth[frame.valid], rtol=1e-4)
     assert (frame.color_image is None) == (own.color_image is None)
@@ -167,7 +167,7 @@ def test_lens_unit_and_kind_are_taken(tmp_path: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["sens", "npz", "azure-kinect", "realsense-bag", "tum"])
-def test_a_table_of_rays_counts_and_another_size_does_not(tmp_path: Path, case: str) -> None:
+def test_ray_table_is_used_and_other_size_refused(tmp_path: Path, case: str) -> None:
     name, make, _ = TAKES[case]
     path = make(tmp_path)
     own = open_recording(path, format=name)[0]
@@ -186,7 +186,7 @@ def test_a_table_of_rays_counts_and_another_size_does_not(tmp_path: Path, case: 
 
 
 @pytest.mark.parametrize("name", REFUSES)
-def test_where_it_means_nothing_it_is_refused(tmp_path: Path, name: str) -> None:
+def test_camera_is_refused_where_not_applicable(tmp_path: Path, name: str) -> None:
     file, _ = camera_file(tmp_path / "given", (16, 12), 0.001, "z")
     (tmp_path / "b").mkdir()
     with pytest.raises(InputError, match=r"--camera: does not apply to the format .*leave it out"):

@@ -76,7 +76,7 @@ def test_every_camera(tmp_path: Path, name: str) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
 
 
-def test_a_lens_for_each_frame_stays_one(tmp_path: Path) -> None:
+def test_lens_of_each_frame_is_kept(tmp_path: Path) -> None:
     MAKERS["3dscannerapp"][0](tmp_path / "scan")
     before = open_recording(tmp_path / "scan")
     convert(before, tmp_path / "out")
@@ -103,7 +103,7 @@ def test_rays_of_each_frame(tmp_path: Path) -> None:
         open_recording(tmp_path / "out")
 
 
-def test_a_correction_is_kept_beside_what_was_measured(tmp_path: Path) -> None:
+def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
     make_native(tmp_path / "scan")
     (tmp_path / "scan" / "noise.json").write_text("{}")
     before = open_recording(tmp_path / "scan")
@@ -119,12 +119,12 @@ def test_a_correction_is_kept_beside_what_was_measured(tmp_path: Path) -> None:
     assert source.frame_columns is not None
     assert source.frame_columns["temperature_c"].tolist() == [0, 2]
     assert (tmp_path / "out" / "noise.json").read_text() == "{}"
-    # The recording that was given still corrects.
+    # The given recording still applies its correction.
     assert isinstance(before.source, NativeSource)
     assert before.source.correction is not None
 
 
-def test_colour_that_is_not_registered_stays_so(tmp_path: Path) -> None:
+def test_unregistered_colour_stays_unregistered(tmp_path: Path) -> None:
     make_7scenes(tmp_path / "scan")
     convert(open_recording(tmp_path / "scan"), tmp_path / "out")
     frame = open_recording(tmp_path / "out")[0]
@@ -147,7 +147,7 @@ def test_clouds(tmp_path: Path) -> None:
     np.testing.assert_allclose(a.normals, b.normals)  # type: ignore[arg-type]
 
 
-def test_another_camera_between_the_frames_looked_at(tmp_path: Path) -> None:
+def test_change_of_camera_between_sampled_frames_is_refused(tmp_path: Path) -> None:
     from dataclasses import replace
 
     from tofuse.recordings.recording import ArraySource
@@ -161,7 +161,7 @@ def test_another_camera_between_the_frames_looked_at(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made_arrays.make_zense(tmp_path / "scan")
     path = tmp_path / "scan" / "depth_0001.png"
     path.write_bytes(path.read_bytes()[:60])
@@ -178,7 +178,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert not (tmp_path / "new").exists()
 
 
-def test_what_goes_wrong_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made_arrays.make_npz(tmp_path / "a.npz")
     recording = open_recording(tmp_path / "a.npz")
 

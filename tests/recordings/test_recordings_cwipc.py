@@ -41,7 +41,7 @@ def rewrite(folder: Path, data: dict) -> None:
     (folder / "cameraconfig.json").write_text(json.dumps(data))
 
 
-def test_kinects_see_the_same_planes(folder: Path) -> None:
+def test_kinects_measure_same_planes(folder: Path) -> None:
     """The trafo is of the colour camera, the images are of the depth camera."""
     recording = open_recording(folder)
     assert recording.format == "rig"
@@ -58,7 +58,7 @@ def test_kinects_see_the_same_planes(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_earlier_versions_and_other_files(folder: Path, version: int) -> None:
+def test_earlier_versions_and_file_names(folder: Path, version: int) -> None:
     """File names as in the published test recording; a disabled camera is left out."""
     data = config(version)
     for k, name in enumerate(("output_master.mkv", "output_sub_1.mkv")):
@@ -72,7 +72,7 @@ def test_earlier_versions_and_other_files(folder: Path, version: int) -> None:
 
 
 @pytest.mark.parametrize("mapping", [None, 1, 0, -1])
-def test_realsense_by_its_mapping(tmp_path: Path, mapping: int | None) -> None:
+def test_realsense_pose_depends_on_mapping(tmp_path: Path, mapping: int | None) -> None:
     """Without a mapping of depth to colour, the trafo is of the depth camera."""
     pytest.importorskip("rosbags")
     for serial in SERIALS:
@@ -93,7 +93,7 @@ def test_realsense_by_its_mapping(tmp_path: Path, mapping: int | None) -> None:
     np.testing.assert_allclose(source.rig.cameras[1].T_rig_camera, expected, atol=1e-6)
 
 
-def test_orbbec_is_of_colour(tmp_path: Path) -> None:
+def test_orbbec_pose_is_that_of_colour_camera(tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     R = ros_bags.T_COLOR[:3, :3]
     for serial in SERIALS:
@@ -148,7 +148,7 @@ SCALED[:3, :3] *= 2
         (changed(1, type="synthetic"), r"camera\[1\]\.type is synthetic"),
     ],
 )
-def test_what_makes_no_sense_is_refused(folder: Path, data: dict, said: str) -> None:
+def test_invalid_files_are_refused(folder: Path, data: dict, said: str) -> None:
     rewrite(folder, data)
     with pytest.raises(InputError, match=said) as error:
         open_recording(folder)
@@ -156,15 +156,15 @@ def test_what_makes_no_sense_is_refused(folder: Path, data: dict, said: str) -> 
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"camera": 5, "type": ""}', "\x00"])
-def test_files_of_others_are_no_rig(folder: Path, text: str) -> None:
-    """Then the folder has two recordings, and the user is asked for one."""
+def test_files_of_other_programs_are_no_rig(folder: Path, text: str) -> None:
+    """The folder then contains two recordings, and the user has to choose one."""
     (folder / "cameraconfig.json").write_text(text)
     assert rig_file_in(folder) is None
     with pytest.raises(InputError):
         open_recording(folder)
 
 
-def test_without_the_pose_of_colour_it_is_refused(folder: Path) -> None:
+def test_missing_pose_of_colour_camera_is_refused(folder: Path) -> None:
     from made_kinect import calibration, make_mkv, small_counts
 
     lens = calibration()
@@ -175,7 +175,7 @@ def test_without_the_pose_of_colour_it_is_refused(folder: Path) -> None:
 
 
 def test_links(folder: Path, tmp_path: Path) -> None:
-    """A linked recording is read, a link to nowhere and to itself are missing recordings."""
+    """A linked recording is read; broken and circular links are missing recordings."""
     path = folder / f"{SERIALS[1]}.mkv"
     path.rename(tmp_path / "elsewhere.mkv")
     path.symlink_to(tmp_path / "elsewhere.mkv")
@@ -187,7 +187,7 @@ def test_links(folder: Path, tmp_path: Path) -> None:
             open_recording(folder)
 
 
-def test_damaged_folders_give_only_our_errors(folder: Path, tmp_path: Path) -> None:
+def test_damaged_folders_raise_only_package_errors(folder: Path, tmp_path: Path) -> None:
     totals = np.zeros(3, int)
     for k in range(40):
         rng = np.random.default_rng([72, k])
@@ -201,7 +201,7 @@ def test_damaged_folders_give_only_our_errors(folder: Path, tmp_path: Path) -> N
     assert unread + refused > 0
 
 
-def test_one_model_by_one_command(folder: Path, tmp_path: Path, capfd) -> None:
+def test_rig_is_reconstructed_by_one_command(folder: Path, tmp_path: Path, capfd) -> None:
     out = tmp_path / "model"
     assert main(["run", str(folder), "--out", str(out)]) == 0, capfd.readouterr().err
     told = json.loads((out / "run.json").read_text())

@@ -1,4 +1,4 @@
-"""Clouds that are images without their grid: the camera is recovered from the points."""
+"""Clouds deprojected from images: the camera is recovered from the points."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def cloud_of(frame: RangeFrame, order: Intp | None = None) -> CloudFrame:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_image_comes_back_from_shuffled_points(lens: str) -> None:
+def test_image_is_recovered_from_shuffled_points(lens: str) -> None:
     frames = [seen(LENSES[lens], k) for k in range(3)]
     rng = np.random.default_rng(7)
     clouds = [cloud_of(f, rng.permutation(len(f))) for f in frames]
@@ -51,7 +51,7 @@ def test_the_image_comes_back_from_shuffled_points(lens: str) -> None:
     assert found is not None
     assert (found.camera.width, found.camera.height) == (160, 120)
     assert isinstance(found.camera, Pinhole) == (lens == "pinhole")
-    # Where nothing was measured the rays are those of the lens, too.
+    # Rays of invalid pixels match the lens, too.
     off = np.abs(found.camera.rays() - LENSES[lens].rays()) * 140
     assert off.max() < 0.01
     for frame, cloud in zip(frames, clouds, strict=True):
@@ -64,7 +64,7 @@ def test_the_image_comes_back_from_shuffled_points(lens: str) -> None:
         np.testing.assert_allclose(image.points, frame.points, atol=2e-5)
 
 
-def test_coordinates_rounded_to_a_millimetre_will_do() -> None:
+def test_coordinates_rounded_to_millimetres_suffice() -> None:
     cloud = cloud_of(seen(PINHOLE, 0))
     rounded = CloudFrame.of(np.round(cloud.points, 3))
     found = find_deprojection([rounded])
@@ -94,7 +94,7 @@ def test_other_clouds_stay_clouds(spoilt: str) -> None:
     assert find_deprojection([CloudFrame.of(other)]) is None
 
 
-def test_a_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
+def test_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
     frames = [seen(LENSES["brown"], k) for k in range(4)]
     for k, frame in enumerate(frames[:3]):
         write_ply(
@@ -112,7 +112,7 @@ def test_a_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
     assert len(recording[3]) == 0
 
 
-def test_a_folder_with_another_kind_of_cloud_stays_clouds(tmp_path: Path) -> None:
+def test_folder_with_other_clouds_stays_clouds(tmp_path: Path) -> None:
     frames = [seen(PINHOLE, k) for k in range(3)]
     for k, frame in enumerate(frames):
         points = np.concatenate([frame.points, moved(frame.points)]) if k else frame.points
@@ -120,7 +120,7 @@ def test_a_folder_with_another_kind_of_cloud_stays_clouds(tmp_path: Path) -> Non
     assert isinstance(open_recording(tmp_path)[0], CloudFrame)
 
 
-def test_a_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
+def test_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
     frames = [seen(PINHOLE, k % 5) for k in range(24)]
     for k, frame in enumerate(frames):
         points = moved(frame.points) if k == 4 else frame.points

@@ -1,4 +1,4 @@
-"""Folders of other programs, in their published layouts, and their faults."""
+"""Folders of other programs, in their published layouts, and faulty ones."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_polycam_without_optimised_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference[:, :3, 3], POSES[:, :3, 3] + 0.01)
 
 
-def test_polycam_that_lacks_something(tmp_path: Path) -> None:
+def test_incomplete_polycam(tmp_path: Path) -> None:
     made.make_polycam(tmp_path / "scan")
     keyframes = tmp_path / "scan" / "keyframes"
     (keyframes / "cameras" / "5000000.json").write_text('{"fx": NaN}')
@@ -77,7 +77,7 @@ def test_nerfstudio(tmp_path: Path) -> None:
         check_frames(recording)
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
-    # Eight pixels of colour are one of depth; both begin at a corner.
+    # Eight colour pixels are one depth pixel; both grids start at a corner.
     expected = BrownConrady(
         WIDTH, HEIGHT, 25.0, 201 / 8, 130 / 8 - 0.5, 95 / 8 - 0.5, -0.05, 0.01, 0.001
     )
@@ -95,7 +95,7 @@ def test_nerfcapture(tmp_path: Path) -> None:
         assert frame.color_image is not None
 
 
-def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
+def test_exported_nerfstudio_is_read_back(tmp_path: Path) -> None:
     """Depth, colour, lens, poses, times and sigma, as `tofuse export` writes them."""
     (folder,) = export(made_result(tmp_path, BROWN), ["nerfstudio"])
     recording = open_recording(folder)
@@ -137,7 +137,7 @@ def changed(folder: Path, **changes: object) -> None:
         ({"frames": {}}, "has no list of frames"),
     ],
 )
-def test_nerfstudio_that_lacks_something(tmp_path: Path, changes: dict, says: str) -> None:
+def test_incomplete_nerfstudio(tmp_path: Path, changes: dict, says: str) -> None:
     made.make_nerfstudio(tmp_path / "scan")
     changed(tmp_path / "scan", **changes)
     with pytest.raises(InputError) as error:
@@ -146,7 +146,7 @@ def test_nerfstudio_that_lacks_something(tmp_path: Path, changes: dict, says: st
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_nerfstudio_by_angle_fisheye_and_floats(tmp_path: Path) -> None:
+def test_nerfstudio_with_angle_fisheye_and_float_depth(tmp_path: Path) -> None:
     folder = tmp_path / "scan"
     made.make_nerfstudio(folder)
     about = json.loads((folder / "transforms.json").read_text())
@@ -179,7 +179,7 @@ def test_nerfstudio_by_angle_fisheye_and_floats(tmp_path: Path) -> None:
     assert frame.camera.k1 == 0.01
 
 
-def test_depth_without_a_unit_is_asked_for(tmp_path: Path) -> None:
+def test_depth_without_unit_is_refused(tmp_path: Path) -> None:
     made.make_nerfcapture(tmp_path / "scan")
     changed(tmp_path / "scan", integer_depth_scale=None)
     with pytest.raises(InputError, match="integer_depth_scale: is missing"):
@@ -210,7 +210,7 @@ def test_hololens(tmp_path: Path, stream: str, unpacked: bool) -> None:
     assert recording.warnings == []
 
 
-def test_hololens_that_lacks_something(tmp_path: Path) -> None:
+def test_incomplete_hololens(tmp_path: Path) -> None:
     folder = tmp_path / "scan"
     made.make_hololens(folder, unpacked=True)
     stream = "Depth Long Throw"
@@ -239,7 +239,7 @@ def test_hololens_that_lacks_something(tmp_path: Path) -> None:
         open_recording(folder)
 
 
-def test_hololens_takes_long_throw_of_both(tmp_path: Path) -> None:
+def test_hololens_prefers_long_throw(tmp_path: Path) -> None:
     made.make_hololens(tmp_path / "scan")
     made.make_hololens(tmp_path / "other", stream="Depth AHaT")
     for path in (tmp_path / "other").iterdir():
@@ -277,7 +277,7 @@ def test_kinect2(tmp_path: Path, size: tuple[int, int], serial: str, scale: floa
     assert "only 2 of 3 frames have colour" in recording.warnings
 
 
-def test_kinect2_that_lacks_something(tmp_path: Path) -> None:
+def test_incomplete_kinect2(tmp_path: Path) -> None:
     made.make_kinect2(tmp_path / "scan")
     (tmp_path / "scan" / "calib_ir.yaml").write_text("%YAML:1.0\ncameraMatrix:\n data: [1, x]")
     with pytest.raises(InputError, match="has no cameraMatrix of 9 numbers"):
@@ -299,14 +299,14 @@ def test_depth16(tmp_path: Path) -> None:
     for k, frame in enumerate(recording):
         assert isinstance(frame, RangeFrame)
         np.testing.assert_allclose(frame.depth, DEPTH[k], atol=6e-4)
-        # Level 0 says nothing and counts as sure; level n is (n - 1) sevenths.
+        # Level 0 is undefined and counts as certain; level n is (n - 1) sevenths.
         expected = np.array([7, 4, 5], np.uint8)[made_phones.CONFIDENCE[k]]
         np.testing.assert_array_equal(frame.confidence_image, expected)
         assert (frame.color_image is not None) == (k == 1)
     assert recording.warnings == ["only 1 of 3 frames have colour"]
 
 
-def test_depth16_that_lacks_something(tmp_path: Path) -> None:
+def test_incomplete_depth16(tmp_path: Path) -> None:
     made.make_depth16(tmp_path / "scan")
     camera = tmp_path / "camera.json"
     shutil.move(tmp_path / "scan" / "camera.json", camera)

@@ -32,7 +32,7 @@ MAKERS: dict[str, tuple[Maker, float]] = {
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_point_for_each_pixel_becomes_an_image(tmp_path: Path, name: str) -> None:
+def test_organised_clouds_become_images(tmp_path: Path, name: str) -> None:
     make, off = MAKERS[name]
     make(tmp_path / "a")
     recording = open_recording(tmp_path / "a")
@@ -55,9 +55,7 @@ def test_a_point_for_each_pixel_becomes_an_image(tmp_path: Path, name: str) -> N
 
 
 @pytest.mark.parametrize("signs", [(-1, -1, 1), (1, -1, -1), (1, -1, 1)])
-def test_axes_that_run_against_the_pixels_are_turned(
-    tmp_path: Path, signs: tuple[int, int, int]
-) -> None:
+def test_reversed_axes_are_corrected(tmp_path: Path, signs: tuple[int, int, int]) -> None:
     made.make_royale(tmp_path / "a")
     for file in (tmp_path / "a").iterdir():
         write_ply(file, GeometryRecord(read_ply(file).points * np.array(signs, np.float32)))
@@ -69,7 +67,7 @@ def test_axes_that_run_against_the_pixels_are_turned(
 
 
 def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
-    """Random points, and a height field, whose rows and columns are no pixels of a camera."""
+    """Random points, and a height field, whose rows and columns are not pixels of a camera."""
     rng = np.random.default_rng(310)
     y, x = np.mgrid[:24, :32] / 10
     field = np.stack([x - 1.6, y - 1.2, 2 + rng.uniform(-1, 1, x.shape)], -1)
@@ -84,7 +82,7 @@ def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
             open_recording(folder, format="grid")
 
 
-def test_points_that_were_left_out_leave_the_others_on_their_pixels(tmp_path: Path) -> None:
+def test_missing_points_leave_others_on_their_pixels(tmp_path: Path) -> None:
     for name in ("whole", "thinned"):
         made.make_helios(tmp_path / name)
     path = tmp_path / "thinned" / "Image_1.ply"
@@ -94,13 +92,13 @@ def test_points_that_were_left_out_leave_the_others_on_their_pixels(tmp_path: Pa
     write_ply(path, GeometryRecord(ply.points[kept], scalars={"intensity": ply.amplitude[kept]}))
     whole, thinned = (open_recording(tmp_path / name)[1] for name in ("whole", "thinned"))
     both = (whole.depth > 0) & (thinned.depth > 0)
-    # Pixels that saw nothing in the first file have no ray.
+    # Pixels without depth in the first file have no ray.
     assert both.sum() > 0.8 * (whole.depth > 0).sum() >= 0.8 * (thinned.depth > 0).sum()
     np.testing.assert_allclose(thinned.depth[both], whole.depth[both], rtol=1e-3)
     np.testing.assert_array_equal(thinned.amplitude_image[both], whole.amplitude_image[both])
 
 
-def test_points_off_the_rays_are_one_bad_frame(tmp_path: Path) -> None:
+def test_points_off_the_rays_are_one_unreadable_frame(tmp_path: Path) -> None:
     made.make_helios(tmp_path / "a")
     path = tmp_path / "a" / "Image_1.ply"
     points = read_ply(path).points
@@ -121,7 +119,7 @@ def camera_json(folder: Path, **changes: object) -> Path:
     return folder / "camera.json"
 
 
-def test_tiff3d_with_its_camera(tmp_path: Path) -> None:
+def test_tiff3d_with_camera(tmp_path: Path) -> None:
     made.make_tiff3d(tmp_path / "a")
     with pytest.raises(InputError, match=r"has no camera: the layout of \.t3c .*--camera"):
         open_recording(tmp_path / "a")
@@ -138,7 +136,7 @@ def test_tiff3d_with_its_camera(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, made.amplitudes()[k])
 
 
-def test_other_tiffs_are_depth_when_asked_for(tmp_path: Path) -> None:
+def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     folder.mkdir()
     counts = (made.depths()[0] / 1e-4).astype(np.uint16)
@@ -158,7 +156,7 @@ def test_other_tiffs_are_depth_when_asked_for(tmp_path: Path) -> None:
         open_recording(folder, format="tiff", camera=small)
 
 
-def test_tiffs_that_are_damaged_are_refused(tmp_path: Path) -> None:
+def test_damaged_tiffs_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     cv2.imwrite(str(path), np.zeros((24, 32, 3), np.uint8))
     with pytest.raises(InputError, match="3 channels"):
@@ -176,7 +174,7 @@ def test_tiffs_that_are_damaged_are_refused(tmp_path: Path) -> None:
             read_tiff(path)
 
 
-def test_damage_gives_only_our_errors(tmp_path: Path) -> None:
+def test_damage_raises_only_package_errors(tmp_path: Path) -> None:
     original = tmp_path / "a"
     made.make_tiff3d(original)
     camera = camera_json(tmp_path)
@@ -194,9 +192,7 @@ def test_damage_gives_only_our_errors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("inside", [False, True])
-def test_what_only_the_maker_can_read_is_said_with_the_way_out(
-    tmp_path: Path, inside: bool
-) -> None:
+def test_proprietary_format_is_refused_with_remedy(tmp_path: Path, inside: bool) -> None:
     path = tmp_path / "a" / "b.rrf"
     path.parent.mkdir()
     path.write_bytes(bytes(range(256)))

@@ -15,7 +15,7 @@ from tofuse.recordings.open import open_recording
 
 
 def unit_vector(model: int, numbers: tuple[float, ...], u: int, v: int) -> np.ndarray:
-    """The maker's formula for one pixel, in the plainest way."""
+    """The manufacturer's formula for one pixel, evaluated literally."""
     fx, fy, mx, my, skew, a, b, c, d, e = numbers
     y = (v + 0.5 - my) / fy
     x = (u + 0.5 - mx) / fx - skew * y
@@ -63,7 +63,7 @@ def test_points_noise_and_flags(tmp_path: Path, model: int, numbers: tuple[float
                 np.testing.assert_allclose(frame.point_image[v, u], expected, rtol=1e-4, atol=1e-6)
 
 
-def test_a_frame_that_is_damaged_is_skipped(tmp_path: Path) -> None:
+def test_damaged_frame_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "buffer.data"
     data = bytearray(made.frame(0) + made.frame(1) + made.frame(2))
     at = len(made.frame(0)) + 24 + 4
@@ -96,7 +96,7 @@ def test_real_frame(shared_data: Path) -> None:
     rows, columns = np.nonzero(frame.valid)
     assert np.abs(fx * x / z * radial + mx - 0.5 - columns).max() < 0.6
     assert np.abs(fy * y / z * radial + my - 0.5 - rows).max() < 0.6
-    # The camera calls invalid what it gives no distance.
+    # The camera marks pixels without a distance as invalid.
     start = data.find(struct.pack("<II", 300, 38576)) + 48
     flags = np.frombuffer(data, np.uint8, 172 * 224, start).reshape(172, 224)
     np.testing.assert_array_equal(frame.valid, flags % 2 == 0)
@@ -104,6 +104,6 @@ def test_real_frame(shared_data: Path) -> None:
     points = frame.point_image[66:108, 76:104].reshape(-1, 3).astype(float)
     normal = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
     assert np.median(np.abs((points - points.mean(0)) @ normal)) < 0.002
-    # The camera's own noise: a millimetre or so on this near scene.
+    # The camera's own noise: about a millimetre in this near scene.
     assert frame.sigma is not None
     assert 1e-4 < np.median(frame.sigma) < 3e-3

@@ -18,7 +18,7 @@ h5py = pytest.importorskip("h5py", reason="the package h5py is not installed")
 
 
 @pytest.mark.parametrize("model", [0, 2])
-def test_it_is_what_the_stream_of_the_head_is(tmp_path: Path, model: int) -> None:
+def test_h5_matches_stream_of_head(tmp_path: Path, model: int) -> None:
     numbers = made.BOUGUET if model == 0 else made.FISHEYE
     made.make_o3r(tmp_path / "a.data", model, numbers)
     made.make_h5(tmp_path / "b.h5", model=model)
@@ -36,7 +36,7 @@ def test_it_is_what_the_stream_of_the_head_is(tmp_path: Path, model: int) -> Non
         np.testing.assert_array_equal(frame.camera.rays(), same.camera.rays())
 
 
-def test_one_of_several_heads(tmp_path: Path) -> None:
+def test_one_of_several_heads_is_chosen(tmp_path: Path) -> None:
     made.make_h5(tmp_path / "a.h5", heads=2)
     recording = open_recording(tmp_path / "a.h5")
     assert any("others are o3r_tof_1: choose with --topic" in w for w in recording.warnings)
@@ -49,7 +49,7 @@ def test_one_of_several_heads(tmp_path: Path) -> None:
         open_recording(tmp_path / "a.h5", topic="o3r_tof_5")
 
 
-def test_files_that_lack_something(tmp_path: Path, monkeypatch) -> None:
+def test_incomplete_files(tmp_path: Path, monkeypatch) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["other"] = np.zeros(3)
     with pytest.raises(InputError, match="has no stream o3r_tof_0"):

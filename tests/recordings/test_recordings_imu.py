@@ -21,7 +21,7 @@ def columns(times: np.ndarray, felt: np.ndarray) -> dict[str, np.ndarray]:
     return {"timestamp": times, "ax": felt[:, 0], "ay": felt[:, 1], "az": felt[:, 2]}
 
 
-def test_each_frame_takes_the_samples_that_are_nearest_to_it():
+def test_each_frame_uses_nearest_samples():
     times = np.array([0.0, 1.0, 1.2])
     at = np.arange(-0.3, 2.0, 0.01)
     felt = np.where((at < 0.5)[:, None], UP, -UP) * 9.81
@@ -29,7 +29,7 @@ def test_each_frame_takes_the_samples_that_are_nearest_to_it():
     assert found is not None
     np.testing.assert_allclose(found[:, :3], [-UP, UP, UP], atol=1e-12)
     assert (found[:, 3] < 0.005).all()
-    # In units of g, or worked out by the phone: the same.
+    # In units of g, or as fused by the phone: the same.
     np.testing.assert_allclose(gravity_at(times, columns(at, felt / 9.81)), found, atol=1e-12)
     fused = {f"gravity_{axis}": -felt[:, k] for k, axis in enumerate("xyz")}
     fused_found = gravity_at(times, {"timestamp": at, **fused})
@@ -37,7 +37,7 @@ def test_each_frame_takes_the_samples_that_are_nearest_to_it():
     np.testing.assert_allclose(fused_found[:, :3], found[:, :3], atol=1e-12)
 
 
-def test_motion_along_gravity_tells_of_motion_across_it():
+def test_variation_along_gravity_estimates_the_error():
     rng = np.random.default_rng(0)
     times = np.arange(200.0)
     still = 9.81 * UP + 0.02 * rng.standard_normal((200, 3))
@@ -47,11 +47,11 @@ def test_motion_along_gravity_tells_of_motion_across_it():
         assert found is not None
         assert low < np.median(found[:, 3]) < high
         away = np.linalg.norm(found[:, :3] + UP, axis=1)
-        # Two directions across, each with that sigma.
+        # Two perpendicular directions, each with that sigma.
         assert 0.5 < np.sqrt((away**2).mean() / 2) / np.sqrt((found[:, 3] ** 2).mean()) < 1.5
 
 
-def test_what_was_not_measured_is_not_known():
+def test_missing_measurements_are_unknown():
     times = np.array([0.0, 10.0, 20.0])
     felt = np.stack([9.81 * UP, 9.81 * UP, [np.nan, 0, 0]])
     found = gravity_at(times, columns(np.array([0.1, 14.0, 20.0]), felt))
@@ -72,7 +72,7 @@ def folder(path: Path, imu: dict[str, np.ndarray]) -> Path:
     return writer.finish(imu=imu)
 
 
-def test_a_native_recording_and_selections_of_it_know_what_is_down(tmp_path: Path):
+def test_gravity_of_native_recordings_and_selections(tmp_path: Path):
     felt = np.tile(9.81 * UP, (4, 1))
     recording = open_recording(folder(tmp_path / "a", columns(np.arange(4) / 10, felt)))
     assert recording.warnings == []
@@ -87,7 +87,7 @@ def test_a_native_recording_and_selections_of_it_know_what_is_down(tmp_path: Pat
     assert any("gravity is unknown" in warning for warning in joined.warnings)
 
 
-def test_the_simulated_accelerometer_tells_the_tilt_of_the_camera(tmp_path: Path):
+def test_simulated_accelerometer_gives_camera_tilt(tmp_path: Path):
     from tofuse.lab.simulation.accelerometer import accelerations
     from tofuse.lab.simulation.record import plan
 
@@ -99,12 +99,12 @@ def test_the_simulated_accelerometer_tells_the_tilt_of_the_camera(tmp_path: Path
     seen = np.einsum("kij,kj->ki", made.poses[:, :3, :3], found[:, :3])
     mean = seen.mean(0) / np.linalg.norm(seen.mean(0))
     assert np.degrees(np.linalg.norm(seen - mean, axis=1)).max() < 2
-    # Down in the first camera's frame is what the room's z axis says.
+    # Down in the first camera's frame agrees with the room's z axis.
     down = made.sequence.T_room_camera(times[0])[:3, :3].T @ [0, 0, -1]
     assert np.degrees(np.arccos(mean @ down)) < 1.5
 
 
-def test_a_phone_s_accelerometer_agrees_with_its_own_poses(shared_data):
+def test_accelerometer_of_phone_agrees_with_its_poses(shared_data):
     recording = open_recording(shared_data / "iphone_stray")
     assert recording.gravity is not None
     assert recording.reference is not None

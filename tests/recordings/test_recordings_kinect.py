@@ -40,7 +40,7 @@ def opencv_lens(mode: str, lens: list[float]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("mode", SIZES)
-def test_rays_are_opencvs_in_every_mode(tmp_path: Path, mode: str) -> None:
+def test_rays_match_opencv_in_every_mode(tmp_path: Path, mode: str) -> None:
     width, height, *_ = SIZES[mode]
     made.make_mkv(tmp_path / "a.mkv", np.full((1, height, width), 1500, np.uint16), mode=mode)
     frame = open_recording(tmp_path / "a.mkv")[0]
@@ -50,7 +50,7 @@ def test_rays_are_opencvs_in_every_mode(tmp_path: Path, mode: str) -> None:
     rays = frame.camera.rays()[v, u].astype(float)
     seen = np.isfinite(rays).all(-1)
     pixels = np.stack([u, v], -1)[seen].astype(float)
-    # Both ways: our rays land on the pixels, and OpenCV's rays of the pixels are ours.
+    # Both ways: our rays project to the pixels, and OpenCV's rays of the pixels equal ours.
     points = np.concatenate([rays[seen], np.ones((len(pixels), 1))], 1)
     landed = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
     assert np.abs(landed - pixels).max() < 1e-3
@@ -64,7 +64,7 @@ def test_rays_are_opencvs_in_every_mode(tmp_path: Path, mode: str) -> None:
         expected = cv2.undistortPoints(*args, criteria=stop)
     error = (expected[:, 0] - rays[seen][near]) * (K[0, 0], K[1, 1])
     assert np.abs(error).max() < 0.1
-    # The corners of the wide modes lie beyond where the calibration holds.
+    # The corners of the wide modes are outside the valid range of the calibration.
     share = np.isfinite(frame.camera.rays()).all(-1).mean()
     assert share == 1 if mode.startswith("N") else 0.7 < share < 0.85
     assert np.hypot(*rays[seen].T).max() <= 1.74
@@ -72,7 +72,7 @@ def test_rays_are_opencvs_in_every_mode(tmp_path: Path, mode: str) -> None:
     np.testing.assert_allclose(frame.z[frame.valid], 1.5)
 
 
-def test_images_times_and_facts(tmp_path: Path) -> None:
+def test_images_timestamps_and_metadata(tmp_path: Path) -> None:
     depth = made.small_counts()
     made.make_mkv(tmp_path / "rec" / "a.mkv", depth, infrared=depth // 2)
     recording = open_recording(tmp_path / "rec")  # a folder that holds one
@@ -89,7 +89,7 @@ def test_images_times_and_facts(tmp_path: Path) -> None:
     assert recording.warnings == []
 
 
-def test_sizes_need_not_be_known_nor_the_mode_told(tmp_path: Path) -> None:
+def test_unknown_sizes_and_missing_mode(tmp_path: Path) -> None:
     depth = made.small_counts()
     made.make_mkv(tmp_path / "a.mkv", depth, mode=None, unknown_sizes=True)
     recording = open_recording(tmp_path / "a.mkv")
@@ -100,8 +100,8 @@ def test_sizes_need_not_be_known_nor_the_mode_told(tmp_path: Path) -> None:
         np.testing.assert_allclose(frame.z, depth[k] / 1000, atol=1e-6)
 
 
-def test_color_is_registered_and_hidden_points_have_none(tmp_path: Path) -> None:
-    """A near strip occludes for the colour camera what the depth camera sees next to it."""
+def test_color_is_registered_and_occluded_points_have_none(tmp_path: Path) -> None:
+    """A near strip occludes, in the colour camera, points that the depth camera sees next to it."""
     depth = np.full((1, 288, 320), 2000, np.uint16)
     depth[:, :, 150:170] = 500
     v, u = np.mgrid[:720, :1280]
@@ -129,7 +129,7 @@ def test_color_is_registered_and_hidden_points_have_none(tmp_path: Path) -> None
     assert seen[inside].mean() > 0.85
 
 
-def test_the_older_tangential_form(tmp_path: Path) -> None:
+def test_older_tangential_form(tmp_path: Path) -> None:
     lens = made.calibration("Rational6KT")
     cameras = lens["CalibrationInformation"]["Cameras"]  # type: ignore[index]
     cameras[0]["Intrinsics"]["ModelParameters"] = [*made.DEPTH_LENS[:12], 2e-3, 1e-3]
@@ -150,7 +150,7 @@ def test_the_older_tangential_form(tmp_path: Path) -> None:
     assert np.abs(v - rows).max() < 1e-3
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_missing_tracks_and_calibration_are_named(tmp_path: Path) -> None:
     depth = made.small_counts(2)
     path = tmp_path / "a.mkv"
     made.make_mkv(path, depth, infrared=depth, without="DEPTH")
@@ -168,7 +168,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         open_recording(path)
 
 
-def test_a_recording_that_was_cut_off_keeps_its_whole_frames(tmp_path: Path) -> None:
+def test_truncated_recording_keeps_complete_frames(tmp_path: Path) -> None:
     path = tmp_path / "a.mkv"
     depth = made.small_counts()
     made.make_mkv(path, depth)
@@ -180,8 +180,8 @@ def test_a_recording_that_was_cut_off_keeps_its_whole_frames(tmp_path: Path) -> 
     assert [isinstance(item, UnreadableFrameError) for item in items] == [False, False, True]
 
 
-def test_a_header_that_ends_after_its_parent_is_cut_off(tmp_path: Path) -> None:
-    """The last byte of a tag is the beginning of an element whose size is in the next tag."""
+def test_header_that_exceeds_its_parent_is_cut_off(tmp_path: Path) -> None:
+    """The last byte of a tag is the start of an element whose size is in the next tag."""
     depth = made.small_counts(2)
     made.make_mkv(tmp_path / "a.mkv", depth)
     data = (tmp_path / "a.mkv").read_bytes()
@@ -205,7 +205,7 @@ def test_real_capture(shared_data: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
     assert frame.depth.shape == (576, 640)
-    # The attachment is the file beside it, whose lens OpenCV projects by.
+    # The attachment equals the file beside it, with whose lens OpenCV projects.
     data = json.loads((folder / "calibration.json").read_text())
     parameters = data["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelParameters"]
     K, distortion = opencv_lens("NFOV_UNBINNED", parameters)
@@ -213,12 +213,12 @@ def test_real_capture(shared_data: Path) -> None:
     landed = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
     rows, columns = np.nonzero(frame.valid)
     assert np.abs(landed - np.stack([columns, rows], -1)[::50]).max() < 1e-2
-    # The back wall is flat, as a wrong lens would not have it.
+    # The back wall is flat, which it would not be with a wrong lens.
     wall = frame.point_image[395:450:2, 420:560:2].reshape(-1, 3).astype(float)
     wall = wall[wall[:, 2] > 0]
     normal = np.linalg.svd(wall - wall.mean(0), full_matrices=False)[2][2]
     assert np.abs((wall - wall.mean(0)) @ normal).mean() < 0.006
-    # Colour: the dark print on the near cup, and the bright wall behind it, are where they are.
+    # Colour: the dark print on the near cup, and the bright wall behind it, are in place.
     assert frame.color_image is not None
     assert isinstance(recording.source.color_camera, ColorCamera)  # type: ignore[attr-defined]
     assert frame.color_image[frame.valid].any(-1).mean() > 0.85
@@ -243,7 +243,7 @@ def test_real_capture(shared_data: Path) -> None:
     assert scores[best] > 0.3
 
 
-def test_modes_and_lenses_of_the_reader_are_the_documented_ones() -> None:
+def test_modes_of_reader_are_as_documented() -> None:
     for mode, (width, height, whole, left, top) in SIZES.items():
         window = azure_kinect.DEPTH_MODES[mode]
         assert window == azure_kinect.Window((whole, whole), (left, top), (width, height))

@@ -1,4 +1,4 @@
-"""Recordings in the layouts of TUM RGB-D and Open3D, and images as a pinhole camera sees them."""
+"""Recordings in the layouts of TUM RGB-D and Open3D, and rectified images."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def plane_depth(camera: object) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [BARREL, WIDE, RayTable(np.array(BARREL.rays()))])
-def test_a_plane_stays_a_plane(camera: object) -> None:
+def test_rectified_plane_stays_planar(camera: object) -> None:
     frame = RangeFrame(0, 0.0, camera, plane_depth(camera))  # type: ignore[arg-type]
     pinhole = pinhole_of(camera)  # type: ignore[arg-type]
     out = Rectifier(pinhole)(frame)
     points = points_from_z(pinhole, out.z)[out.valid].astype(float)
     assert len(points) > 0.8 * out.depth.size
-    # Taken from the nearest pixel without regard of its slope this would be centimetres.
+    # Taken from the nearest pixel regardless of its slope, the error would be centimetres.
     assert np.abs(points @ NORMAL - DISTANCE).max() < 1e-3
 
 
-def test_a_pinhole_stays_what_it_is() -> None:
+def test_pinhole_images_are_unchanged() -> None:
     pinhole = Pinhole(64, 48, 50.0, 50.0, 31.5, 23.5)
     assert pinhole_of(pinhole) is pinhole
     depth = np.random.default_rng(5).uniform(1, 3, (48, 64)).astype(np.float32)
@@ -50,7 +50,7 @@ def test_a_pinhole_stays_what_it_is() -> None:
     np.testing.assert_array_equal(out.z, frame.z)
 
 
-def test_jumps_are_not_smeared() -> None:
+def test_depth_edges_are_not_interpolated() -> None:
     depth = np.full((72, 96), 1.0, np.float32)
     depth[:, 50:] = 3.0
     depth[10:20, 10:20] = 0
@@ -60,7 +60,7 @@ def test_jumps_are_not_smeared() -> None:
     assert (~out.valid).sum() >= 80
 
 
-def test_a_wide_lens_is_cut_at_sixty_degrees() -> None:
+def test_wide_lens_is_cropped_at_sixty_degrees() -> None:
     pinhole = pinhole_of(WIDE)
     assert np.abs(pinhole.rays()).max() < 2.0
     assert np.abs(pinhole.rays()[..., 0]).max() > 1.0
@@ -116,7 +116,7 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
     assert np.allclose(back.reference[3][:3, 3], [0.3, 0, 0])
 
 
-def test_what_can_not_be_converted(tmp_path: Path) -> None:
+def test_unsupported_conversions_are_refused(tmp_path: Path) -> None:
     cloud = Recording.of(ArraySource([CloudFrame.of(np.ones((5, 3)))]), "made", "made")
     with pytest.raises(InputError, match="contains clouds"):
         convert_to(cloud, tmp_path / "a", "tum")

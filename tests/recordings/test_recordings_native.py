@@ -86,7 +86,7 @@ def test_round_trip(tmp_path: Path, camera: Camera, kind: str) -> None:
         assert isinstance(frame, RangeFrame)
         assert frame.depth_kind == kind
         assert frame.index == k
-        # Half a count of range moves z by no more.
+        # Half a count of range changes z by no more.
         np.testing.assert_allclose(frame.z, truth.z, atol=0.00025 + 1e-6)
         np.testing.assert_array_equal(frame.valid, truth.valid)
         np.testing.assert_array_equal(frame.amplitude_image, truth.amplitude_image)
@@ -143,7 +143,7 @@ def test_poses_tables_and_correction(tmp_path: Path) -> None:
     assert source.imu["t"].shape == (9,)
     assert source.frame_columns is not None
     assert source.frame_columns["integration_us"].tolist() == [100, 200, 300]
-    # The correction belongs to radial range, whatever is stored.
+    # The correction applies to radial range, whatever is stored.
     frame = source.read(0)
     assert isinstance(frame, RangeFrame)
     stored = RangeFrame(0, 0.0, PINHOLE, np.full((30, 40), 2.0, np.float32)).radial_range
@@ -192,7 +192,7 @@ def test_clouds(tmp_path: Path) -> None:
     assert len(NativeSource(tmp_path / "a").read(0)) == 50
 
 
-def test_color_of_another_camera_is_looked_up(tmp_path: Path) -> None:
+def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", 1)
     z = np.full((30, 40), 2.0)
     write_png(folder / "depth" / "000000.png", np.full((30, 40), 4000, np.uint16))
@@ -263,7 +263,7 @@ def test_unknown_keys_warn(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_fields_are_named(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+def test_invalid_fields_are_named(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     folder = write(tmp_path / "a", 1)
     edit(folder, **changes)
     with pytest.raises(InputError, match=words) as caught:
@@ -272,7 +272,7 @@ def test_bad_fields_are_named(tmp_path: Path, changes: dict[str, Any], words: st
     assert "\n" not in str(caught.value)
 
 
-def test_bad_color_transform(tmp_path: Path) -> None:
+def test_invalid_color_transform(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", 1)
     intrinsics = {"width": 40, "height": 30, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 2.0}
     for T in ([[1, 2]], (2 * np.eye(4)).tolist(), "T", None):
@@ -290,7 +290,7 @@ def test_broken_json(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["amplitude", "confidence", "color", "depth"])
-def test_counts_that_disagree(tmp_path: Path, name: str) -> None:
+def test_inconsistent_counts(tmp_path: Path, name: str) -> None:
     folder = write(tmp_path / "a")
     (folder / name / "000002.png").unlink()
     with pytest.raises(InputError, match=r"has 3 |has 4 "):
@@ -312,7 +312,7 @@ def test_counts_that_disagree(tmp_path: Path, name: str) -> None:
         ("rays.npy", "not a table", "rays.npy"),
     ],
 )
-def test_bad_files_beside_the_images(tmp_path: Path, name: str, text: str, words: str) -> None:
+def test_invalid_files_beside_images(tmp_path: Path, name: str, text: str, words: str) -> None:
     folder = write(tmp_path / "a")
     (folder / name).write_text(text)
     with pytest.raises(InputError, match=words):
@@ -329,7 +329,7 @@ def test_unsorted_and_repeated_timestamps_warn(tmp_path: Path) -> None:
     assert "frames 1 and 2 have the same timestamp" in NativeSource(folder).warnings[0]
 
 
-def test_rays_of_a_wrong_shape(tmp_path: Path) -> None:
+def test_rays_of_wrong_shape(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     np.save(folder / "rays.npy", np.zeros((30, 41, 2), np.float32))
     with pytest.raises(InputError, match=r"is 41 x 30, camera.json says 40 x 30"):
@@ -342,7 +342,7 @@ def test_rays_of_a_wrong_shape(tmp_path: Path) -> None:
         NativeSource(folder)
 
 
-def test_rays_that_mirror_the_image(tmp_path: Path) -> None:
+def test_rays_that_mirror_image(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     np.save(folder / "rays.npy", PINHOLE.rays() * np.array([1, -1], np.float32))
     with pytest.raises(InputError, match=r"mirror the image.*negate one") as caught:
@@ -359,7 +359,7 @@ def test_rays_override_the_lens(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.camera.rays(), rays)
 
 
-def test_a_header_of_rays_that_promises_more_than_the_file_holds(tmp_path: Path) -> None:
+def test_rays_with_forged_header(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     with (folder / "rays.npy").open("wb") as file:
         claim = {"descr": "<f4", "fortran_order": False, "shape": (30000, 4000000, 2)}
@@ -369,7 +369,7 @@ def test_a_header_of_rays_that_promises_more_than_the_file_holds(tmp_path: Path)
         NativeSource(folder)
 
 
-def test_a_correction_that_promises_more_than_there_is_memory(tmp_path: Path) -> None:
+def test_correction_with_forged_header(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     with zipfile.ZipFile(folder / "correction.npz", "w") as archive:
         for name in ("range_m", "bias_m"):
@@ -381,7 +381,7 @@ def test_a_correction_that_promises_more_than_there_is_memory(tmp_path: Path) ->
         NativeSource(folder)
 
 
-def test_a_bad_frame_is_its_own_trouble(tmp_path: Path) -> None:
+def test_damaged_frame_is_an_unreadable_frame(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     path = folder / "depth" / "000001.png"
     path.write_bytes(path.read_bytes()[:200])
@@ -394,9 +394,9 @@ def test_a_bad_frame_is_its_own_trouble(tmp_path: Path) -> None:
             source.read(k)
 
 
-def test_camera_of_other_images(tmp_path: Path) -> None:
+def test_camera_of_different_image_size(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
-    # The first image is cut off: the next readable one decides.
+    # The first image is truncated: the next readable one decides.
     (folder / "depth" / "000000.png").write_bytes(b"\x89PNG")
     edit(folder, width=80)
     with pytest.raises(InputError, match=r"camera.json states 80 x 30") as caught:
@@ -404,7 +404,7 @@ def test_camera_of_other_images(tmp_path: Path) -> None:
     assert not isinstance(caught.value, UnreadableFrameError)
 
 
-def test_given_camera_replaces_the_folder_s(tmp_path: Path) -> None:
+def test_given_camera_replaces_that_of_folder(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     other = tmp_path / "other.json"
     shutil.copy(folder / "camera.json", other)
@@ -419,7 +419,7 @@ def test_given_camera_replaces_the_folder_s(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.z, 2 * image(0).z, atol=0.001)
 
 
-def test_writer_refuses_what_would_not_read_back(tmp_path: Path) -> None:
+def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE)
     with pytest.raises(InputError, match="no frames"):
         writer.finish()
@@ -434,7 +434,7 @@ def test_writer_refuses_what_would_not_read_back(tmp_path: Path) -> None:
         writer.add(CloudFrame.of(np.zeros((3, 3))))
     with pytest.raises(InputError, match="poses"):
         writer.finish(groundtruth=np.zeros((2, 4, 4)))
-    # Interrupted here, the folder is no recording yet.
+    # At this point the folder is not a recording yet.
     with pytest.raises(InputError, match=r"camera\.json"):
         NativeSource(tmp_path / "a")
     writer.finish()
@@ -442,7 +442,7 @@ def test_writer_refuses_what_would_not_read_back(tmp_path: Path) -> None:
         RecordingWriter(tmp_path / "a", PINHOLE)
 
 
-def test_the_example_of_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_of_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (DOCS / "formats.md").read_text()
     code = page.split("```python\n")[1].split("```")[0]
     about = json.loads(page.split("```json\n")[1].split("```")[0])
@@ -454,7 +454,7 @@ def test_the_example_of_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert written == about
 
 
-def test_same_frames_same_bytes(tmp_path: Path) -> None:
+def test_same_frames_give_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write(tmp_path / name, camera=CAMERAS[4])
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))

@@ -39,7 +39,7 @@ def test_every_format_has_a_reader() -> None:
     assert names <= set(readers())
 
 
-def test_several_paths_are_joined_in_the_order_given(tmp_path: Path) -> None:
+def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     write(tmp_path / "a", [1, 2])
     write(tmp_path / "b", [3, 4, 5], poses=True)
     recording = open_recording(tmp_path / "b", tmp_path / "a")
@@ -52,7 +52,7 @@ def test_several_paths_are_joined_in_the_order_given(tmp_path: Path) -> None:
     assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
 
 
-def test_a_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
+def test_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
     for name, depth in (("part10", 3), ("part2", 2), ("part1", 1)):
         write(tmp_path / name, [depth])
     (tmp_path / "notes.txt").write_text("")
@@ -61,7 +61,7 @@ def test_a_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
     assert depths(open_recording(tmp_path).select(1)) == [2, 3]
 
 
-def test_recordings_of_different_formats_are_not_joined_unasked(tmp_path: Path) -> None:
+def test_recordings_of_different_formats_are_not_joined_by_default(tmp_path: Path) -> None:
     write(tmp_path / "a", [1])
     (tmp_path / "b").mkdir()
     write_ply(tmp_path / "b" / "0.ply", GeometryRecord(np.ones((3, 3))))
@@ -70,7 +70,7 @@ def test_recordings_of_different_formats_are_not_joined_unasked(tmp_path: Path) 
     assert open_recording(tmp_path / "a", tmp_path / "b").format == "native+ply"
 
 
-def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
+def test_ambiguous_format_is_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "0.ply", GeometryRecord(np.ones((3, 3))))
     (tmp_path / "0.xyz").write_text("1 2 3\n")
     with pytest.raises(InputError, match="--format ply or xyz"):
@@ -78,7 +78,7 @@ def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
     assert open_recording(tmp_path, format="xyz").format == "xyz"
 
 
-def test_a_cloud_beside_a_native_recording_is_passed_over(tmp_path: Path) -> None:
+def test_cloud_beside_native_recording_is_ignored(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
     write_ply(folder / "model.ply", GeometryRecord(np.ones((3, 3))))
     assert open_recording(folder).format == "native"
@@ -105,14 +105,14 @@ def test_limits_of_depth(tmp_path: Path) -> None:
         open_recording(folder, min_depth=2.0, max_depth=1.0)
 
 
-def test_a_result_is_no_recording(tmp_path: Path) -> None:
+def test_result_is_no_recording(tmp_path: Path) -> None:
     write_ply(tmp_path / "cloud.ply", GeometryRecord(np.ones((3, 3))))
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(InputError, match="a result of tofuse"):
         open_recording(tmp_path)
 
 
-def test_what_is_no_recording(tmp_path: Path) -> None:
+def test_paths_that_are_no_recordings(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     (tmp_path / "inside").mkdir()
@@ -143,14 +143,14 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(readers()))
-def test_a_format_asked_for_that_isn_t_there(tmp_path: Path, name: str) -> None:
+def test_requested_format_that_does_not_match(tmp_path: Path, name: str) -> None:
     (tmp_path / "a.docx").touch()
     for path in (tmp_path, tmp_path / "a.docx"):
         with pytest.raises(InputError):
             open_recording(path, format=name)
 
 
-def test_all_images_cut_off(tmp_path: Path) -> None:
+def test_all_images_truncated(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1, 2, 3])
     for path in (folder / "depth").iterdir():
         path.write_bytes(path.read_bytes()[:60])
@@ -161,7 +161,7 @@ def test_all_images_cut_off(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_first_frame_bad_others_good(tmp_path: Path) -> None:
+def test_unreadable_first_frame(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1, 2, 3])
     (folder / "depth" / "000000.png").write_bytes(b"")
     recording = open_recording(folder)
@@ -189,7 +189,7 @@ def test_permissions(tmp_path: Path) -> None:
 
 
 def test_permission_denied_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As above, for users whom permissions don't hold back."""
+    """As above, for users to whom permissions do not apply."""
     folder = write(tmp_path / "a", [1, 2])
 
     def deny(self: Path) -> bytes:
@@ -235,7 +235,7 @@ def test_frames_come_in_order_with_errors_in_place() -> None:
     assert reader_threads() == []
 
 
-def test_work_is_done_where_frames_are_read() -> None:
+def test_work_is_done_in_reader_thread() -> None:
     _, recording = counting(6, 3)
     found = list(recording.read_with(lambda f: (f.index, threading.current_thread().name), first=1))
     assert [work and work[0] for _, work in found] == [1, 2, None, 4, 5]
@@ -243,7 +243,7 @@ def test_work_is_done_where_frames_are_read() -> None:
     assert all(work is None or work[1].startswith("tofuse-reader") for _, work in found)
 
 
-def test_iteration_raises_when_it_is_the_bad_frame_s_turn() -> None:
+def test_iteration_raises_at_unreadable_frame() -> None:
     _, recording = counting(5, 3)
     iterator = iter(recording)
     assert [next(iterator).index for _ in range(3)] == [0, 1, 2]
@@ -251,7 +251,7 @@ def test_iteration_raises_when_it_is_the_bad_frame_s_turn() -> None:
         next(iterator)
 
 
-def test_reads_ahead_but_not_without_bound_and_stops_early() -> None:
+def test_read_ahead_is_bounded_and_stops_early() -> None:
     source, recording = counting(1000)
     iterator = recording.read_all(ahead=4)
     next(iterator)
@@ -260,7 +260,7 @@ def test_reads_ahead_but_not_without_bound_and_stops_early() -> None:
     assert reader_threads() == []
 
 
-def test_other_errors_come_through_the_thread() -> None:
+def test_other_errors_are_raised_from_thread() -> None:
     class Broken(Counting):
         def read(self, index: int) -> Frame:
             raise InputError("breaks down")
@@ -271,14 +271,14 @@ def test_other_errors_come_through_the_thread() -> None:
     assert reader_threads() == []
 
 
-def test_a_wrong_dtype_everywhere(tmp_path: Path) -> None:
+def test_wrong_dtype_of_all_frames(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
     write_png(folder / "depth" / "000000.png", np.ones((30, 40), np.uint8))
     with pytest.raises(InputError, match="store one channel of uint16"):
         open_recording(folder)
 
 
-def test_opening_leaves_the_recording_untouched(tmp_path: Path) -> None:
+def test_opening_leaves_recording_unchanged(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1, 2])
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     list(open_recording(folder))

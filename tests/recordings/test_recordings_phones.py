@@ -32,7 +32,7 @@ def test_scanner_app(tmp_path: Path) -> None:
     assert recording.warnings == ["only 1 of 3 frames have colour"]
 
 
-def test_scanner_app_takes_the_size_that_its_projection_tells(tmp_path: Path) -> None:
+def test_scanner_app_derives_image_size_from_projection(tmp_path: Path) -> None:
     made.make_scanner_app(tmp_path / "scan")
     for path in (tmp_path / "scan").glob("frame_*.json"):
         facts = json.loads(path.read_text())
@@ -46,7 +46,7 @@ def test_scanner_app_takes_the_size_that_its_projection_tells(tmp_path: Path) ->
     assert frame.camera.fx == pytest.approx(made.FX / 60)
 
 
-def test_scanner_app_skips_a_frame_without_its_json(tmp_path: Path) -> None:
+def test_scanner_app_skips_frame_without_json(tmp_path: Path) -> None:
     made.make_scanner_app(tmp_path / "scan")
     (tmp_path / "scan" / "frame_00001.json").write_text('{"time": 1}')
     recording = open_recording(tmp_path / "scan")
@@ -66,14 +66,14 @@ def test_stray(tmp_path: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
     check_lens(frame, made.FX, made.CX, made.CY)
-    # What the phone measures downwards in its own axes is upwards in those of the camera.
+    # x of the camera is y of the phone, and z is reversed.
     imu = recording.source.imu  # type: ignore[attr-defined]
     assert [imu[name].tolist() for name in ("ax", "ay", "az", "wz")] == [[-9.8], [0], [0], [-0.5]]
-    assert recording.gravity is not None  # but nothing was measured at the time of the frames
+    assert recording.gravity is not None  # but there are no samples at the times of the frames
     assert not np.isfinite(recording.gravity).any()
 
 
-def test_stray_with_video_and_a_lens_for_each_frame(tmp_path: Path) -> None:
+def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
     made.make_stray(tmp_path / "scan", lenses=True)
     size = (320, 240)
     path = str(tmp_path / "scan" / "rgb.mp4")
@@ -136,7 +136,7 @@ def test_r3d_archive(tmp_path: Path) -> None:
         open_recording(tmp_path / "scan.r3d")
 
 
-def test_a_camera_is_refused(tmp_path: Path) -> None:
+def test_camera_option_is_refused(tmp_path: Path) -> None:
     made.make_r3d(tmp_path / "scan.r3d")
     with pytest.raises(InputError, match="--camera"):
         open_recording(tmp_path / "scan.r3d", camera=tmp_path / "camera.json")
@@ -174,12 +174,12 @@ def test_real_recordings_agree_with_their_own_poses(
     turned = map_consistency(few, few.reference @ turn)
     assert poses.inlier_ratio > others
     for other in (still, mirrored, turned):
-        # Under wrong poses the views overlap less, or disagree.
+        # Under wrong poses the views overlap less, or are less consistent.
         assert 2 * other.pairs < poses.pairs or poses.rms_m < 0.85 * other.rms_m
 
 
-def test_real_depth_is_that_of_the_colour_image(shared_data: Path) -> None:
-    """Edges of depth and colour correlate best where they lie, so colour is registered."""
+def test_real_depth_is_registered_to_colour(shared_data: Path) -> None:
+    """Edges of depth and colour correlate best without a shift."""
     recording = open_recording(shared_data / "iphone_chair_3dscannerapp")
 
     def edges(image: np.ndarray) -> np.ndarray:
@@ -202,7 +202,7 @@ def test_real_depth_is_that_of_the_colour_image(shared_data: Path) -> None:
         assert max(scores, key=lambda shift: scores[shift]) == (0, 0)
 
 
-def test_folders_that_lack_something_are_not_taken_for_phones(tmp_path: Path) -> None:
+def test_incomplete_folders_are_not_taken_for_phones(tmp_path: Path) -> None:
     made.make_record3d(tmp_path / "scan")
     shutil.rmtree(tmp_path / "scan" / "rgb")
     assert open_recording(tmp_path / "scan")[0].color is None

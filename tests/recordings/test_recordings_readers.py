@@ -32,7 +32,7 @@ from tofuse.recordings.noise import family_of
 from tofuse.recordings.open import open_recording
 
 
-def test_sr4000_gives_the_vectors_themselves(tmp_path: Path) -> None:
+def test_sr4000_points_equal_stored_vectors(tmp_path: Path) -> None:
     z, rays = make_sr4000(tmp_path / "Y1")
     recording = open_recording(tmp_path / "Y1")
     assert recording.format == "sr4000"
@@ -65,7 +65,7 @@ def test_sr4000_stations_are_joined_in_name_order(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.z[frame.valid], z2[0][frame.valid], atol=1e-6)
 
 
-def test_sr4000_frame_that_is_cut_off(tmp_path: Path) -> None:
+def test_sr4000_truncated_frame(tmp_path: Path) -> None:
     make_sr4000(tmp_path / "Y1")
     path = tmp_path / "Y1" / "frm_0002.dat"
     path.write_text(path.read_text()[:2000])
@@ -100,7 +100,7 @@ def test_tum(tmp_path: Path) -> None:
     assert third.camera == BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6)
 
 
-def test_tum_asks_for_the_camera_of_an_unknown_name(tmp_path: Path) -> None:
+def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
     make_tum(tmp_path / "living_room")
     with pytest.raises(InputError, match="--camera"):
         open_recording(tmp_path / "living_room")
@@ -121,7 +121,7 @@ def test_tum_asks_for_the_camera_of_an_unknown_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "line", ["1.0 ../../secret.png", "1.0 /etc/passwd", "1.0", "x depth/a.png"]
 )
-def test_tum_list_with_a_bad_line(tmp_path: Path, line: str) -> None:
+def test_tum_list_with_invalid_line(tmp_path: Path, line: str) -> None:
     make_tum(tmp_path / "freiburg1")
     (tmp_path / "freiburg1" / "depth.txt").write_text(line + "\n")
     with pytest.raises(InputError, match=r"depth\.txt, line 1"):
@@ -193,7 +193,7 @@ def test_redwood(tmp_path: Path, color: str) -> None:
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
 
 
-def test_redwood_with_some_colour_or_other_names(tmp_path: Path) -> None:
+def test_redwood_with_partial_colour_or_other_names(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "color" / "000001.png").unlink()
     recording = open_recording(tmp_path, format="redwood")
@@ -210,7 +210,7 @@ def test_redwood_with_some_colour_or_other_names(tmp_path: Path) -> None:
     assert any("their names don't show which belong together" in w for w in recording.warnings)
 
 
-def test_redwood_without_a_camera_is_unsure(tmp_path: Path) -> None:
+def test_redwood_without_camera_is_ambiguous(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "trajectory.log").unlink()
     with pytest.raises(InputError, match="--format redwood"):
@@ -218,7 +218,7 @@ def test_redwood_without_a_camera_is_unsure(tmp_path: Path) -> None:
     assert len(open_recording(tmp_path, format="redwood")) == 3
 
 
-def test_redwood_with_a_damaged_log_or_camera(tmp_path: Path) -> None:
+def test_redwood_with_damaged_log_or_camera(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     log = (tmp_path / "trajectory.log").read_text()
     for text, words in (
@@ -236,7 +236,7 @@ def test_redwood_with_a_damaged_log_or_camera(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
-def test_organised_pcd_becomes_an_image(tmp_path: Path) -> None:
+def test_organised_pcd_becomes_image(tmp_path: Path) -> None:
     truth = [pcd_points(CAMERA, k) for k in range(3)]
     for k, points in enumerate(truth):
         intensity = np.arange(1200.0)
@@ -262,11 +262,11 @@ def test_organised_pcd_becomes_an_image(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference[2][:3, 3], [1, 2, 3])
 
 
-def test_organised_pcd_of_a_bent_lens_keeps_a_table(tmp_path: Path) -> None:
+def test_organised_pcd_with_distortion_has_ray_table(tmp_path: Path) -> None:
     lens = BrownConrady(40, 30, 35.0, 36.0, 19.5, 14.5, -0.1, 0.02)
     truth = pcd_points(lens, 1)
     (tmp_path / "a.pcd").write_bytes(pcd_bytes(truth))
-    # A second file sees pixels that the first doesn't.
+    # A second file has pixels that the first lacks.
     (tmp_path / "b.pcd").write_bytes(pcd_bytes(pcd_points(lens, 2)))
     frame = open_recording(tmp_path)[0]
     assert isinstance(frame, RangeFrame)
@@ -276,7 +276,7 @@ def test_organised_pcd_of_a_bent_lens_keeps_a_table(tmp_path: Path) -> None:
     assert np.isfinite(frame.camera.rays()).all(-1).mean() > 0.85
 
 
-def test_pcd_that_is_no_image_stays_a_cloud(tmp_path: Path) -> None:
+def test_unorganised_pcd_stays_cloud(tmp_path: Path) -> None:
     points = np.random.default_rng(3).normal(size=(30, 40, 3))
     (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
     frame = open_recording(tmp_path / "a.pcd")[0]
@@ -289,10 +289,10 @@ def test_pcd_that_is_no_image_stays_a_cloud(tmp_path: Path) -> None:
     assert frame.origin.tolist() == [1, 2, 3]
 
 
-def test_pcd_of_another_camera_among_them(tmp_path: Path) -> None:
+def test_pcd_of_another_camera_is_unreadable(tmp_path: Path) -> None:
     for k in range(12):
         (tmp_path / f"{k}.pcd").write_bytes(pcd_bytes(pcd_points(CAMERA, k)))
-    # Not among the files that are looked at first.
+    # Not among the files that are inspected first.
     other = Pinhole(40, 30, 60.0, 60.0, 19.5, 14.5)
     (tmp_path / "11.pcd").write_bytes(pcd_bytes(pcd_points(other, 11)))
     recording = open_recording(tmp_path)
@@ -303,7 +303,7 @@ def test_pcd_of_another_camera_among_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [3e38, -3e38, 1e20, 1e-40, 0.0, np.inf])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_absurd_numbers_in_an_organised_pcd(tmp_path: Path, value: float, axis: int) -> None:
+def test_absurd_numbers_in_organised_pcd(tmp_path: Path, value: float, axis: int) -> None:
     for count in (1, 1200):
         points = pcd_points(CAMERA, 1)
         points.reshape(-1, 3)[:count, axis] = value
@@ -312,7 +312,7 @@ def test_absurd_numbers_in_an_organised_pcd(tmp_path: Path, value: float, axis: 
         assert (np.abs(frame.points) < 1e9).all()
 
 
-def test_a_file_that_only_claims_to_be_pcd(tmp_path: Path) -> None:
+def test_text_file_named_pcd_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_text("This is no point cloud.\n" * 100)
     with pytest.raises(InputError, match="is not a PCD file"):
         open_recording(tmp_path / "a.pcd")
@@ -369,7 +369,7 @@ def test_xyz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
-def test_map_coordinates_keep_their_millimetres(tmp_path: Path, suffix: str) -> None:
+def test_map_coordinates_keep_millimetre_precision(tmp_path: Path, suffix: str) -> None:
     """All clouds of a folder, and their poses, are shifted by the same whole kilometres."""
     rng = np.random.default_rng(5)
     clouds = np.array([500_000.123, 4_000_000.456, 3]) + rng.uniform(-3, 3, (2, 40, 3))
@@ -424,13 +424,13 @@ def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
     np.testing.assert_array_equal(recording.odometry[0], np.eye(4))
     T = recording.odometry[1]
     np.testing.assert_allclose(T[:3, 3], [1, -0.5, -2])
-    # 3DTK turns z forward into x right at +90 degrees about y.
+    # 3DTK rotates z forward to x right at +90 degrees about y.
     np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-15)
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
     assert "not ground truth" in recording.warnings[0]
 
 
-def test_slam6d_pose_that_is_none(tmp_path: Path) -> None:
+def test_slam6d_with_invalid_pose(tmp_path: Path) -> None:
     for k in range(2):
         (tmp_path / f"scan{k:03d}.3d").write_text("1 2 3\n")
         (tmp_path / f"scan{k:03d}.pose").write_text("1 2 3\n4 5 6\n" if k else "1 2 3\n")
@@ -440,7 +440,7 @@ def test_slam6d_pose_that_is_none(tmp_path: Path) -> None:
     assert "scan000.pose" in recording.warnings[0]
 
 
-def test_camera_means_nothing_for_clouds(tmp_path: Path) -> None:
+def test_camera_option_is_refused_for_clouds(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((3, 3))))
     with pytest.raises(InputError, match="--camera"):
         open_recording(tmp_path / "a.ply", camera=tmp_path / "camera.json")

@@ -19,7 +19,7 @@ from tofuse.recordings.recording import Recording
 
 
 def sr4000_blocks(path: Path) -> list[np.ndarray]:
-    """Parse the export in the plainest way."""
+    """Parse the export literally."""
     blocks: list[list[list[float]]] = []
     for line in path.read_text().splitlines():
         if line.startswith("%"):
@@ -30,7 +30,7 @@ def sr4000_blocks(path: Path) -> list[np.ndarray]:
 
 
 def overlap(recording: Recording, a: int, b: int, T_a_b: np.ndarray, near: float) -> float:
-    """Share of points of frame b that lie near points of frame a."""
+    """Fraction of points of frame b that are near points of frame a."""
     tree = cKDTree(recording[a].points)
     return float((tree.query(transform(T_a_b, recording[b].points[::20]))[0] < near).mean())
 
@@ -57,7 +57,7 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     assert step == pytest.approx(0.305, abs=0.03)
 
 
-def test_kinectv2_clouds_are_the_images(shared_data: Path) -> None:
+def test_kinectv2_clouds_match_images(shared_data: Path) -> None:
     native = open_recording(shared_data / "kinectv2_loop" / "recording")
     clouds = open_recording(shared_data / "kinectv2_loop" / "pcd")
     assert (native.format, len(native)) == ("native", 17)
@@ -147,7 +147,7 @@ def test_lidar_pair_gt(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["kinectv2_loop", "pose_graphs"])
-def test_what_is_not_known_is_refused(shared_data: Path, name: str) -> None:
+def test_unknown_formats_are_refused(shared_data: Path, name: str) -> None:
     with pytest.raises(InputError, match=name):
         open_recording(shared_data / name)
 
@@ -171,7 +171,7 @@ def test_what_is_not_known_is_refused(shared_data: Path, name: str) -> None:
         ("slam6d_scans", "slam6d", None),
     ],
 )
-def test_every_folder_opens_unasked_and_is_described(
+def test_every_folder_opens_without_options_and_is_described(
     shared_data: Path, name: str, format_: str, sensor: str | None
 ) -> None:
     recording = open_recording(shared_data / name)
@@ -180,7 +180,7 @@ def test_every_folder_opens_unasked_and_is_described(
     assert facts["format"] == format_
     if sensor is not None:
         assert sensor in facts["sensor"]
-    # Metres: what lies before the camera is between a hand's breadth and a large hall.
+    # Metres: the typical depth is between a hand's breadth and a large hall.
     median = float(facts["depth"].rsplit(" ", 2)[1])
     assert 0.2 < median < 30
     if format_ not in ("ply", "slam6d"):

@@ -27,7 +27,7 @@ def made() -> Rig:
     )
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_round_trip(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", made())
     read = read_rig(tmp_path / "rig.json")
     assert read.to_dict() == made().to_dict()
@@ -49,7 +49,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         (lambda d: d["disagreement"][0].update(a="top"), "does not name two cameras"),
     ],
 )
-def test_what_makes_no_sense_is_refused(tmp_path: Path, change, said: str) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, change, said: str) -> None:
     data = made().to_dict()
     change(data)
     path = tmp_path / "rig.json"
@@ -59,7 +59,7 @@ def test_what_makes_no_sense_is_refused(tmp_path: Path, change, said: str) -> No
     assert "\n" not in str(error.value)
 
 
-def test_a_depth_offset_is_along_the_ray() -> None:
+def test_depth_offset_is_along_ray() -> None:
     from tofuse.geometry.cameras import Pinhole
     from tofuse.recordings.frames import RangeFrame
 
@@ -70,7 +70,7 @@ def test_a_depth_offset_is_along_the_ray() -> None:
     assert with_range_added(frame, 0.0) is frame
 
 
-def test_a_rig_is_not_changed_by_names() -> None:
+def test_cameras_are_found_by_name() -> None:
     rig = made()
     assert rig.camera("right") is rig.cameras[1]
     assert rig.camera("none") is None

@@ -118,8 +118,8 @@ def test_clouds(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.amplitude, light[keep])
 
 
-def test_organised_clouds_are_images(tmp_path: Path) -> None:
-    """Clouds in rows and columns that lie on a camera's rays keep the grid, and get the camera."""
+def test_organised_clouds_become_images(tmp_path: Path) -> None:
+    """Organised clouds on the rays of a camera keep the grid, and get the camera."""
     bag = Bag(tmp_path, "ros2")
     z = RNG.uniform(1, 3, (4, 12, 16)).astype(np.float32)
     z[:, 2, 3] = np.nan
@@ -138,7 +138,7 @@ def test_organised_clouds_are_images(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, light[k].reshape(12, 16))
 
 
-def test_infrared_of_the_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
+def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.info("/camera/depth/camera_info")
     bright = RNG.integers(0, 4000, (3, 12, 16)).astype(np.uint16)
@@ -155,7 +155,7 @@ def test_infrared_of_the_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, expected)
 
 
-def test_the_topic_can_be_chosen(tmp_path: Path) -> None:
+def test_topic_can_be_chosen(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info("/a/depth/camera_info")
     bag.info("/b/depth/camera_info")
@@ -173,7 +173,7 @@ def test_the_topic_can_be_chosen(tmp_path: Path) -> None:
 
 
 def expected_colors(z: np.ndarray, T: np.ndarray, lens: Pinhole = COLOR_LENS) -> np.ndarray:
-    """Colour (12, 16, 3) of each depth pixel, black where nearer points cover it, one by one."""
+    """Colour (12, 16, 3) of each depth pixel, black where occluded, pixel by pixel."""
     v, u = np.mgrid[:12, :16]
     points = np.stack([(u - 7.5) / 20 * z, (v - 5.5) / 21 * z, z], -1) @ T[:3, :3].T + T[:3, 3]
     uv = np.nan_to_num(lens.project(points), nan=-1)
@@ -190,9 +190,9 @@ def expected_colors(z: np.ndarray, T: np.ndarray, lens: Pinhole = COLOR_LENS) ->
 
 
 def check_colors(found: np.ndarray | None, expected: np.ndarray, off: int = 0) -> None:
-    """Where both say a colour, it is the same; most of what is seen is coloured, hidden parts not.
+    """Colours that both have are equal; most visible pixels have colour, occluded ones do not.
 
-    What is hidden depends on how wide a point is taken to be, so single pixels may differ there.
+    Occlusion depends on the assumed size of points, so single pixels may differ.
     """
     assert found is not None
     both = found.any(-1) & expected.any(-1)
@@ -234,9 +234,7 @@ def test_realsense_stereo_and_lenses(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(("kind", "encoding", "off"), [
     ("ros1", "rgb8", 0), ("ros1", "bgra8", 0), ("ros1", "yuyv", 12), ("ros2", "rgb8", 0),
 ])  # fmt: skip
-def test_realsense_color_is_that_of_each_point(
-    tmp_path: Path, kind: str, encoding: str, off: int
-) -> None:
+def test_realsense_color_matches_points(tmp_path: Path, kind: str, encoding: str, off: int) -> None:
     path = real_sense(tmp_path, kind, "None", name="Intel RealSense D435", color=encoding)
     recording = open_recording(path)
     assert recording.warnings == []
@@ -250,7 +248,7 @@ def test_realsense_color_is_that_of_each_point(
     assert without.color_image is None
 
 
-def test_realsense_color_through_an_inverse_lens(tmp_path: Path) -> None:
+def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
     """The lens maps pixels to rays; projection must map each ray back to its pixel."""
     k = (0.12, -0.05, 0.002, -0.001, 0.01)
     name = "Intel RealSense D455"
@@ -266,7 +264,7 @@ def test_realsense_color_through_an_inverse_lens(tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.project(points), np.stack([COLOR_U, COLOR_V], -1), atol=0.1)
 
 
-def test_color_without_its_place_is_left_out(tmp_path: Path) -> None:
+def test_orbbec_color_without_pose_is_ignored(tmp_path: Path) -> None:
     recording = open_recording(orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=np.zeros((3, 3))))
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
@@ -275,8 +273,8 @@ def test_color_without_its_place_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])
-def test_orbbec_color_is_that_of_each_point(tmp_path: Path, encoding: str, off: int) -> None:
-    R = T_COLOR[:3, :3] * 0.999  # as it is stored
+def test_orbbec_color_matches_points(tmp_path: Path, encoding: str, off: int) -> None:
+    R = T_COLOR[:3, :3] * 0.999  # as stored
     frame = open_recording(orbbec(tmp_path, (0.0,) * 8, color=encoding, R=R))[2]
     assert isinstance(frame, RangeFrame)
     check_colors(frame.color_image, expected_colors(STEP * 0.00025, T_COLOR), off)
@@ -297,7 +295,7 @@ def test_orbbec_bags(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("maker", ["realsense", "orbbec"])
-def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
+def test_damaged_bags_of_manufacturers(tmp_path: Path, maker: str) -> None:
     if maker == "realsense":
         path = real_sense(tmp_path, "ros1", "None", name="Intel RealSense L515", color="yuyv")
     else:
@@ -312,7 +310,7 @@ def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
     assert seen[1] + seen[2] > 0
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_missing_topics_are_named(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
     with pytest.raises(InputError, match=r"has no CameraInfo for .*; pass .* --camera"):
@@ -327,7 +325,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_damage_gives_only_our_errors(tmp_path: Path, kind: str) -> None:
+def test_damage_raises_only_package_errors(tmp_path: Path, kind: str) -> None:
     bag = Bag(tmp_path, kind)
     bag.info("/camera/depth/camera_info")
     for k in range(3):
@@ -372,9 +370,7 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_folders_that_rosbags_would_not_finish_reading_are_rejected(
-    tmp_path: Path, name: str
-) -> None:
+def test_hostile_folders_are_rejected(tmp_path: Path, name: str) -> None:
     bag = Bag(tmp_path, "ros2")
     bag.info("/camera/depth/camera_info")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
@@ -442,7 +438,7 @@ def test_compressed_files(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyP
             open_recording(path, format=format_)
         assert list(temporary.iterdir()) == []
 
-    # A small file that is listed many times is limited as well.
+    # A small file that is listed many times is limited, too.
     file.write_bytes(content)
     metadata = path / "metadata.yaml"
     text = metadata.read_text()
@@ -466,7 +462,7 @@ def test_no_space_for_decompressed_files(tmp_path: Path, monkeypatch: pytest.Mon
         open_recording(path)
 
 
-def test_chunks_that_expand_too_much_together_are_rejected(
+def test_chunks_with_excessive_total_size_are_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chunks with forged times would all be in memory at once."""
@@ -493,9 +489,7 @@ DATABASES = {
 
 
 @pytest.mark.parametrize("name", DATABASES)
-def test_databases_whose_queries_yield_more_rows_than_messages_are_rejected(
-    tmp_path: Path, name: str
-) -> None:
+def test_databases_with_excessive_rows_are_rejected(tmp_path: Path, name: str) -> None:
     bag = Bag(tmp_path, "ros2")
     depth_bag(bag)
     path = bag.close()
@@ -508,7 +502,7 @@ def test_databases_whose_queries_yield_more_rows_than_messages_are_rejected(
             open_recording(each)
 
 
-def test_other_users_of_rosbags_keep_its_decompressors() -> None:
+def test_decompressors_of_rosbags_are_unchanged() -> None:
     mcap = pytest.importorskip("rosbags.rosbag2.storage_mcap")
     limits = bounded_bags()
     assert set(limits._mcap.DECOMPRESSORS) == set(mcap.DECOMPRESSORS)
@@ -517,7 +511,7 @@ def test_other_users_of_rosbags_keep_its_decompressors() -> None:
         assert limits._mcap.DECOMPRESSORS[name].__module__ == limits.__name__
 
 
-def test_without_rosbags_it_is_said_how_to_get_it(
+def test_missing_rosbags_is_reported_with_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
@@ -549,15 +543,15 @@ def depth_bag(bag: Bag) -> None:
 
 
 def color_at(k: int) -> np.ndarray:
-    """The column and the row as red and green, the number of the frame as blue."""
+    """The column and the row as red and green, the frame index as blue."""
     v, u = np.mgrid[0:24, 0:32]
     return np.stack([8 * u, 10 * v, np.full_like(u, 50 + k)], -1).astype(np.uint8)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("compressed", [False, True])
-def test_colour_of_a_camera_beside(tmp_path: Path, kind: str, compressed: bool) -> None:
-    """By tf_static, with frames between; each point takes the colour of where it lands."""
+def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) -> None:
+    """Posed by tf_static, over intermediate frames; each point has the colour at its projection."""
     bag = Bag(tmp_path, kind)
     depth_bag(bag)
     bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
@@ -590,7 +584,7 @@ def test_colour_of_a_camera_beside(tmp_path: Path, kind: str, compressed: bool) 
         assert (frame.color_image[seen][:, 2] == 50 + k).all()
 
 
-def test_colour_at_the_pixels_of_depth(tmp_path: Path) -> None:
+def test_colour_registered_to_depth(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros2")
     topic = "/camera/aligned_depth_to_color/image_raw"
     bag.info("/camera/aligned_depth_to_color/camera_info", D=())
@@ -602,7 +596,7 @@ def test_colour_at_the_pixels_of_depth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.color_image, image)
 
 
-def test_colour_without_a_place_is_left_out(tmp_path: Path) -> None:
+def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros2")
     depth_bag(bag)
     bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
@@ -614,14 +608,14 @@ def test_colour_without_a_place_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_poses_by_tf(tmp_path: Path, kind: str) -> None:
-    """Odometry below a map that corrects it; between two messages a frame moves evenly."""
+def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
+    """Odometry below a map that corrects it; poses are interpolated between messages."""
     bag = Bag(tmp_path, kind)
     depth_bag(bag)
     slash = "/" if kind == "ros1" else ""
     bag.tf("/tf_static", 9.0, f"{slash}base_link", f"{slash}depth", T_RIG_DEPTH)
     T_MAP_ODOM = exp(np.array([1.0, 2.0, 0.5, 0.0, 0.0, 0.4]))
-    for k, T in enumerate(T_WORLD_RIG):  # at 9.95, 10.05, 10.15: halfway; the last frame has none
+    for k, T in enumerate(T_WORLD_RIG):  # at 9.95, 10.05, 10.15: interpolated; the last has none
         bag.tf("/tf", 9.95 + 0.1 * k, "odom", "base_link", T)
         bag.tf("/tf", 9.95 + 0.1 * k, "map", "odom", T_MAP_ODOM)
     recording = open_recording(bag.close())
@@ -637,8 +631,8 @@ def test_poses_by_tf(tmp_path: Path, kind: str) -> None:
     assert np.isnan(recording.odometry[2]).all()
 
 
-def test_transforms_that_make_no_sense(tmp_path: Path) -> None:
-    """A loop of frames, a quaternion of no length, and a still tree: no poses, and no trouble."""
+def test_invalid_transforms_are_ignored(tmp_path: Path) -> None:
+    """A loop of frames, a zero quaternion, and a static tree: no poses, and no error."""
     bag = Bag(tmp_path, "ros2")
     depth_bag(bag)
     bag.tf("/tf", 10.0, "depth", "a", np.eye(4))

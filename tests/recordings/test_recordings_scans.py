@@ -45,8 +45,8 @@ def test_sens(tmp_path: Path, depth: str, color: str) -> None:
     assert np.isnan(reference[1]).all()  # lost
 
 
-def test_sens_color_is_seen_from_its_own_camera(tmp_path: Path) -> None:
-    """A point at the depth camera's left edge is out of sight of a camera to its right."""
+def test_sens_color_is_projected_from_its_own_camera(tmp_path: Path) -> None:
+    """A point at the depth camera's left edge is not visible to a camera to its right."""
     make_sens(tmp_path / "scene.sens", color="raw")
     frame = image(tofuse.open(tmp_path / "scene.sens"), 0)
     assert frame.color_image is not None
@@ -58,7 +58,7 @@ def test_sens_color_is_seen_from_its_own_camera(tmp_path: Path) -> None:
     assert not frame.color_image[v, u][outside].any()
 
 
-def test_sens_cut_off_keeps_whole_frames(tmp_path: Path) -> None:
+def test_truncated_sens_keeps_complete_frames(tmp_path: Path) -> None:
     path = tmp_path / "scene.sens"
     make_sens(path)
     path.write_bytes(path.read_bytes()[:-200])
@@ -67,7 +67,7 @@ def test_sens_cut_off_keeps_whole_frames(tmp_path: Path) -> None:
     assert any("cut off after 2 of 3" in w for w in recording.warnings)
 
 
-def test_sens_refusals(tmp_path: Path) -> None:
+def test_invalid_sens_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.sens"
     make_sens(path, depth="occi")
     with pytest.raises(InputError, match="compressed by method 2"):
@@ -81,7 +81,7 @@ def test_sens_refusals(tmp_path: Path) -> None:
         tofuse.open(path)
 
 
-def test_sens_zip_bomb_is_one_bad_frame(tmp_path: Path) -> None:
+def test_sens_zip_bomb_is_one_unreadable_frame(tmp_path: Path) -> None:
     """Depth that decompresses to more than the image size is not decompressed."""
     import zlib
 
@@ -122,7 +122,7 @@ def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(frame.color, RGB)
 
 
-def test_las_of_our_own_comes_back(tmp_path: Path) -> None:
+def test_exported_las_is_read_back(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     write_las(tmp_path / "a.las", GeometryRecord(POINTS, color=RGB))
     frame = tofuse.open(tmp_path / "a.las")[0]
@@ -132,7 +132,7 @@ def test_las_of_our_own_comes_back(tmp_path: Path) -> None:
     assert frame.amplitude is None
 
 
-def test_coordinates_of_maps_keep_their_millimetres(tmp_path: Path) -> None:
+def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
     """Easting and northing exceed float32 precision: they are shifted, with a warning."""
     laspy = pytest.importorskip("laspy")
     where = np.array([453_210.0, 5_411_870.0, 300.0])
@@ -149,7 +149,7 @@ def test_coordinates_of_maps_keep_their_millimetres(tmp_path: Path) -> None:
     assert any("minus (453000, 5412000, 0) m" in w for w in recording.warnings)
 
 
-def test_las_with_too_large_a_point_count(tmp_path: Path) -> None:
+def test_las_with_excessive_point_count(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     write_las(tmp_path / "a.las", GeometryRecord(POINTS))
     data = bytearray((tmp_path / "a.las").read_bytes())
@@ -159,7 +159,7 @@ def test_las_with_too_large_a_point_count(tmp_path: Path) -> None:
         tofuse.open(tmp_path / "a.las")[0]
 
 
-def test_las_with_too_large_a_record_count(tmp_path: Path) -> None:
+def test_las_with_excessive_record_count(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     write_las(tmp_path / "a.las", GeometryRecord(POINTS))
     content = (tmp_path / "a.las").read_bytes()
@@ -171,7 +171,7 @@ def test_las_with_too_large_a_record_count(tmp_path: Path) -> None:
             tofuse.open(tmp_path / "a.las")
 
 
-def test_las_far_from_its_own_bounds(tmp_path: Path) -> None:
+def test_las_with_wrong_bounds(tmp_path: Path) -> None:
     """The shift of its points is derived from the bounds in the header, which are wrong here."""
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(version="1.2", point_format=0)

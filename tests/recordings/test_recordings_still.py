@@ -29,7 +29,7 @@ V, U = np.mgrid[0:96, 0:120]
 
 
 def scene(shift_m: float = 0.0, box_at: int | None = None) -> np.ndarray:
-    """Return ranges of a wavy wall, from a camera that moved back, perhaps with a box before it."""
+    """Ranges of a wavy wall, from a camera shifted backwards, perhaps with a box before it."""
     depth = 2.0 + 0.3 * np.sin(U / 15) * np.cos(V / 20) + shift_m
     if box_at is not None:
         depth[30:70, box_at : box_at + 30] = 1.4
@@ -48,7 +48,7 @@ def recording_of(frames: list) -> Recording:
     return Recording.of(ArraySource(frames, poses), "made", "made")
 
 
-def test_noise_is_no_motion_however_strong() -> None:
+def test_noise_is_not_motion() -> None:
     for sigma in (0.0005, 0.02, 0.3):
         a, b = shot(0, scene(), sigma), shot(1, scene(), sigma)
         motion = change_between(a, b, MODEL)
@@ -56,15 +56,15 @@ def test_noise_is_no_motion_however_strong() -> None:
         assert not motion.identical
 
 
-def test_motion_is_seen_far_below_the_noise_of_a_pixel() -> None:
+def test_motion_below_pixel_noise_is_detected() -> None:
     assert not change_between(shot(0, scene()), shot(1, scene(0.4 * SIGMA)), MODEL).still
-    # With a better camera, a smaller one.
+    # With a better camera, even smaller motion.
     better = 0.1 * SIGMA
     a, b = shot(0, scene(), better), shot(1, scene(0.4 * better), better)
     assert not change_between(a, b, MODEL).still
 
 
-def test_noise_that_neighbours_share_is_still_noise() -> None:
+def test_correlated_noise_is_not_motion() -> None:
     def smooth(frame: RangeFrame) -> RangeFrame:
         padded = np.pad(frame.depth, 1, "edge")
         mean = sum(padded[i : i + 96, j : j + 120] for i in range(3) for j in range(3)) / 9
@@ -73,12 +73,12 @@ def test_noise_that_neighbours_share_is_still_noise() -> None:
     assert change_between(smooth(shot(0, scene())), smooth(shot(1, scene())), MODEL).still
 
 
-def test_a_thing_that_moves_before_a_still_wall_is_motion() -> None:
+def test_object_moving_before_static_wall_is_motion() -> None:
     assert change_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=20)), MODEL).still
     assert not change_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=50)), MODEL).still
 
 
-def test_amplitude_shows_a_camera_sliding_along_a_flat_wall() -> None:
+def test_amplitude_reveals_motion_along_flat_wall() -> None:
     wall = np.full((96, 120), 2.0)
 
     def seen(k: int, slide_px: float, exposure: float = 1.0) -> RangeFrame:
@@ -92,7 +92,7 @@ def test_amplitude_shows_a_camera_sliding_along_a_flat_wall() -> None:
     assert not change_between(seen(0, 0), seen(1, 1), MODEL).still
 
 
-def test_copies_and_frames_that_show_nothing() -> None:
+def test_identical_and_empty_frames() -> None:
     a = shot(0, scene())
     assert change_between(a, a, MODEL).identical
     empty = replace(a, depth=np.zeros_like(a.depth))
@@ -101,7 +101,7 @@ def test_copies_and_frames_that_show_nothing() -> None:
     assert not change_between(a, other, MODEL).still
 
 
-def test_stretches_have_no_gaps_and_slow_motion_cannot_add_up() -> None:
+def test_intervals_are_contiguous_and_slow_motion_is_detected() -> None:
     shifts = [0, 0, 0, 0, 0.1, 0.2, 0.3, 0.3, 0.3]
     frames = [shot(k, scene(s)) for k, s in enumerate(shifts)]
     assert stationary_intervals(recording_of(frames), MODEL) == [(0, 4), (4, 5), (5, 6), (6, 9)]
@@ -112,7 +112,7 @@ def test_stretches_have_no_gaps_and_slow_motion_cannot_add_up() -> None:
     assert found[-1][1] == 40
 
 
-def test_clouds_and_unreadable_frames_stand_alone() -> None:
+def test_clouds_and_unreadable_frames_are_separate() -> None:
     class Broken(ArraySource):
         def read(self, index: int) -> RangeFrame | CloudFrame:
             if index == 2:
@@ -131,7 +131,7 @@ def test_clouds_and_unreadable_frames_stand_alone() -> None:
     assert len(average_still(clouds)[2]) == 3
 
 
-def test_averaging_makes_noise_fall_with_the_root_and_says_so() -> None:
+def test_averaging_reduces_noise_and_sigma() -> None:
     frames = [shot(k, scene()) for k in range(16)]
     averaged = average_still(recording_of(frames), MODEL)
     assert len(averaged) == 1
@@ -160,14 +160,14 @@ def test_averaging_keeps_times_poses_and_moving_frames() -> None:
     np.testing.assert_array_equal(average_still(selected, MODEL).timestamps, [0.5])
 
 
-def test_outliers_and_rare_pixels() -> None:
+def test_outliers_and_rarely_valid_pixels() -> None:
     frames = [shot(k, scene()) for k in range(6)]
     for k, frame in enumerate(frames):
         depth = frame.depth.copy()
         if k == 2:
             depth[0, 0] += 1.5  # a flying pixel
         if k > 1:
-            depth[0, 1] = 0  # seen in two of six
+            depth[0, 1] = 0  # valid in two of six
         if k > 2:
             depth[0, 2] = 0  # in three of six
         depth[0, 3] = 0
@@ -182,13 +182,13 @@ def test_outliers_and_rare_pixels() -> None:
     assert (frame.sigma_image[0, [1, 3]] == 0).all()
 
 
-def test_noise_that_the_model_does_not_know_is_averaged_all_the_same() -> None:
+def test_noise_above_model_is_averaged_too() -> None:
     frames = [shot(k, scene(), 5 * SIGMA) for k in range(16)]
     error = average_of(frames, MODEL).radial_range - scene()
     assert error.std() == pytest.approx(5 * SIGMA / 4, rel=0.15)
 
 
-def test_copies_make_nothing_better() -> None:
+def test_identical_frames_do_not_reduce_sigma() -> None:
     first, second = shot(0, scene()), shot(1, scene())
     frame = average_of([first, first, second, second, second], MODEL)
     assert frame.sigma_image is not None
@@ -226,7 +226,7 @@ def test_channels() -> None:
     assert (frame.color_image == 15).all()
 
 
-def test_long_stretches_cost_bounded_memory() -> None:
+def test_memory_of_long_intervals_is_bounded() -> None:
     frames = [shot(k, scene()) for k in range(60)]
     averaged = average_still(recording_of(frames), MODEL)
     frame = averaged[0]
@@ -235,12 +235,12 @@ def test_long_stretches_cost_bounded_memory() -> None:
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / np.sqrt(48), rel=0.02)
 
 
-def test_simulated_turn_is_not_still() -> None:
+def test_simulated_rotation_is_not_stationary() -> None:
     frames = simulate_recording("wall", every=10, frames=2)
     assert len(stationary_intervals(frames)) == 2
 
 
-def test_run_averages_when_asked(tmp_path: Path) -> None:
+def test_run_averages_on_request(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "rec", CAMERA, depth_unit_m=0.0001)
     for k, shift in enumerate([0, 0, 0, 0.03, 0.03, 0.03]):
         writer.add(shot(k, scene(shift), 0.003))
@@ -261,7 +261,7 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     assert stationary_intervals(recording) == [(0, 4), (4, 8)]
     averaged = average_still(recording)
     assert len(averaged) == 2
-    # Each frame has rays of its own; the mean has theirs.
+    # Each frame has its own rays; the mean has the mean of them.
     first, frame = recording[1], averaged[0]
     assert isinstance(first, RangeFrame)
     assert isinstance(frame, RangeFrame)
@@ -269,7 +269,7 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     assert both.mean() > 0.95
     rays = np.abs(frame.camera.rays() - first.camera.rays())[both]
     assert np.median(rays) < 2e-4
-    # Rows differ less from their neighbours than in any of the four frames.
+    # Neighbouring pixels differ less than in any of the four frames.
     rough = [np.median(np.abs(np.diff(f.z, n=2, axis=1))[both[:, 2:]]) for f in (first, frame)]
     assert rough[1] < 0.65 * rough[0]
     model = noise_model_for(recording)
@@ -278,8 +278,8 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     assert np.median(ratio) == pytest.approx(0.5, abs=0.03)
 
 
-def test_pico_zense_is_still_all_along(shared_data: Path) -> None:
-    """Its noise is blotchy: neighbours share it, and dark things flicker."""
+def test_pico_zense_is_stationary_throughout(shared_data: Path) -> None:
+    """Its noise is correlated between neighbours, and dark surfaces flicker."""
     camera = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)
     files = sorted((shared_data / "pico_zense_static").glob("depth_*.png"))
     frames = [

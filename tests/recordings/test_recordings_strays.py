@@ -46,7 +46,7 @@ ODD: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_what_stands_for_a_frame_is_one_that_can_not_be_read(name, recording) -> None:
+def test_invalid_entry_in_place_of_frame_is_unreadable(name, recording) -> None:
     for k in (0, 3):
         path = recording / "depth" / f"{k:06}.png"
         path.unlink()
@@ -54,35 +54,35 @@ def test_what_stands_for_a_frame_is_one_that_can_not_be_read(name, recording) ->
     found = tofuse.open(recording)
     assert len(found) == 8
     unread = [k for k, item in enumerate(found.read_all()) if isinstance(item, InputError)]
-    assert unread == [0, 3]  # and no other has another time
+    assert unread == [0, 3]  # timestamps of the others are unchanged
     assert found.timestamps[4] == pytest.approx(tofuse.open(recording).timestamps[4])
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_what_stands_for_nothing_is_left_out(name, recording, tmp_path, capfd) -> None:
+def test_unrelated_entries_are_ignored(name, recording, tmp_path, capfd) -> None:
     for path in (recording / "lock", recording / "depth" / ".#000001.png", recording / "truth/x"):
         ODD[name](path)
     assert len(stamps_in(recording, tmp_path / "out")) > 8
     assert len(tofuse.open(recording)) == 8
-    if name == "to nowhere":  # which once refused the whole recording
+    if name == "to nowhere":  # such a link once made the recording unreadable
         words = ["run", str(recording), "--out", str(tmp_path / "out"), "--every", "4"]
         assert main(words) == 0, capfd.readouterr().err
 
 
-def test_a_recording_that_is_no_file_is_refused_at_once(tmp_path, capfd) -> None:
+def test_special_file_as_recording_is_refused_at_once(tmp_path, capfd) -> None:
     os.mkfifo(tmp_path / "a.r3d")
     for name in ("a.r3d", "/dev/zero"):
         assert main(["inspect", str(tmp_path / name), "--format", "record3d"]) == 2
         assert "is neither a file nor a folder" in capfd.readouterr().err
 
 
-def test_the_stamp_of_a_link_to_nowhere_is_its_own(tmp_path) -> None:
+def test_stamp_of_broken_link_is_its_own(tmp_path) -> None:
     (tmp_path / "a").symlink_to("nowhere")
     assert stamp(tmp_path / "a")[1] == len("nowhere")
 
 
-def test_links_out_of_a_recording_are_read(recording, tmp_path) -> None:
-    """The person gave the folder; a data set on another disk is linked to."""
+def test_links_out_of_recording_are_read(recording, tmp_path) -> None:
+    """Users choose the folder; data sets on other disks are linked."""
     image = recording / "depth" / "000002.png"
     image.rename(tmp_path / "elsewhere.png")
     image.symlink_to(tmp_path / "elsewhere.png")
@@ -90,7 +90,7 @@ def test_links_out_of_a_recording_are_read(recording, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("name", ["..", ".", "../x", "/etc", "a/b", "a\\b", "C:", "C:x", "a\nb"])
-def test_names_of_cameras_lead_nowhere(name, tmp_path) -> None:
+def test_camera_names_are_no_paths(name, tmp_path) -> None:
     assert not is_plain_name(name)
     camera = {"name": name, "recording": "", "T_rig_camera": [[1, 0, 0, 0], [0, 1, 0, 0],
               [0, 0, 1, 0], [0, 0, 0, 1]]}  # fmt: skip
@@ -104,7 +104,7 @@ def test_names_of_cameras_lead_nowhere(name, tmp_path) -> None:
     ("field", "value"),
     [("frame_rate_hz", 1e-300), ("frame_rate_hz", 1e300), ("ambiguity_m", 1e-9)],
 )
-def test_numbers_that_no_camera_has(field, value, recording, tmp_path, capfd) -> None:
+def test_implausible_numbers_are_refused(field, value, recording, tmp_path, capfd) -> None:
     path = recording / "camera.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     assert main(["run", str(recording), "--out", str(tmp_path / "out")]) == 2
@@ -124,7 +124,7 @@ def test_nested_tables(text, recording, tmp_path, capfd) -> None:
     assert capfd.readouterr().err.count("\n") == 1
 
 
-LONG = "1e300 0 0 1"  # a quaternion whose square is more than any number
+LONG = "1e300 0 0 1"  # a quaternion whose squared norm overflows
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ LONG = "1e300 0 0 1"  # a quaternion whose square is more than any number
         ("pose.txt", f"0 0 0 {LONG}\n", read_pose),
     ],
 )
-def test_quaternions_of_any_length(name, text, read, tmp_path) -> None:
+def test_non_normalised_quaternions_are_refused(name, text, read, tmp_path) -> None:
     path = tmp_path / name
     path.write_text(text)
     with warnings.catch_warnings():
@@ -145,15 +145,15 @@ def test_quaternions_of_any_length(name, text, read, tmp_path) -> None:
             read(path)
 
 
-def test_what_is_quoted_of_a_file_has_an_end(tmp_path) -> None:
+def test_quoted_content_is_truncated(tmp_path) -> None:
     assert len(str(InputError("is " + "x" * 10**6, where="a", remedy="b"))) < 700
     (tmp_path / "a.npz").write_bytes(b"x")
     with pytest.raises(InputError, match="can't be read as"):
         read_npz(tmp_path / "a.npz")
 
 
-def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) -> None:
-    """Pytest turns those into errors."""
+def test_absurd_numbers_beside_images_cause_no_numpy_warnings(recording) -> None:
+    """Pytest turns warnings into errors."""
     path = recording / "groundtruth.txt"
     lines = path.read_text().splitlines()
     words = lines[-1].split()
@@ -163,8 +163,8 @@ def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) ->
     assert not any(isinstance(item, InputError) for item in tofuse.open(recording).read_all())
 
 
-def test_time_is_not_asked_of_what_is_no_file(tmp_path: Path) -> None:
-    """A device has no end, and a FIFO blocks until something is written."""
+def test_special_files_are_not_read_for_timestamps(tmp_path: Path) -> None:
+    """A device is endless, and a FIFO blocks until something is written."""
     folder = tmp_path / "rec"
     make_sr4000(folder, 4)
     first, second, *_ = sorted(folder.iterdir())

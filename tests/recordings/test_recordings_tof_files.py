@@ -35,8 +35,8 @@ def test_arducam(tmp_path: Path) -> None:
     assert recording.warnings == []
 
 
-def test_arducam_in_metres_along_the_ray(tmp_path: Path) -> None:
-    """Unit and kind are those of camera.json: earlier SDKs gave metres."""
+def test_arducam_in_metres_along_ray(tmp_path: Path) -> None:
+    """Unit and kind are those of camera.json: earlier SDKs wrote metres."""
     made_tof.make_arducam(tmp_path / "scan")
     path = tmp_path / "scan" / "camera.json"
     about = json.loads(path.read_text()) | {"depth_unit_m": 1.0, "depth_kind": "range"}
@@ -47,7 +47,7 @@ def test_arducam_in_metres_along_the_ray(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.depth[2:], 1000 * DEPTH[0][2:], rtol=1e-6)
 
 
-def test_arducam_that_lacks_something(tmp_path: Path) -> None:
+def test_incomplete_arducam(tmp_path: Path) -> None:
     folder = tmp_path / "scan"
     made_tof.make_arducam(folder)
     depth = sorted(folder.glob("depth_*.raw"))
@@ -67,7 +67,7 @@ def test_arducam_that_lacks_something(tmp_path: Path) -> None:
     assert recording.warnings == ["2 of 4 frames have no confidence"]
 
 
-def test_arducam_without_a_camera(tmp_path: Path) -> None:
+def test_arducam_without_camera(tmp_path: Path) -> None:
     made_tof.make_arducam(tmp_path / "scan")
     camera = tmp_path / "camera.json"
     shutil.move(tmp_path / "scan" / "camera.json", camera)
@@ -78,7 +78,7 @@ def test_arducam_without_a_camera(tmp_path: Path) -> None:
     assert len(open_recording(tmp_path / "scan", format="arducam", camera=camera)) == 3
 
 
-def test_arducam_of_raw_phases(tmp_path: Path) -> None:
+def test_arducam_raw_phases_are_refused(tmp_path: Path) -> None:
     (tmp_path / "raw_240_1800_u16_1700000000000.raw").write_bytes(bytes(100))
     with pytest.raises(InputError, match="not the sensor's raw phases"):
         open_recording(tmp_path, format="arducam")
@@ -136,7 +136,7 @@ def test_aditof(tmp_path: Path, options: dict[str, bool]) -> None:
     assert recording.warnings == []
 
 
-def test_aditof_one_frame_a_file(tmp_path: Path) -> None:
+def test_aditof_with_one_frame_per_file(tmp_path: Path) -> None:
     for k in (0, 1, 10):
         (tmp_path / f"frame2025_01_01_00_00_00_{k}.bin").write_bytes(adi_frame(k, clock=False))
     recording = open_recording(tmp_path)
@@ -161,8 +161,8 @@ def test_aditof_without_points(tmp_path: Path) -> None:
         check_adi(frame, k)
 
 
-def test_aditof_whose_points_are_elsewhere(tmp_path: Path) -> None:
-    """Points of another lens are 4 % longer than the depth, so one of both is misread."""
+def test_aditof_with_inconsistent_points(tmp_path: Path) -> None:
+    """Points of another lens are 4 % longer than the depth: one of both is misread."""
     data = bytearray(adi_frame(0))
     at = len(data) - 6 * 64 * 48
     data[at:] = (np.frombuffer(bytes(data[at:]), "<i2") * 1.04).astype("<i2").tobytes()
@@ -171,7 +171,7 @@ def test_aditof_whose_points_are_elsewhere(tmp_path: Path) -> None:
         open_recording(tmp_path / "a.bin")
 
 
-def test_aditof_cut_off_and_of_another_size(tmp_path: Path) -> None:
+def test_aditof_truncated_and_of_another_size(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     small = Rational(32, 24, 23.0, 23.0, 15.5, 11.5)
     frames = [adi_frame(0), adi_frame(1), adi_frame(2, lens=small), adi_frame(3)]
@@ -189,7 +189,7 @@ def test_aditof_cut_off_and_of_another_size(tmp_path: Path) -> None:
                 open_recording(path, format=name)
 
 
-def test_other_bin_files_are_not_taken_for_it(tmp_path: Path) -> None:
+def test_other_bin_files_are_not_taken_for_aditof(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     path = tmp_path / "a.bin"
     for size in (100, 128, 10_000, 1 << 20):

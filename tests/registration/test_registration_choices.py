@@ -73,7 +73,7 @@ def test_uniform_takes_every_kth(size, points, step):
     np.testing.assert_array_equal(chosen, np.arange(0, size, step))
 
 
-def test_voxel_takes_the_point_nearest_to_the_middle_of_each_cube():
+def test_voxel_selects_point_nearest_to_centre_of_each_cube():
     points = rng(1).uniform(-1, 1, (2000, 3)).astype(np.float32)
     chosen = Voxel(0.25).select(CloudFrame.of(points), rng())
     cells = {}
@@ -85,7 +85,7 @@ def test_voxel_takes_the_point_nearest_to_the_middle_of_each_cube():
     np.testing.assert_array_equal(chosen, sorted(i for _, i in cells.values()))
 
 
-def test_random_at_each_iteration_draws_anew():
+def test_random_selection_is_redrawn_at_each_iteration():
     target, source = view(relief(2000, 0)), view(relief(2000, 1))
     seen = []
 
@@ -152,18 +152,18 @@ def test_normal_space_registers_grooves_that_random_points_miss():
     assert squares[NormalSpace] < 0.4 * squares[Random]
 
 
-def test_normal_space_spreads_directions_evenly():
+def test_normal_space_sampling_is_uniform_over_directions():
     walls = np.vstack([box_walls(4000, 0, 0, "z"), box_walls(200, 1, 0, "x")])
     chosen = NormalSpace(300).select(view(walls), rng())
     assert len(chosen) == len(set(chosen)) == 300
     assert (np.diff(chosen) > 0).all()
-    # One in 20 points lies on the side walls; of those chosen it is far more.
+    # One point in 20 is on the side walls; the fraction of selected ones is much larger.
     assert (chosen >= 4000).mean() > 0.3
     few = NormalSpace(10000).select(view(walls), rng())
     np.testing.assert_array_equal(few, np.arange(len(walls)))
 
 
-def test_normal_space_takes_the_normals_of_the_view():
+def test_normal_space_uses_normals_of_view():
     p = relief(200, 0).astype(np.float32)
     n = np.zeros((200, 3), np.float32)
     n[:195, 2], n[195:, 0] = -1, -1
@@ -174,7 +174,7 @@ def test_normal_space_takes_the_normals_of_the_view():
     np.testing.assert_array_equal(chosen, np.r_[0:100, 150:200])
 
 
-def test_intensity_gradient_takes_the_edges_of_a_pattern():
+def test_intensity_gradient_selects_edges_of_pattern():
     image = relief_image(np.eye(4), amplitude=lambda x, y: np.where(x > 0.05, 400.0, 100.0))
     chosen = IntensityGradient(80).select(image, rng())
     assert len(chosen) == 80
@@ -190,7 +190,7 @@ def test_intensity_gradient_takes_the_edges_of_a_pattern():
 # Matching
 
 
-def test_normal_shooting_meets_the_surface_along_the_normal():
+def test_normal_shooting_finds_intersection_along_normal():
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-40, 41) * 0.01, np.arange(-40, 41) * 0.01))
     plane = np.column_stack([x, y, 1.5 + 0.5 * x])
     target = view(plane)
@@ -201,7 +201,7 @@ def test_normal_shooting_meets_the_surface_along_the_normal():
     )
     a = aligned(source, target)
     matches = NormalShooting().prepare(a.target).match(a, 1.0)
-    # Where the line meets the plane 0.5 x - z + 1.5 = 0, by hand.
+    # Intersection of the line with the plane 0.5 x - z + 1.5 = 0, computed by hand.
     plane_normal = np.array([0.5, 0, -1])
     along = -(start @ plane_normal + 1.5) / (normal @ plane_normal)
     meets = start + along[:, None] * normal
@@ -237,7 +237,7 @@ def test_chen_and_medioni_need_few_iterations():
 SMALL = se3.exp([0.01, -0.008, 0.012, 0.01, -0.008, 0.012])
 
 
-def test_projection_pairs_points_on_the_same_pixel():
+def test_projection_matches_points_on_same_pixel():
     source, target = relief_image(SMALL, 1), relief_image(np.eye(4))
     target = target.keep(rng(3).random(target.depth.shape) < 0.9)
     a = aligned(source, target, SMALL)
@@ -248,7 +248,7 @@ def test_projection_pairs_points_on_the_same_pixel():
     np.testing.assert_array_equal(uv[matches.source], pixel[matches.target])
     gap = a.moved[matches.source] - a.target.points[matches.target]
     np.testing.assert_allclose(matches.distance, np.linalg.norm(gap, axis=1))
-    # No pair is missing: the others fall outside, on no point, or too far.
+    # No pair is missing: the others are outside, on no point, or too far.
     inside = ((uv >= 0) & (uv < [120, 90])).all(1)
     lost = np.setdiff1d(np.flatnonzero(inside), matches.source)
     position = np.full(target.valid.shape, -1)
@@ -258,7 +258,7 @@ def test_projection_pairs_points_on_the_same_pixel():
     assert ((there < 0) | far).all()
 
 
-def test_projection_and_search_finds_the_closest_points_where_views_are_near():
+def test_projection_search_finds_closest_points_for_small_motions():
     source, target = relief_image(SMALL, 1), relief_image(np.eye(4))
     a = aligned(source, target, SMALL)
     found = ProjectionSearch(2).prepare(a.target).match(a, 0.05)
@@ -268,7 +268,7 @@ def test_projection_and_search_finds_the_closest_points_where_views_are_near():
     assert (found.target[i] == exact.target[j]).mean() > 0.97
 
 
-def test_projection_ends_where_closest_points_end():
+def test_projection_converges_to_same_pose_as_closest_points():
     source = relief_image(SMALL, 1, noise=0.001)
     target = relief_image(np.eye(4), noise=0.001)
     for matcher in (ClosestPoint(), ProjectionSearch(), Projection()):
@@ -288,13 +288,13 @@ def test_projection_ends_where_closest_points_end():
 
 
 @pytest.mark.parametrize("matcher", [Projection(), ProjectionSearch()])
-def test_nothing_can_be_projected_into_a_cloud(matcher):
+def test_projection_requires_a_camera(matcher):
     assert matcher.takes == {"range"}
     with pytest.raises(RegistrationError, match="without a camera"):
         matcher.prepare(everything(view(relief(50, 0))))
 
 
-def test_closest_compatible_passes_over_others():
+def test_closest_compatible_skips_incompatible_points():
     points = np.array([[0, 0, 1], [0.1, 0, 1], [0.3, 0, 1.0]], np.float32)
     target = CloudFrame(0, 0.0, points, amplitude=np.array([100, 0, 205], np.float32))
     source = CloudFrame(1, 0.0, points[[0, 0, 0]], amplitude=np.array([199, 90, 500], np.float32))
@@ -307,7 +307,7 @@ def test_closest_compatible_passes_over_others():
 
 
 def test_closest_invariant_weighs_shape_against_distance():
-    # A source point on a bump lies closer to a flat place than to the bump.
+    # A source point on a bump is closer to a flat place than to the bump.
     def sheet(bump):
         x, y = rng(1).uniform(-0.5, 0.5, (2, 6000))
         off = (x - bump) ** 2 + y**2
@@ -334,7 +334,7 @@ def with_normals(normals):
     return CloudFrame(0, 0.0, points, normals=normals)
 
 
-def test_normal_compatibility_looks_at_the_angle_after_turning():
+def test_normal_compatibility_uses_rotated_normals():
     angles = np.deg2rad([0, 40, 50, 180, 0])
     source = with_normals(np.column_stack([np.sin(angles), 0 * angles, -np.cos(angles)]))
     source.normals[4] = np.nan
@@ -347,7 +347,7 @@ def test_normal_compatibility_looks_at_the_angle_after_turning():
     assert list(kept.source) == [1, 2]
 
 
-def test_curvature_compatibility_tells_a_ball_from_a_wall():
+def test_curvature_compatibility_distinguishes_ball_and_wall():
     ball = stone(3000, 0) * 0.2
     a = aligned(view(ball), view(box_walls(len(ball), 1, 0, "z")), resolution=0.02)
     n = len(ball)
@@ -373,7 +373,7 @@ def test_amplitude_and_colour_compatibility():
         ColorCompatibility().reject(one_to_one(4), bare)
 
 
-def test_trimmed_keeps_a_share_of_the_sources_points():
+def test_trimmed_keeps_fraction_of_source_points():
     source = CloudFrame.of(np.zeros((10, 3)))
     a = aligned(source, source)
     distance = np.array([5, 1, 4, 1, 3, 2, 9, 8.0])
@@ -382,8 +382,8 @@ def test_trimmed_keeps_a_share_of_the_sources_points():
     assert len(Trimmed(1.0).reject(one_to_one(8), a)) == 8
 
 
-def test_boundary_rejection_prevents_the_pull_of_partial_overlap():
-    """Turk and Levoy: points beyond the overlap would drag the source over the target."""
+def test_boundary_rejection_avoids_bias_of_partial_overlap():
+    """Turk and Levoy: points outside the overlap would drag the source over the target."""
     for metric, bound in ((PointToPoint(), 0.04), (PointToPlane(), 0.04)):
         errors = []
         for rejectors in ((Boundary(),), ()):
@@ -402,7 +402,7 @@ def test_boundary_rejection_prevents_the_pull_of_partial_overlap():
         assert errors[1] > 4 * errors[0]
 
 
-def test_boundaries_are_the_rim():
+def test_boundary_points_are_at_the_rim():
     sheet = view(relief(4000, 0))
     rim = everything(sheet).shape.boundary
     x, y = np.abs(sheet.points[:, 0]), np.abs(sheet.points[:, 1])
@@ -413,7 +413,7 @@ def test_boundaries_are_the_rim():
 # Stopping
 
 
-def test_small_step_ends_at_small_motions_and_at_repetitions():
+def test_small_step_stops_at_small_motions_and_cycles():
     rule = SmallStep(0.01, 50)
     assert rule.met(History([5], [1.0], [0.009]))
     assert not rule.met(History([5], [1.0], [0.011]))
@@ -423,22 +423,22 @@ def test_small_step_ends_at_small_motions_and_at_repetitions():
     assert not rule.met(History([5] * 5, [1.0, 0.9, 0.8, 0.7, 0.6], [1.0] * 5))
 
 
-# What the parts share
+# Shared code of the parts
 
 
-def test_shapes_are_worked_out_once_for_a_view():
+def test_shapes_are_computed_once_per_view():
     sheet = view(relief(500, 0))
     first = shape.shape_at(sheet, np.arange(500))
     again = shape.shape_at(sheet, np.arange(200, 300))
     np.testing.assert_array_equal(again.normals, first.normals[200:300])
     assert shape.tree_of(sheet) is shape.tree_of(sheet)
-    # Few points of a fresh view: the same answer, without the others.
+    # Few points of a new view: the same result, without the others.
     few = shape.shape_at(view(relief(500, 0)), np.arange(20))
     np.testing.assert_array_equal(few.normals, first.normals[:20])
     np.testing.assert_array_equal(few.boundary, first.boundary[:20])
 
 
-def test_normals_point_to_the_sensor():
+def test_normals_point_towards_sensor():
     sheet = relief(500, 0)
     for z in (0.0, 5.0):
         at = np.array([0.1, 0.2, z])
@@ -446,7 +446,7 @@ def test_normals_point_to_the_sensor():
         assert ((normals * (at - sheet)).sum(1) > 0).all()
 
 
-def test_height_of_the_relief_is_what_the_image_shows():
+def test_relief_image_matches_height_function():
     image = relief_image(SMALL, 1)
     world = se3.transform(SMALL, image.points.astype(float))
     np.testing.assert_allclose(world[:, 2], 2 + relief_height(*world[:, :2].T), atol=1e-5)
@@ -470,6 +470,6 @@ def test_height_of_the_relief_is_what_the_image_shows():
         lambda: Trimmed(0.0),
     ],
 )
-def test_senseless_options_are_refused(make):
+def test_invalid_options_are_refused(make):
     with pytest.raises(ValueError, match="not"):
         make()

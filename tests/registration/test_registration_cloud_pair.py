@@ -50,7 +50,7 @@ def scanned(at, heading, count=60_000, seed=0, name="flat"):
 
 @pytest.fixture(scope="module")
 def scans():
-    """Of one room of the flat, from two places."""
+    """Two scans of one room of the flat, from different places."""
     (T_a, a), (T_b, b) = scanned([-2.6, -2.5, 1.3], 0.4), scanned([-1.6, -2.2, 1.3], 2.6, seed=1)
     return b, a, se3.inverse(T_a) @ T_b
 
@@ -64,7 +64,7 @@ def frames():
 
 
 def off(T, true, points):
-    """Error in m at the middle of the source, and in degrees."""
+    """Error in m at the median of the source, and in degrees."""
     middle = np.median(points, 0)[None].astype(float)
     gap = se3.transform(T, middle) - se3.transform(true, middle)
     return np.linalg.norm(gap), np.degrees(se3.angle(se3.inverse(true) @ T))
@@ -73,7 +73,7 @@ def off(T, true, points):
 # Viewpoints
 
 
-def test_points_of_an_image_show_that_they_were_seen_from_their_origin(frames):
+def test_viewpoint_of_image_points_is_their_origin(frames):
     for frame in frames[:2]:
         found = viewpoint_of(CloudFrame.of(frame.points))
         assert found is not None
@@ -85,15 +85,15 @@ def test_points_of_an_image_show_that_they_were_seen_from_their_origin(frames):
         assert found.spacing == pytest.approx(pixel.spacing * np.sqrt(len(frame) / 5000), rel=0.2)
 
 
-def test_a_scan_shows_where_it_was_seen_from(scans):
+def test_viewpoint_of_scan_is_detected(scans):
     assert viewpoint_of(CloudFrame.of(scans[0])) is not None
     origin = np.array([3.0, 4.0, -2.0])
     moved = CloudFrame(0, 0.0, scans[0] + origin.astype(np.float32), origin=origin)
     np.testing.assert_array_equal(viewpoint_of(moved).origin, origin)
 
 
-def test_points_that_were_seen_from_elsewhere_show_none(frames, scans):
-    """Mostly: from some places the surfaces of a small image look as evenly sampled."""
+def test_moved_points_have_no_viewpoint(frames, scans):
+    """Mostly: from some places the surfaces of a small image are sampled as evenly."""
     rng = np.random.default_rng(4)
     for points in (frames[0].points, scans[0]):
         found = []
@@ -103,14 +103,14 @@ def test_points_that_were_seen_from_elsewhere_show_none(frames, scans):
         assert sum(v is not None for v in found) <= 7
 
 
-def test_points_that_are_spread_evenly_over_the_surface_show_none(frames):
+def test_evenly_sampled_surfaces_have_no_viewpoint(frames):
     even = averaged(CloudFrame.of(frames[0].points), 0.08)
     assert viewpoint_of(even) is None
     assert viewpoint_of(CloudFrame.of(np.zeros((100, 3)))) is None
     assert viewpoint_of(CloudFrame.of(frames[0].points[:20])) is None
 
 
-def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
+def test_image_of_cloud_matches_original_image(frames):
     frame = frames[0]
     color = np.random.default_rng(0).integers(0, 255, (*frame.depth.shape, 3)).astype(np.uint8)
     frame = replace(frame, color_image=color)
@@ -119,7 +119,7 @@ def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
     np.testing.assert_array_equal(T, np.eye(4))
     assert (image.index, image.timestamp) == (3, 4.0)
     assert 0.7 * frame.depth.shape[1] < image.depth.shape[1] <= frame.depth.shape[1]
-    # Each point of the image lies on the surface that the camera saw.
+    # Each point of the image is on the surface that the camera measured.
     pixel = np.round(frame.camera.project(image.points)).astype(int)
     inside = (pixel >= 0).all(1) & (pixel < frame.depth.shape[::-1]).all(1)
     z = frame.z[pixel[inside, 1], pixel[inside, 0]]
@@ -128,8 +128,8 @@ def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
     assert np.isin(image.amplitude, frame.amplitude).all()
 
 
-def test_pixels_show_a_slanted_plane_where_their_centres_see_it() -> None:
-    """Points lie anywhere in their pixels; their offsets must not displace the surface."""
+def test_pixels_of_slanted_plane_are_unbiased() -> None:
+    """Points are anywhere in their pixels; their offsets must not displace the surface."""
     xy = np.random.default_rng(4).uniform(-0.5, 0.5, (60_000, 2))
     z = 2.0 / (1 - 0.6 * xy[:, 0] + 0.3 * xy[:, 1])  # a plane, slanted by more than 30 degrees
     points = np.column_stack([xy * z[:, None], z])
@@ -139,12 +139,12 @@ def test_pixels_show_a_slanted_plane_where_their_centres_see_it() -> None:
     expected = 2.0 / (1 - 0.6 * rays[..., 0] + 0.3 * rays[..., 1])
     seen = image.depth[3:-3, 3:-3]
     off = np.abs(seen / expected - 1)[seen > 0]
-    assert np.median(off) < 2e-5  # the means of the points in each pixel are off by 7e-4
+    assert np.median(off) < 2e-5  # plain means of the points in each pixel are off by 7e-4
     assert np.quantile(off, 0.95) < 5e-4
 
 
-def test_a_cloud_with_z_up_is_seen_by_a_camera_that_stands_upright(frames):
-    # x forward, y left, z up, as scanners have it.
+def test_cloud_with_z_up_is_rendered_upright(frames):
+    # x forward, y left, z up, as in scanners.
     axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
     cloud = CloudFrame.of(frames[0].points @ axes.T)
     image, T = as_image(cloud, viewpoint_of(cloud))
@@ -157,19 +157,19 @@ def test_a_cloud_with_z_up_is_seen_by_a_camera_that_stands_upright(frames):
     assert np.mean(near >= 0) > 0.95
 
 
-def test_no_image_holds_a_whole_sphere(scans):
+def test_full_sphere_does_not_fit_into_image(scans):
     cloud = CloudFrame.of(scans[0])
     assert as_image(cloud, viewpoint_of(cloud)) is None
 
 
-def test_a_sphere_knows_what_was_seen_through(scans):
+def test_range_sphere_stores_free_space(scans):
     cloud = CloudFrame.of(scans[0])
     sphere = RangeSphere.of(cloud, viewpoint_of(cloud))
     points = scans[0][::50].astype(float)
     assert np.nanmedian(sphere.before(0.5 * points) / np.linalg.norm(0.5 * points, axis=1)) > 0.9
     assert np.mean(sphere.before(points) <= 1e-3) > 0.99
     assert np.nanmax(sphere.before(1.5 * points)) <= 0
-    # Nothing was seen straight down.
+    # No measurements straight down.
     assert np.isnan(sphere.before(np.array([[0.0, 0, -1]]))).all()
 
 
@@ -181,7 +181,7 @@ def maps(source, target, size=0.12):
     return [CloudMap.of(averaged(v, size), size, v) for v in views]
 
 
-def test_the_right_pose_is_supported_and_not_contradicted(scans):
+def test_correct_pose_is_supported_and_not_contradicted(scans):
     source, target, true = scans
     said = cloud_agreement(*maps(source, target), true)
     assert said.support > 0.6
@@ -189,7 +189,7 @@ def test_the_right_pose_is_supported_and_not_contradicted(scans):
     assert said.rms_m < 0.03
 
 
-def test_a_wrong_pose_is_contradicted_by_free_space(scans):
+def test_wrong_pose_is_contradicted_by_free_space(scans):
     source, target, true = scans
     views = maps(source, target)
     right = cloud_agreement(*views, true)
@@ -197,7 +197,7 @@ def test_a_wrong_pose_is_contradicted_by_free_space(scans):
         said = cloud_agreement(*views, true @ wrong)
         assert said.violation > 0.02
         assert said.score < right.score - 0.2
-    # Without viewpoints nothing is known of free space.
+    # Without viewpoints, free space is unknown.
     blind = maps(se3.transform(ANYWHERE, source.astype(float)), target)
     assert blind[0].sphere is None
     said = cloud_agreement(blind[0], replace(blind[1], sphere=None), turn([0, 0, 1], 180))
@@ -205,7 +205,7 @@ def test_a_wrong_pose_is_contradicted_by_free_space(scans):
 
 
 def with_mixed_pixels(aside):
-    """A disc before a wall, from a place aside in m; pixels on the outline mix both depths."""
+    """A disc before a wall, from a place `aside` m to the right; outline pixels mix both depths."""
     v, u = np.mgrid[-60:61, -80:81] * 0.005
     disc = [np.hypot(1.2 * (u + du) + aside, 1.2 * (v + dv)) < 0.3 for du, dv in SUBPIXELS]
     share = np.mean(disc, axis=0)
@@ -217,20 +217,20 @@ def with_mixed_pixels(aside):
 SUBPIXELS = [(du, dv) for du in (-0.002, 0, 0.002) for dv in (-0.002, 0, 0.002)]
 
 
-def test_mixed_pixels_do_not_contradict_the_right_pose():
+def test_flying_pixels_do_not_contradict_correct_pose():
     (source, mixed), (target, _) = with_mixed_pixels(0.15), with_mixed_pixels(0.0)
     views = maps(source, target, 0.03)
     true = se3.exp([0.15, 0, 0, 0, 0, 0])
     assert cloud_agreement(*views, true).contradiction < 0.002
-    # They do lie where the other view saw through.
+    # They do lie in free space of the other view.
     seen = se3.transform(true, source[mixed].astype(float))
     assert np.mean(views[1].sphere.before(seen) > 0.1) > 0.1
-    # What is a surface contradicts a wrong one.
+    # Surfaces do contradict a wrong pose.
     wrong = cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0]))
     assert wrong.contradiction > 0.05
 
 
-def test_agreement_is_the_same_both_ways(scans):
+def test_agreement_is_symmetric(scans):
     source, target, true = scans
     a, b = maps(source, target)
     there, back = cloud_agreement(a, b, true), cloud_agreement(b, a, se3.inverse(true))
@@ -238,8 +238,8 @@ def test_agreement_is_the_same_both_ways(scans):
     assert there.support == pytest.approx(back.support, abs=1e-9)
 
 
-def test_without_free_space_a_lead_alone_decides():
-    """The same evidence of images and clouds is weighed by their own models."""
+def test_evidence_without_free_space_depends_on_margin():
+    """Images and clouds have their own models of evidence."""
     cases = [
         Evidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
     ]
@@ -261,7 +261,7 @@ def test_scans_with_any_heading(scans):
     assert found.contradiction < 0.01
 
 
-def test_clouds_of_which_nothing_is_known_under_any_rotation(frames):
+def test_clouds_without_viewpoint_under_any_rotation(frames):
     target, source, true = frames
     moved = se3.transform(ANYWHERE, source.points.astype(float))
     found = tofuse.register(moved, target.points)
@@ -270,7 +270,7 @@ def test_clouds_of_which_nothing_is_known_under_any_rotation(frames):
     assert angle < 4
 
 
-def test_a_tenth_of_the_points(scans):
+def test_clouds_of_different_density(scans):
     source, target, true = scans
     few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
     for pair, T in (((few, target), true), ((target, few), se3.inverse(true))):
@@ -280,7 +280,7 @@ def test_a_tenth_of_the_points(scans):
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 20.0])
-def test_lengths_do_not_matter(scans, scale):
+def test_registration_is_independent_of_scale(scans, scale):
     source, target, true = scans
     scaled = true.copy()
     scaled[:3, 3] *= scale
@@ -289,7 +289,7 @@ def test_lengths_do_not_matter(scans, scale):
     assert found.believed
 
 
-def test_views_that_share_nothing_are_rejected(scans, frames):
+def test_views_without_overlap_are_rejected(scans, frames):
     for source, target in (
         (bumpy_ball(5000, 1), scans[0]),
         (frames[0].points, bumpy_ball(5000, 1) * 4),
@@ -303,7 +303,7 @@ def test_views_that_share_nothing_are_rejected(scans, frames):
         assert found.reason
 
 
-def test_a_corridor_that_fits_in_several_ways_is_rejected():
+def test_ambiguous_corridor_is_rejected():
     """Two parallel walls and a floor: the pose along them is unobservable."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
     assert found.believed is False
@@ -312,7 +312,7 @@ def test_a_corridor_that_fits_in_several_ways_is_rejected():
 
 
 @pytest.mark.parametrize("scale", [0.001, 0.01, 1000.0])
-def test_other_units_are_named(scans, scale):
+def test_different_units_are_reported(scans, scale):
     source, target, _ = scans
     found = tofuse.register(source * scale, target)
     assert found.believed is False
@@ -321,7 +321,7 @@ def test_other_units_are_named(scans, scale):
 
 
 @pytest.mark.parametrize("scale", [0.001, 100.0])
-def test_other_units_are_named_where_nothing_is_certain(scale):
+def test_different_units_are_reported_without_an_accepted_pose(scale):
     """A square room fits in four ways, so that no scale is accepted."""
     walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
     try:
@@ -333,7 +333,7 @@ def test_other_units_are_named_where_nothing_is_certain(scale):
     assert said
 
 
-def test_a_guess_decides_between_poses_that_are_alike():
+def test_guess_resolves_symmetry():
     """An empty square room is the same after a rotation by 90 degrees."""
     walls = box_walls(8000, 0, 0.003, "xyz")
     other = box_walls(8000, 1, 0.003, "xyz")
@@ -342,7 +342,7 @@ def test_a_guess_decides_between_poses_that_are_alike():
     assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
 
 
-def test_the_same_whatever_the_threads(scans):
+def test_result_is_independent_of_threads(scans):
     source, target, _ = scans
     found = []
     for count in (1, 2):
@@ -352,7 +352,7 @@ def test_the_same_whatever_the_threads(scans):
     assert found[0].probability == found[1].probability
 
 
-def test_lines_planes_and_points_get_an_honest_answer():
+def test_degenerate_clouds_are_not_accepted():
     rng = np.random.default_rng(0)
     plane = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 2]
     line = rng.uniform(-1, 1, (3000, 1)) * [1.0, 0.2, 0.1] + [0, 0, 2]
@@ -366,14 +366,14 @@ def test_lines_planes_and_points_get_an_honest_answer():
         assert found.believed is False
 
 
-def test_an_image_and_a_cloud_and_a_wide_image(frames):
+def test_image_is_registered_to_cloud(frames):
     target, source, true = frames
     found = tofuse.register(source, CloudFrame.of(target.points))
     assert off(found.T_target_source, true, source.points)[0] < 0.05
     assert found.believed
 
 
-def test_registration_between_other_frames():
+def test_registration_in_other_frames():
     rng = np.random.default_rng(1)
     A = rng.normal(size=(6, 6))
     T, T_a, T_b = (se3.exp(rng.normal(size=6)) for _ in range(3))
@@ -390,10 +390,10 @@ def test_registration_between_other_frames():
     np.testing.assert_allclose(np.abs(there / np.linalg.norm(there)), np.abs(slide[0]), atol=1e-6)
 
 
-# From view to view
+# Sequences of views
 
 
-def test_views_are_chained_and_rejected_ones_begin_a_component(scans):
+def test_views_are_chained_and_rejected_views_start_components(scans):
     source, target, true = scans
     tracker = Pairwise().start(0)
     views = [target, source, bumpy_ball(5000, 1), source + np.float32(1e-4)]
@@ -402,7 +402,7 @@ def test_views_are_chained_and_rejected_ones_begin_a_component(scans):
     assert [s.component for s in steps] == [0, 0, 1, 2]
     assert off(steps[1].T_component_camera, true, source)[0] < 0.02
     assert not steps[1].doubtful
-    # What begins the last component is linked with the first.
+    # The first view of the last component is linked to the first component.
     assert [(link.i, link.j) for link in steps[3].links] == [(1, 3)]
     assert off(steps[3].links[0].T_i_j, np.eye(4), source)[0] < 0.01
     lost = tracker.push(replace(CloudFrame.of(target[:5]), index=4))
@@ -413,7 +413,7 @@ def test_views_are_chained_and_rejected_ones_begin_a_component(scans):
             Pairwise(**bad)
 
 
-def test_a_folder_of_scans_becomes_one_model(tmp_path):
+def test_folder_of_scans_becomes_one_model(tmp_path):
     """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
     places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))
     taken = [scanned(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
@@ -428,8 +428,8 @@ def test_a_folder_of_scans_becomes_one_model(tmp_path):
         assert off(result.trajectory[k], true, points)[1] < 0.3
 
 
-def test_what_leads_to_the_same_pose_is_no_rival():
-    """Large noise stops a few iterations far apart; an answer elsewhere stays a rival."""
+def test_candidates_of_same_pose_are_not_rivals():
+    """With large noise, iterations stop slightly apart; a pose elsewhere remains a rival."""
     views, truth = peaks_views(0.1, 101)
     source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
     both = cloud_pair._Views.of(source, target, np.random.default_rng(0))

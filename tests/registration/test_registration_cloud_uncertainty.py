@@ -29,7 +29,7 @@ def sigma(information):
 
 
 def aligned(seed, bend=0.0, points=4000, noise=0.004):
-    """A ball with bumps seen twice, once bent: the maps, and the pose that ICP finds."""
+    """A ball with bumps seen twice, once bent: the maps, and the pose found by ICP."""
     first, second = (bumpy_ball(points, seed + k, noise) for k in (0, 1000))
     first[:, 0] += bend * np.sin(6 * first[:, 1] + seed)
     first[:, 2] += bend * np.sin(5 * first[:, 0] + seed)
@@ -51,7 +51,7 @@ def test_errors_are_as_large_as_stated(bend):
     assert np.median(found) > 0.1  # nor far smaller
 
 
-def test_what_bends_a_cloud_makes_its_pose_less_certain():
+def test_deformation_increases_uncertainty():
     plain, bent = (
         cloud_information(*aligned(0, bend)[0], np.eye(4), np.zeros((0, 6))) for bend in (0, 0.01)
     )
@@ -59,7 +59,7 @@ def test_what_bends_a_cloud_makes_its_pose_less_certain():
         assert doubted > 2 * known
 
 
-def test_points_that_share_an_error_tell_no_more_than_a_few_of_them():
+def test_correlated_errors_limit_information():
     few, many = (
         cloud_information(*aligned(0, 0.01, points)[0], np.eye(4), np.zeros((0, 6)))
         for points in (2000, 8000)
@@ -68,7 +68,7 @@ def test_points_that_share_an_error_tell_no_more_than_a_few_of_them():
         assert b > 0.6 * a  # half of it, if they were independent
 
 
-def test_a_wall_holds_three_directions_and_bounds_no_other():
+def test_wall_constrains_three_directions():
     rng = np.random.default_rng(0)
     walls = [
         CloudFrame.of(np.c_[rng.uniform(-1, 1, (4000, 2)), 2 + rng.normal(0, 0.004, 4000)], index=k)
@@ -84,7 +84,7 @@ def test_a_wall_holds_three_directions_and_bounds_no_other():
     assert towards @ information @ towards > 1 / 0.01**2
 
 
-def test_clouds_that_do_not_meet_know_nothing():
+def test_clouds_without_overlap_have_no_information():
     cloud = view(bumpy_ball(2000, 0))
     away = CloudFrame.of(cloud.points + np.array([30.0, 0, 0]))
     source, target = maps(cloud, away)
@@ -93,7 +93,7 @@ def test_clouds_that_do_not_meet_know_nothing():
     assert np.diag(cloud_information(source, target, np.eye(4), free)).max() < 1e-2
 
 
-def test_a_pose_from_elsewhere_is_off_by_what_the_points_say():
+def test_uncertainty_includes_residual_misalignment():
     (source, target), T = aligned(1)
     off = T @ se3.exp([0.01, 0, 0, 0, 0, 0])
     free = np.zeros((0, 6))
@@ -103,7 +103,7 @@ def test_a_pose_from_elsewhere_is_off_by_what_the_points_say():
     assert x @ np.linalg.inv(near) @ x < x @ np.linalg.inv(far) @ x
 
 
-def test_the_information_of_a_registration_is_usable():
+def test_information_is_symmetric_and_positive_definite():
     found = Registration(np.eye(4), True, 1, 1, 1, 0.0, 0.0, np.eye(6))
     (source, target), T = aligned(2)
     information = cloud_information(source, target, T, found.unobservable)

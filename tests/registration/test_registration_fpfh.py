@@ -17,19 +17,19 @@ from tofuse.registration.fpfh import Fpfh, fpfh, mutually_nearest
 
 @pytest.fixture(scope="module")
 def corners():
-    """Points of a furnished corner, seen from two places half a metre and 30 degrees apart."""
+    """Points of a furnished corner from two places half a metre and 30 degrees apart."""
     return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)
 
 
 def off(found, true, points):
-    """How far apart two motions put the middle of some points, m, and their angle, degrees."""
+    """Distance in m between the images of the median point, and angle in degrees."""
     middle = np.median(points, 0)[None]
     shift = se3.transform(found, middle) - se3.transform(true, middle)
     return float(np.linalg.norm(shift)), float(np.degrees(se3.angle(se3.inverse(true) @ found)))
 
 
 @pytest.mark.parametrize("degrees", [30, 75, 120, 180])
-def test_views_turned_by_any_angle_overlap_in_part(corners, degrees):
+def test_partially_overlapping_views_under_any_rotation(corners, degrees):
     source, target = corners
     turned = turn(rng(degrees).normal(size=3), degrees, centre=np.median(source, 0))
     strange = rng(7).uniform(source.min(0), source.max(0), (len(source) // 10, 3))
@@ -41,19 +41,19 @@ def test_views_turned_by_any_angle_overlap_in_part(corners, degrees):
     assert found.margin > 0
 
 
-def test_a_body_is_told_from_itself_turned():
+def test_asymmetric_body_has_one_pose():
     T = turn([1, 2, 0.5], 180)
     points = se3.transform(se3.inverse(T), stone(3000, 1, 0.002))
     found = tofuse.register(points, stone(3000, 0, 0.002), method=Fpfh(refine=False))
     shift, angle = off(found.T_target_source, T, points)
     assert shift < 0.03
     assert angle < 8
-    assert found.margin > 0.25  # nothing else fits
+    assert found.margin > 0.25  # no other pose fits
     refined = tofuse.register(points, stone(3000, 0, 0.002), method=Fpfh())
     assert off(refined.T_target_source, T, points)[1] < 0.3
 
 
-def test_a_cube_has_no_margin():
+def test_cube_has_no_margin():
     """All faces are identical, so that it fits as well after a rotation by 90 degrees."""
 
     def cube(seed):
@@ -67,7 +67,7 @@ def test_a_cube_has_no_margin():
     assert found.margin < 0.1 < 0.25 < body.margin
 
 
-def test_a_real_pair_of_lidar_scans_upside_down(shared_data):
+def test_real_pair_of_lidar_scans_upside_down(shared_data):
     folder = shared_data / "lidar_pair_gt"
     source, target = (read_ply(folder / f"{name}.ply").points for name in ("source", "target"))
     T = np.loadtxt(folder / "T_target_source.txt")
@@ -79,13 +79,13 @@ def test_a_real_pair_of_lidar_scans_upside_down(shared_data):
     assert angle < 0.5
 
 
-def test_without_a_guess_a_start_that_leads_nowhere_is_left(corners):
+def test_wrong_start_is_left_without_guess(corners):
     source, target = corners
     turned = turn([0.2, 1, 0.3], 150, centre=np.median(source, 0) + 5)
     moved = se3.transform(se3.inverse(turned), source)
     found = tofuse.register(moved, target)
     assert off(found.T_target_source, TRUE @ turned, moved)[0] < 0.01
-    # A guess that is far off is left as well; a start that does lead somewhere is kept.
+    # A wrong guess is left as well; a start that leads to the pose is kept.
     far = tofuse.register(moved, target, guess=np.eye(4))
     assert off(far.T_target_source, TRUE @ turned, moved)[0] < 0.01
     near = tofuse.register(source, target, guess=TRUE)
@@ -137,7 +137,7 @@ def surface(n=40, seed=0):
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_histograms_against_a_slow_twin(signed):
+def test_histograms_match_reference(signed):
     points, normals = surface()
     np.testing.assert_allclose(
         fpfh(points, normals, 0.9, signed), slow_fpfh(points, normals, 0.9, signed), atol=1e-12
@@ -145,16 +145,16 @@ def test_histograms_against_a_slow_twin(signed):
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_histograms_do_not_change_with_the_view(signed):
+def test_histograms_are_invariant_to_pose(signed):
     points, normals = surface(200)
     for k in range(3):
         T = se3.exp(rng(k).normal(size=6))
         other = fpfh(se3.transform(T, points), normals @ T[:3, :3].T, 0.4, signed)
-        # But for what lies on the border of two bins, to rounding.
+        # Except for values on the border of two bins, to rounding.
         assert np.mean(np.abs(other - fpfh(points, normals, 0.4, signed)) > 1e-9) < 0.01
 
 
-def test_unsigned_histograms_do_not_know_the_side():
+def test_unsigned_histograms_ignore_sign_of_normals():
     points, normals = surface(100)
     sides = rng(3).choice([-1.0, 1.0], 100)[:, None]
     same = fpfh(points, normals, 0.5, False)
@@ -162,7 +162,7 @@ def test_unsigned_histograms_do_not_know_the_side():
     assert np.abs(fpfh(points, sides * normals, 0.5, True) - same).max() > 0.1
 
 
-def test_rows_are_matched_both_ways():
+def test_rows_are_matched_mutually():
     a, b = rng(0).normal(size=(300, 5)), rng(1).normal(size=(280, 5))
     i, j = mutually_nearest(a, b)
     apart = ((a[:, None] - b) ** 2).sum(2)
@@ -172,7 +172,7 @@ def test_rows_are_matched_both_ways():
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
 
 
-def test_a_good_start_is_not_lost_in_coarser_levels(corners):
+def test_good_start_is_kept_by_skipping_coarse_levels(corners):
     """With `coarsest`, levels beyond the error of the guess are skipped."""
     source, _target = corners
     data, model = (seen(T, seed=k) for k, T in ((1, B), (2, A)))
@@ -184,7 +184,7 @@ def test_a_good_start_is_not_lost_in_coarser_levels(corners):
         CoarseToFine(coarsest=0.0)
 
 
-def test_too_little_is_refused(corners):
+def test_too_few_points_or_matches_are_refused(corners):
     source, target = corners
     with pytest.raises(RegistrationError, match=r"agree|too few"):
         tofuse.register(source[:12], target, method=Fpfh())

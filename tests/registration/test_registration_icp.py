@@ -44,8 +44,8 @@ def rng(seed=0):
 SMALL = se3.exp([0.004, -0.003, 0.005, 0.004, -0.002, 0.003])
 
 
-def algorithm_1_written_out(data, model, res, epsilon, k, guess):
-    """Algorithm 1 line by line, without a tree; the pose is that of every iteration."""
+def literal_algorithm_1(data, model, res, epsilon, k, guess):
+    """Algorithm 1 line by line, without a tree; T is the pose after each iteration."""
     data2 = data @ guess[:3, :3].T + guess[:3, 3]
     T, E, corresponding, poses = guess, [], [], []
 
@@ -82,10 +82,10 @@ def algorithm_1_written_out(data, model, res, epsilon, k, guess):
 
 
 @pytest.mark.parametrize("guess", [np.eye(4), se3.exp([0.01, 0, 0, 0, 0.01, 0])])
-def test_it_equals_algorithm_1_written_out(guess):
+def test_result_equals_literal_algorithm_1(guess):
     source, target = pair(SMALL, n=500)
     res = 0.03
-    T, E, corresponding = algorithm_1_written_out(
+    T, E, corresponding = literal_algorithm_1(
         source.points.astype(float), target.points.astype(float), res, 1e-4, 3, guess
     )
     found = algorithm_1(res, None).register(source, target, guess, rng())
@@ -98,7 +98,7 @@ def test_it_equals_algorithm_1_written_out(guess):
     np.testing.assert_allclose(found.T_target_source, T, atol=1e-10)
 
 
-def test_it_recovers_the_motion_exactly_where_both_views_hold_the_same_points():
+def test_motion_is_exact_for_identical_points():
     source, target = pair(SMALL, n=400, noise=0, same_points=True)
     found = algorithm_1(0.02, None).register(source, target, np.eye(4), rng())
     assert found.converged
@@ -108,7 +108,7 @@ def test_it_recovers_the_motion_exactly_where_both_views_hold_the_same_points():
     assert found.rms_m < 1e-6
 
 
-def test_aligned_views_take_two_iterations_and_k_more():
+def test_aligned_views_take_two_plus_k_iterations():
     source, target = pair(np.eye(4), n=200, noise=0, same_points=True)
     for k in (1, 3, 5):
         found = algorithm_1(0.02, None, k=k).register(source, target, np.eye(4), rng())
@@ -116,7 +116,7 @@ def test_aligned_views_take_two_iterations_and_k_more():
         assert found.error < 1e-12
 
 
-def test_it_comes_near_with_other_points_of_the_same_surfaces():
+def test_different_samples_of_same_surfaces_are_registered():
     T = se3.exp([0.02, -0.01, 0.015, 0.01, -0.02, 0.015])
     source, target = pair(T, n=20_000)
     found = algorithm_1(points=4000).register(source, target, np.eye(4), rng())
@@ -127,7 +127,7 @@ def test_it_comes_near_with_other_points_of_the_same_surfaces():
     assert 0.2 < found.inlier_ratio < 0.7
 
 
-def test_the_guess_is_where_it_starts():
+def test_registration_starts_at_guess():
     T = se3.exp([0.3, 0.1, -0.2, 0.1, 0.4, -0.2])
     source, target = pair(T, n=400, noise=0, same_points=True)
     icp = algorithm_1(0.02, None)
@@ -168,7 +168,7 @@ class WatchedMatcher(Matcher):
         return Watched()
 
 
-def test_the_same_subset_is_used_through_all_iterations():
+def test_subset_is_the_same_in_all_iterations():
     source, target = pair(SMALL)
     selector = CountingSelector()
     base = algorithm_1(0.05)
@@ -186,7 +186,7 @@ def test_the_same_subset_is_used_through_all_iterations():
     assert icp.takes == {"cloud"}
 
 
-def test_the_seed_decides_the_result():
+def test_seed_determines_result():
     source, target = pair(SMALL)
     icp = algorithm_1(0.02)
     first, again, other = (
@@ -198,7 +198,7 @@ def test_the_seed_decides_the_result():
     assert first.errors != other.errors
 
 
-def test_the_number_of_threads_does_not_change_the_result():
+def test_result_is_independent_of_threads():
     source, target = pair(SMALL, n=9000)
     results = []
     for count in (1, 2, 3):
@@ -208,8 +208,8 @@ def test_the_number_of_threads_does_not_change_the_result():
     assert results[0] == results[1] == results[2]
 
 
-def test_a_flat_wall_slides_and_point_to_point_does_not_know():
-    """The wall fixes three directions of six; the others stay where the guess put them."""
+def test_point_to_point_slides_along_wall_unnoticed():
+    """The wall constrains three of six directions; the others stay near the guess."""
 
     def wall(seed):
         points = np.random.default_rng(seed).uniform(-1, 1, (8000, 3)) * [1, 1, 0]
@@ -225,7 +225,7 @@ def test_a_flat_wall_slides_and_point_to_point_does_not_know():
     assert claimed < 0.001
 
 
-def test_running_out_of_iterations_is_told():
+def test_iteration_limit_is_reported():
     source, target = pair(se3.exp([0.02, 0, 0, 0, 0, 0]), n=20_000)
     found = algorithm_1(max_iterations=4).register(source, target, np.eye(4), rng())
     assert not found.converged
@@ -242,19 +242,19 @@ def test_views_with_too_few_points_are_refused(count):
             algorithm_1().register(source, target, np.eye(4), rng())
 
 
-def test_views_apart_are_refused():
+def test_distant_views_are_refused():
     source, target = pair(SMALL)
     with pytest.raises(RegistrationError, match="only 0 points"):
         algorithm_1().register(source, target, se3.exp([5, 0, 0, 0, 0, 0]), rng())
 
 
-def test_views_on_a_line_are_refused():
+def test_collinear_points_are_refused():
     line = CloudFrame.of(np.outer(np.linspace(0, 1, 50), [1, 1, 1]))
     with pytest.raises(RegistrationError, match="line"):
         algorithm_1().register(line, line, np.eye(4), rng())
 
 
-def test_it_takes_the_images_of_a_camera():
+def test_images_of_camera_are_accepted():
     camera = Pinhole(width=40, height=30, fx=40, fy=40, cx=19.5, cy=14.5)
     v, u = np.mgrid[0:30, 0:40]
     depth = (2 + 0.3 * np.sin(u / 6) + 0.2 * np.cos(v / 5)).astype(np.float32)
@@ -267,7 +267,7 @@ def test_it_takes_the_images_of_a_camera():
     np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-6)
 
 
-def test_the_configuration_survives_a_round_trip():
+def test_configuration_round_trip():
     parts.discover("tofuse.registration")
     icp = algorithm_1(0.5, None, epsilon=1e-3, k=2, max_iterations=7)
     data = parts.to_dict(icp)

@@ -51,12 +51,12 @@ def cost(T, a, matches):
 # Selectors
 
 
-def test_all_takes_every_point():
+def test_all_selects_every_point():
     view = CloudFrame.of(np.zeros((7, 3)))
     np.testing.assert_array_equal(All().select(view, np.random.default_rng(0)), np.arange(7))
 
 
-def test_random_draws_without_repetition_and_in_order():
+def test_random_selection_is_sorted_without_repetition():
     view = CloudFrame.of(np.zeros((5000, 3)))
     index = Random(1000).select(view, np.random.default_rng(4))
     assert len(np.unique(index)) == 1000
@@ -67,7 +67,7 @@ def test_random_draws_without_repetition_and_in_order():
     assert (index != Random(1000).select(view, np.random.default_rng(5))).any()
 
 
-def test_random_favours_no_part_of_the_view():
+def test_random_selection_is_uniform():
     view = CloudFrame.of(np.zeros((100, 3)))
     rng = np.random.default_rng(0)
     counts = sum(np.bincount(Random(10).select(view, rng), minlength=100) for _ in range(3000))
@@ -75,7 +75,7 @@ def test_random_favours_no_part_of_the_view():
     assert abs(counts - 300).max() < 5 * 16.4
 
 
-def test_random_gives_all_of_a_small_view():
+def test_random_selects_all_points_of_small_view():
     view = CloudFrame.of(np.zeros((5, 3)))
     np.testing.assert_array_equal(Random(10).select(view, np.random.default_rng(0)), np.arange(5))
 
@@ -85,7 +85,7 @@ def test_random_gives_all_of_a_small_view():
 
 @settings(max_examples=25)
 @given(seed=seeds, reach=st.sampled_from([0.05, 0.3, np.inf]))
-def test_closest_point_pairs_each_point_with_its_closest(seed, reach):
+def test_closest_point_matches_brute_force(seed, reach):
     rng = np.random.default_rng(seed)
     T = se3.exp(rng.normal(0, 0.2, 6))
     a = alignment(rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1, (80, 3)), T)
@@ -100,7 +100,7 @@ def test_closest_point_pairs_each_point_with_its_closest(seed, reach):
 # Rejectors
 
 
-def test_max_distance_drops_what_is_further_than_two_resolutions():
+def test_max_distance_drops_pairs_beyond_two_resolutions():
     a = alignment(np.zeros((4, 3)), np.zeros((4, 3)), resolution=0.25)
     distance = np.array([0.1, 0.5, np.nextafter(0.5, 1), 3.0])
     matches = Matches(np.arange(4), np.arange(4), distance, np.array([1.0, 2, 3, 4]))
@@ -111,7 +111,7 @@ def test_max_distance_drops_what_is_further_than_two_resolutions():
     assert MaxDistance(3.0).reach(0.1) == pytest.approx(0.3)
 
 
-def test_unique_keeps_the_shortest_and_of_equals_the_first():
+def test_unique_keeps_shortest_and_first_of_equal_pairs():
     a = alignment(np.zeros((7, 3)), np.zeros((3, 3)))
     target = np.array([0, 1, 0, 1, 0, 2, 1])
     distance = np.array([0.3, 0.2, 0.1, 0.2, 0.2, 0.9, 0.2])
@@ -126,7 +126,7 @@ def test_unique_keeps_the_shortest_and_of_equals_the_first():
         st.tuples(st.integers(0, 6), st.sampled_from([0.0, 0.1, 0.2, 0.3])), max_size=40
     )
 )
-def test_unique_equals_its_twin(pairs_):
+def test_unique_matches_reference(pairs_):
     target = np.array([t for t, _ in pairs_], np.int64)
     distance = np.array([d for _, d in pairs_], float)
     best: dict[int, int] = {}
@@ -148,7 +148,7 @@ def test_unique_equals_its_twin(pairs_):
     kind=st.sampled_from(["noisy", "planar", "mirrored", "unrelated"]),
     weighted=st.booleans(),
 )
-def test_no_motion_fits_better_than_aruns(seed, m, kind, weighted):
+def test_no_motion_fits_better_than_that_of_arun(seed, m, kind, weighted):
     rng = np.random.default_rng(seed)
     source = rng.normal(size=(m, 3))
     if kind == "planar":
@@ -169,7 +169,7 @@ def test_no_motion_fits_better_than_aruns(seed, m, kind, weighted):
             assert cost(T @ se3.exp(xi), a, matches) >= best * (1 - 1e-12) - 1e-12
 
 
-def test_the_weighted_rotation_agrees_with_scipy():
+def test_weighted_rotation_agrees_with_scipy():
     rng = np.random.default_rng(1)
     a = alignment(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
     weight = rng.uniform(0.1, 2, 30)
@@ -180,8 +180,8 @@ def test_the_weighted_rotation_agrees_with_scipy():
     np.testing.assert_allclose(got[:3, :3], want.as_matrix(), atol=1e-12)
 
 
-def test_the_best_fit_is_never_a_reflection():
-    """Umeyama's case: the best orthogonal matrix mirrors, the best rotation does not."""
+def test_best_fit_is_never_a_reflection():
+    """Umeyama's case: the best orthogonal matrix is a reflection, the best rotation is not."""
     rng = np.random.default_rng(2)
     source = rng.normal(size=(20, 3))
     a = alignment(source, source * [1, 1, -1])
@@ -202,7 +202,7 @@ def test_the_best_fit_is_never_a_reflection():
     ],
     ids=["line", "one place"],
 )
-def test_pairs_that_fix_no_rotation_are_refused(source):
+def test_degenerate_pairs_are_refused(source):
     a = alignment(source, se3.transform(se3.exp([1, 2, 3, 0.1, 0.2, 0.3]), source))
     with pytest.raises(RegistrationError, match="line"):
         PointToPoint().motion(pairs(4), a)
@@ -215,7 +215,7 @@ def test_fewer_than_three_pairs_are_refused(m):
         PointToPoint().motion(pairs(m), a)
 
 
-def test_the_kernels_equal_their_twins():
+def test_kernels_match_numpy():
     rng = np.random.default_rng(6)
     p, q, weight = rng.normal(size=(20, 3)), rng.normal(size=(30, 3)), rng.uniform(0.1, 2, 12)
     i, j = rng.integers(0, 20, 12), rng.integers(0, 30, 12)
@@ -229,7 +229,7 @@ def test_the_kernels_equal_their_twins():
     assert size == pytest.approx((weight * ((p[i] ** 2).sum(1) + (q[j] ** 2).sum(1))).sum())
 
 
-def test_information_is_that_of_the_right_perturbation():
+def test_information_is_for_right_perturbation():
     rng = np.random.default_rng(3)
     T = se3.exp(rng.normal(size=6))
     points = rng.normal(size=(9, 3))
@@ -248,7 +248,7 @@ def test_information_is_that_of_the_right_perturbation():
     np.testing.assert_array_equal(got, got.T)
 
 
-def test_information_predicts_the_scatter_where_pairs_are_the_same_points():
+def test_information_predicts_scatter_for_true_pairs():
     """With true pairs the errors xi, T_found = T exp(xi), have covariance information^-1."""
     rng = np.random.default_rng(4)
     T = se3.exp([0.3, -1, 2, 0.5, 1.0, -0.7])
@@ -282,23 +282,23 @@ def test_information_of_perfect_data_is_finite():
         # Stable at once: two iterations of the first loop, k of the second.
         ([5] * 9, [1.0] * 9, 3, 5),
         ([5] * 9, [1.0] * 9, 1, 3),
-        # The number of correspondences keeps the first loop going for four.
+        # The number of correspondences continues the first loop for four iterations.
         ([5, 6, 7, 7, 8, 9, 9, 9, 9], [1.0] * 9, 2, 6),
-        # It may change again in the second loop, and E in the first doesn't count.
+        # It may change again in the second loop, and E in the first is ignored.
         ([5, 5, 6, 7, 8, 9, 9, 9, 9], [1.0] * 9, 3, 5),
-        # A change of E in the second loop starts the count again.
+        # A change of E in the second loop restarts the count.
         ([5] * 9, [1, 1, 1, 1, 2, 2, 2, 2, 2], 3, 8),
         ([5] * 9, [1, 2, 3, 3, 3, 3, 3, 3, 3], 3, 6),
         # The first change of the second loop is that from the last E of the first.
         ([5] * 9, [1, 2, 2, 2, 2, 2, 2, 2, 2], 3, 5),
         # A slow drift below epsilon counts as no change.
         ([5] * 9, np.arange(9) * 0.9e-4, 3, 5),
-        # Never.
+        # Not met.
         ([1, 2, 1, 2, 1, 2, 1, 2, 1], [1.0] * 9, 1, None),
         ([5] * 9, np.arange(9) * 1.1e-4, 1, None),
     ],
 )
-def test_two_loops_end_when_algorithm_1_says(counts, errors, k, iterations):
+def test_two_loops_stop_as_in_algorithm_1(counts, errors, k, iterations):
     rule = TwoLoops(epsilon=1e-4, k=k)
     history = History()
     met = None
@@ -316,7 +316,7 @@ def test_two_loops_end_when_algorithm_1_says(counts, errors, k, iterations):
     steps=st.lists(st.tuples(st.integers(1, 2), st.integers(1, 2)), min_size=1, max_size=14),
     k=st.integers(1, 3),
 )
-def test_two_loops_equal_two_loops_written_out(steps, k):
+def test_two_loops_match_literal_loops(steps, k):
     def written_out():
         i = 0
         while True:  # the first loop
@@ -354,6 +354,6 @@ def test_two_loops_equal_two_loops_written_out(steps, k):
         lambda: TwoLoops(max_iterations=0),
     ],
 )
-def test_senseless_options_are_refused(make):
+def test_invalid_options_are_refused(make):
     with pytest.raises(ValueError, match="must be"):
         make()

@@ -1,4 +1,4 @@
-"""Views prepared for tracking, on fully known scenes of planes."""
+"""Views prepared for tracking, on known scenes of planes."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def inside(view: PreparedView, margin=4):
 
 @pytest.mark.parametrize("sigma", [0.001, 0.004, 0.02])
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated", "ir", None])
-def test_the_noise_is_measured_on_the_view(sigma, amplitude):
+def test_noise_is_estimated_from_view(sigma, amplitude):
     view = prepare_view(wall(sigma=sigma, amplitude=amplitude), OPTIONS)
     found = np.median(view.sigma[view.sigma > 0])
     assert found == pytest.approx(sigma, rel=0.15)
 
 
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
-def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
+def test_noise_is_larger_at_low_amplitude(amplitude):
     frame = wall(sigma=0.004, amplitude=amplitude, spread=0.5)
     view = prepare_view(frame, OPTIONS)
     clean = wall(sigma=0.0, amplitude=amplitude, spread=0.5)
@@ -77,7 +77,7 @@ def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
         assert off[part].std() == pytest.approx(1, rel=0.15)
 
 
-def test_a_floor_in_a_coarse_image_is_no_edge() -> None:
+def test_floor_in_coarse_image_is_no_edge() -> None:
     """Its depth changes by more than `edge_jump` from row to row, far from any edge."""
     camera = Pinhole(64, 48, 45.0, 45.0, 31.5, 23.5)
     rays = camera.rays().astype(float)
@@ -89,7 +89,7 @@ def test_a_floor_in_a_coarse_image_is_no_edge() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
-def test_scattered_gaps_cost_resolution_not_the_planes(share: float) -> None:
+def test_scattered_gaps_reduce_resolution_but_keep_planes(share: float) -> None:
     camera = Pinhole(352, 288, 460.0, 460.0, 175.5, 143.5)
     frame = wall(camera, 0.005)
     rng = np.random.default_rng(4)
@@ -100,7 +100,7 @@ def test_scattered_gaps_cost_resolution_not_the_planes(share: float) -> None:
     assert np.median(found, axis=0) == pytest.approx(PLANE, abs=0.01)
 
 
-def test_depth_projected_into_a_finer_image_is_halved_until_it_is_dense() -> None:
+def test_sparse_depth_is_downsampled_until_dense() -> None:
     camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
     frame = wall(camera, 0.005)
     grid = np.zeros(frame.depth.shape, bool)
@@ -110,7 +110,7 @@ def test_depth_projected_into_a_finer_image_is_halved_until_it_is_dense() -> Non
     assert view.planar_fraction > 0.8
 
 
-def test_gaps_that_hang_together_cost_no_resolution() -> None:
+def test_connected_gaps_keep_resolution() -> None:
     camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
     frame = wall(camera, 0.005)
     kept = np.ones(frame.depth.shape, bool)
@@ -122,16 +122,16 @@ def test_gaps_that_hang_together_cost_no_resolution() -> None:
     assert prepare_view(frame.keep(np.zeros_like(kept)), OPTIONS).z.shape == (240, 320)
 
 
-def test_the_cameras_own_noise_is_believed_up_to_a_factor():
+def test_stated_noise_is_used_up_to_a_factor():
     frame = wall(sigma=0.004)
     ramp = np.linspace(0.5, 2, 72, dtype=np.float32)[:, None].repeat(88, 1)
     view = prepare_view(replace(frame, sigma_image=0.0003 * ramp), OPTIONS)
     ratio = view.sigma / ramp * ray_lengths(CAMERA)
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-5)
-    assert ratio[0, 0] > 0.001  # what the view shows of it, 4 mm at places
+    assert ratio[0, 0] > 0.001  # the view reveals 4 mm at places
 
 
-def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
+def test_stated_variance_matches_errors():
     offs = []
     for seed in range(4):
         view = prepare_view(wall(sigma=0.005, seed=seed), OPTIONS)
@@ -142,7 +142,7 @@ def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
+def test_planes_match_scene_for_any_depth_kind(kind):
     view = prepare_view(wall(kind=kind), OPTIONS)
     assert view.index == 3
     assert view.planar_fraction > 0.9
@@ -153,7 +153,7 @@ def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
 
 
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
-def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
+def test_albedo_is_independent_of_range_and_incidence(amplitude):
     view = prepare_view(wall(amplitude=amplitude, texture=2.0), OPTIONS)
     assert view.has_albedo
     found = view.albedo[np.isfinite(view.albedo).all(-1)]
@@ -163,14 +163,14 @@ def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
     assert np.nanmax(level) - np.nanmin(level) < 0.02
 
 
-def test_without_amplitude_there_is_no_albedo_but_all_the_rest():
+def test_view_without_amplitude_has_no_albedo():
     view = prepare_view(wall(amplitude=None), OPTIONS)
     assert not view.has_albedo
     assert np.isnan(view.albedo).all()
     assert view.planar_fraction > 0.9
 
 
-def test_saturated_pixels_say_nothing_of_the_albedo():
+def test_saturated_pixels_have_no_albedo():
     frame = wall()
     light = frame.amplitude_image.copy()
     light[30:40, 30:40] = SATURATED_AMPLITUDE
@@ -181,7 +181,7 @@ def test_saturated_pixels_say_nothing_of_the_albedo():
 
 
 @pytest.mark.parametrize("columns", [88, 44])
-def test_a_ray_table_with_unknown_rays(columns):
+def test_ray_table_with_unknown_rays(columns):
     lens = BrownConrady(88, 72, 115.0, 115.0, 43.5, 35.5, k1=-0.2)
     table = lens.rays().copy()
     table[:6, :6] = np.nan
@@ -194,7 +194,7 @@ def test_a_ray_table_with_unknown_rays(columns):
     assert (view.planes[: 4 // step, : 4 // step] == 0).all()
     for name in ("planes", "plane_variance", "sigma"):
         assert np.isfinite(getattr(view, name)).all(), name
-    # Far from the holes they change nothing.
+    # Far from the gaps the result is unchanged.
     far = np.s_[-20 // step :, : 60 // step]
     np.testing.assert_allclose(view.planes[far], whole.planes[far], atol=1e-4)
     assert view.planar_fraction > 0.7
@@ -202,7 +202,7 @@ def test_a_ray_table_with_unknown_rays(columns):
 
 @pytest.mark.parametrize("columns", [320, 44])
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated", None])
-def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
+def test_view_without_valid_pixels_has_no_surface(columns, amplitude):
     frame = wall(amplitude=amplitude)
     blank = replace(frame, depth=np.zeros_like(frame.depth))
     view = prepare_view(blank, SurfaceOptions(columns=columns))
@@ -212,7 +212,7 @@ def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 40), (40, 2), (5, 5), (3, 100)])
-def test_tiny_images_give_a_view(shape):
+def test_tiny_images_are_prepared(shape):
     camera = Pinhole(shape[1], shape[0], 50.0, 50.0, shape[1] / 2, shape[0] / 2)
     view = prepare_view(wall(camera), SurfaceOptions(columns=16))
     assert view.planes.shape == (*view.z.shape, 4)
@@ -220,7 +220,7 @@ def test_tiny_images_give_a_view(shape):
     assert 0 <= view.planar_fraction <= 1
 
 
-def test_a_frame_full_of_nonsense_gives_a_view():
+def test_frame_of_invalid_values_is_prepared():
     rng = np.random.default_rng(5)
     depth = rng.choice([0, 1e-30, 1e-3, 1.0, 1e4, 1e30, np.inf, np.nan, -1], (72, 88))
     light = rng.choice([0, -1, 1.0, 1e30, np.inf, np.nan], (72, 88)).astype(np.float32)
@@ -231,7 +231,7 @@ def test_a_frame_full_of_nonsense_gives_a_view():
         assert np.isfinite(view.planes).all()
 
 
-def test_vga_is_reduced_to_the_columns_asked_for():
+def test_vga_is_reduced_to_requested_columns():
     camera = Pinhole(640, 480, 570.0, 570.0, 319.5, 239.5)
     view = prepare_view(wall(camera), SurfaceOptions(columns=320))
     assert view.z.shape == (240, 320)
@@ -241,7 +241,7 @@ def test_vga_is_reduced_to_the_columns_asked_for():
 
 
 @pytest.mark.parametrize("step", [1, 2])
-def test_the_lookup_finds_the_pixel_of_a_ray(step):
+def test_lookup_finds_pixel_of_ray(step):
     lens = BrownConrady(88, 72, 115.0, 115.0, 43.5, 35.5, k1=-0.25, k2=0.08, p1=0.01)
     projection = Projection.of(lens, step)
     rays = lens.rays()[5:-5:3, 5:-5:3].reshape(-1, 2).astype(float)
@@ -257,7 +257,7 @@ def test_the_lookup_finds_the_pixel_of_a_ray(step):
     assert np.abs(found - wanted).max() < 0.05
 
 
-def test_threads_change_nothing():
+def test_result_is_independent_of_threads():
     frame = wall(sigma=0.005)
     with threads(1):
         one = prepare_view(frame, OPTIONS)
@@ -268,8 +268,8 @@ def test_threads_change_nothing():
 
 
 @pytest.mark.parametrize("columns", [320, 50])
-def test_stated_noise_of_the_range_is_that_of_z_at_any_resolution(columns):
-    """Whatever the view shows: it has no noise at all."""
+def test_stated_range_noise_is_converted_to_z_at_any_resolution(columns):
+    """Regardless of the view, which has no noise here."""
     camera = Pinhole(88, 72, 60.0, 60.0, 43.5, 35.5)
     frame = wall(camera)
     view = prepare_view(
@@ -278,13 +278,13 @@ def test_stated_noise_of_the_range_is_that_of_z_at_any_resolution(columns):
     )
     wanted = 0.01 / ray_lengths(camera)
     if columns < 88:
-        # Means of four pixels that share no noise.
+        # Means of four pixels with independent noise.
         wanted = wanted.reshape(36, 2, 44, 2).mean((1, 3)) / 2
     np.testing.assert_allclose(view.sigma, wanted, rtol=2e-3)
 
 
 def smoothed(sigma, seed):
-    """A wall with waves on the right, as cameras see it whose neighbouring pixels share noise."""
+    """A wall with waves on the right, with noise that neighbouring pixels share."""
     rays = CAMERA.rays().astype(float)
     z = 1.5 + 0.03 * np.sin(25 * np.maximum(rays[..., 0] - 0.1, 0)) + 0.2 * rays[..., 1]
     noise = np.random.default_rng(seed).normal(size=z.shape)
@@ -292,7 +292,7 @@ def smoothed(sigma, seed):
     return RangeFrame(0, 0.0, CAMERA, (z + noise * sigma / noise.std()).astype(np.float32))
 
 
-def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
+def test_curved_surface_is_planar_within_stated_noise():
     frame = smoothed(0.01, 1)
     strict = replace(OPTIONS, flatness=0.0, smoothed=NEVER)
     blind = prepare_view(frame, strict)
@@ -302,7 +302,7 @@ def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
     assert blind_fraction < 0.75 < 0.95 < told_fraction
 
 
-def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():
+def test_nearly_flat_surface_is_planar_without_noise():
     """Waves of 3 cm are within 0.2 % of the depth of a plane, over the wider windows."""
     frame = smoothed(0.0005, 1)
     waves = np.s_[4:-4, 60:-4]
@@ -313,8 +313,8 @@ def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():
     assert strict < 0.75 < 0.95 < default
 
 
-def test_small_shapes_stand_where_the_camera_smoothed_its_noise_away():
-    """A bar of five pixels before a wall has planes of its own there, and nothing under noise."""
+def test_small_shapes_are_kept_if_camera_smooths_its_noise():
+    """A bar of five pixels before a wall has its own planes then, but none with pixel noise."""
     frame = smoothed(0.0005, 1)
     depth = frame.depth.copy()
     depth[:, 20:25] = 1.2
@@ -335,7 +335,7 @@ def test_small_shapes_stand_where_the_camera_smoothed_its_noise_away():
 
 
 def test_noise_is_no_edge():
-    """At 1.5 m, 4 cm between neighbours is noise here, and a step of 40 cm still is none."""
+    """At 1.5 m, 4 cm between neighbours is noise here, while a step of 40 cm remains an edge."""
     frame = wall(sigma=0.04, seed=2)
     strict, default = (
         prepare_view(frame, replace(OPTIONS, edge_sigmas=k)).planar_fraction for k in (0.0, 3.0)
@@ -348,8 +348,8 @@ def test_noise_is_no_edge():
     assert (planes[:, 10:30] > 0).mean() > 0.7
 
 
-def test_pixels_of_a_reduced_view_weigh_by_their_stated_noise():
-    """Where sigma is wrong by place, planes follow the bad pixels; where it is right, the good."""
+def test_pixels_of_reduced_view_are_weighted_by_stated_noise():
+    """With a uniform sigma, planes follow the noisy pixels; with the true one, the precise ones."""
     camera = Pinhole(176, 144, 230.0, 230.0, 87.5, 71.5)
     sigma = np.where(np.arange(176) % 4 < 2, 0.002, 0.03).astype(np.float32)[None].repeat(144, 0)
     clean = wall(camera)
@@ -386,7 +386,7 @@ def painted(shift=0.0, gain=1.0, *, color=True):
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.8, 0.6])
-def test_colour_holds_a_pose_before_a_flat_wall_whatever_the_exposure(gain):
+def test_colour_constrains_pose_before_flat_wall_at_any_exposure(gain):
     shift, true = 0.05, np.eye(4)
     true[0, 3] = shift
     views = [prepare_view(f, OPTIONS) for f in (painted(), painted(shift, gain))]
@@ -394,14 +394,14 @@ def test_colour_holds_a_pose_before_a_flat_wall_whatever_the_exposure(gain):
     assert aligned.photometric
     assert len(aligned.unobservable) == 0
     assert np.linalg.norm((aligned.T_world_source - true)[:3, 3]) < 0.003
-    # Of coded light: the power of the code is in it.
+    # Of coded values: includes the exponent of the gamma.
     assert aligned.exposure == pytest.approx(-np.log(gain) / 2.2, abs=0.02)
     bare = [prepare_view(f, OPTIONS) for f in (painted(color=False), painted(shift, color=False))]
     blind = align(bare[1], [Target(bare[0], np.eye(4))], np.eye(4), ProjectiveOptions())
     assert len(blind.unobservable) == 3
 
 
-def test_saturated_and_dark_colour_is_none():
+def test_saturated_and_dark_colour_is_invalid():
     frame = painted()
     color = frame.color_image.copy()
     color[40:60, 40:60, 1] = 255
@@ -412,19 +412,19 @@ def test_saturated_and_dark_colour_is_none():
     assert np.isfinite(view.albedo[44:56, 84:96]).all()
 
 
-def test_colour_that_is_not_registered_takes_no_part():
+def test_unregistered_colour_is_not_used():
     view = prepare_view(replace(painted(), color_registered=False), OPTIONS)
     assert not view.has_albedo
 
 
-def test_amplitude_goes_before_colour():
+def test_amplitude_is_preferred_to_colour():
     frame = replace(wall(amplitude="raw", texture=1.0), color_image=np.zeros((72, 88, 3), np.uint8))
     plain = prepare_view(replace(frame, color_image=None), OPTIONS)
     np.testing.assert_array_equal(prepare_view(frame, OPTIONS).albedo, plain.albedo)
 
 
-def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
-    """A group of pixels with a shared error is worth what one of them is, whatever its noise."""
+def test_shared_error_is_not_averaged_out() -> None:
+    """Pixels with a shared error weigh as much as one of them, whatever their noise."""
     frame = wall(sigma=0.004)
     plain = prepare_view(frame, OPTIONS)
     shared = np.zeros((72, 88), np.float32)
@@ -447,7 +447,7 @@ def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
     np.testing.assert_array_equal(unknown.plane_variance, plain.plane_variance)
 
 
-def test_a_shared_error_is_reduced_with_the_image() -> None:
+def test_shared_error_is_downsampled_with_image() -> None:
     frame = wall(sigma=0.004)
     shared = np.repeat(np.linspace(0.001, 0.02, 88, dtype=np.float32)[None], 72, 0)
     small = SurfaceOptions(columns=44)
@@ -461,7 +461,7 @@ def test_a_shared_error_is_reduced_with_the_image() -> None:
     np.testing.assert_allclose(added[seen], wanted[seen], rtol=0.15)
 
 
-def test_a_thinned_view_is_kept_once():
+def test_subsampled_view_is_cached():
     view = prepare_view(wall(sigma=0.01), OPTIONS)
     thin = view.subsampled(50)
     assert thin is view.subsampled(44)
@@ -469,7 +469,7 @@ def test_a_thinned_view_is_kept_once():
     np.testing.assert_array_equal(thin.z, view.z[1::2, 1::2])
 
 
-def test_views_without_light_share_one_image_of_it():
+def test_views_without_amplitude_share_one_albedo_image():
     dark = [prepare_view(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
     assert dark[0].albedo is dark[1].albedo
     assert dark[0].subsampled(50).albedo is dark[1].subsampled(50).albedo
@@ -479,8 +479,8 @@ def test_views_without_light_share_one_image_of_it():
     assert prepare_view(wall(), OPTIONS).albedo is not dark[0].albedo
 
 
-def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
-    """A slanted wall with a bar in front, whose left border mixes the light of both."""
+def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
+    """A slanted wall with a bar in front, whose left border has flying pixels."""
     frame = wall(sigma=0.004, seed=5)
     depth = frame.depth.copy()
     truth = wall().depth.copy()
@@ -495,7 +495,7 @@ def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
     assert not after[:, 40].any()
     assert after[:, [36, 37, 38, 41, 42, 43, 57, 58]].mean() > 0.95
     np.testing.assert_array_equal(more.planes[view.planes[..., 3] > 0][:, 3] > 0, True)
-    # They lie where the surfaces are, and say how well they know.
+    # They match the surfaces, within their stated uncertainty.
     new = after & ~before
     off = 1 / more.planes[6:-6, :, 3][new] - truth[6:-6][new]
     assert np.abs(off).mean() < 0.003

@@ -22,7 +22,7 @@ GEOMETRY = replace(OPTIONS, photometric=False)
 
 
 class Pair:
-    """Frames of a scene and where they truly were; the first is the world."""
+    """Frames of a scene and their true poses; the first is the world."""
 
     def __init__(self, name, *indices, noise=False, texture=True):
         scene, sequence = build(name, texture=texture)
@@ -46,7 +46,7 @@ def corner():
 
 @pytest.fixture(scope="module")
 def wall():
-    """With noise: what geometry seems to hold of a wall is noise, and has to be seen through."""
+    """With noise, which must not be taken for constraints."""
     return Pair("wall", 0, 3, noise=True)
 
 
@@ -63,7 +63,7 @@ def assert_near(found, true, metres=0.001, degrees=0.02):
 
 @pytest.mark.parametrize("options", [OPTIONS, GEOMETRY], ids=["albedo", "geometry"])
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_a_known_motion_is_found(request, scene, options):
+def test_known_motion_is_found(request, scene, options):
     pair = request.getfixturevalue(scene)
     found = align(pair.views[1], [pair.target], np.eye(4), options)
     assert se3.angle(pair.poses[1]) + np.linalg.norm(pair.poses[1][:3, 3]) > 0.01
@@ -77,7 +77,7 @@ def test_a_known_motion_is_found(request, scene, options):
 
 
 @pytest.mark.parametrize("size", [0.02, 0.05])
-def test_the_start_does_not_matter_within_the_reach_of_the_coarse_level(room, size):
+def test_convergence_basin_of_coarse_level(room, size):
     rng = np.random.default_rng(1)
     for _ in range(3):
         off = size * rng.uniform(-1, 1, 6)
@@ -86,7 +86,7 @@ def test_the_start_does_not_matter_within_the_reach_of_the_coarse_level(room, si
         assert_near(found, room.poses[1], 0.002, 0.04)
 
 
-def test_albedo_holds_what_a_flat_wall_leaves_open(wall):
+def test_albedo_constrains_pose_before_flat_wall(wall):
     true = wall.poses[1]
     assert np.linalg.norm(true[:3, 3]) > 0.005
     found = align(wall.views[1], [wall.target], np.eye(4), OPTIONS)
@@ -94,13 +94,13 @@ def test_albedo_holds_what_a_flat_wall_leaves_open(wall):
     assert_near(found, true, 0.001, 0.03)
 
 
-def test_without_albedo_a_flat_wall_holds_three_directions_and_the_rest_stays(wall):
+def test_flat_wall_without_albedo_constrains_three_directions(wall):
     true = wall.poses[1]
     predicted = true @ se3.exp([0.03, -0.02, 0.015, 0.01, -0.015, 0.02])
     found = align(wall.views[1], [wall.target], predicted, GEOMETRY)
     assert found.unobservable.shape == (3, 6)
     np.testing.assert_allclose(found.unobservable @ found.unobservable.T, np.eye(3), atol=1e-9)
-    # The camera slides along the wall and turns about its normal: these are the three.
+    # The camera slides along the wall and rotates about its normal: these are the three.
     R = found.T_world_source[:3, :3]
     normal = R.T @ np.median(wall.views[0].normals.reshape(-1, 3), axis=0)
     normal /= np.linalg.norm(normal)
@@ -112,17 +112,17 @@ def test_without_albedo_a_flat_wall_holds_three_directions_and_the_rest_stays(wa
     basis = np.linalg.qr(free.T)[0]
     overlap = np.linalg.svd(found.unobservable @ basis)[1]
     assert overlap.min() > 0.98
-    # They stay where they were predicted ...
+    # They stay as predicted ...
     moved = se3.log(se3.inverse(predicted) @ found.T_world_source) / UNITS
     assert np.abs(found.unobservable @ moved).max() < 0.1
-    # ... and the held ones are found: distance and tilt of the wall.
+    # ... and the constrained ones are found: distance and tilt of the wall.
     left = se3.log(se3.inverse(true) @ found.T_world_source)
     assert abs(left[:3] @ normal) < 0.002
     tilt = left[3:] - (left[3:] @ normal) * normal
     assert np.degrees(np.linalg.norm(tilt)) < 0.05
 
 
-def test_a_corridor_leaves_its_length_open():
+def test_corridor_does_not_constrain_its_axis():
     pair = Pair("corridor", 0, 6, texture=False)
     found = align(pair.views[1], [pair.target], np.eye(4), GEOMETRY)
     assert len(found.unobservable) == 1
@@ -131,10 +131,10 @@ def test_a_corridor_leaves_its_length_open():
     assert np.abs(found.unobservable[0, 2]) > 0.9
 
 
-def test_outliers_do_not_move_it(room):
+def test_outliers_do_not_bias_pose(room):
     frame = room.frames[1]
     depth = frame.depth.copy()
-    depth[40:90, 60:110] *= 0.7  # somebody walks in: a tenth of the image
+    depth[40:90, 60:110] *= 0.7  # a person enters: a tenth of the image
     depth[100:130, 20:60] += 0.3
     light = frame.amplitude_image.copy()
     light[10:40, 30:90] *= 4
@@ -144,8 +144,8 @@ def test_outliers_do_not_move_it(room):
     assert found.inlier_ratio < 0.95
 
 
-def test_a_scene_under_a_magnifying_glass_is_as_robust(room):
-    """The slack of the coarse level is metres, but must not bridge what stands out up close."""
+def test_small_scene_is_equally_robust(room):
+    """The tolerance of the coarse level is in m, but must not include nearby obstacles."""
     coarse = replace(GEOMETRY, levels=OPTIONS.levels[:1])
     scale = 0.1  # the room becomes 0.3 m deep
     target, source = room.frames[:2]
@@ -167,7 +167,7 @@ def test_a_scene_under_a_magnifying_glass_is_as_robust(room):
 
 
 @pytest.mark.parametrize("gain", [1.5, 0.5])
-def test_an_exposure_that_changed_is_allowed_for(room, wall, gain):
+def test_changed_exposure_is_estimated(room, wall, gain):
     for pair in (room, wall):
         frame = pair.frames[1]
         brighter = replace(frame, amplitude_image=frame.amplitude_image * np.float32(gain))
@@ -177,7 +177,7 @@ def test_an_exposure_that_changed_is_allowed_for(room, wall, gain):
         assert_near(found, pair.poses[1], 0.001, 0.03)
 
 
-def test_several_targets_add_up(room):
+def test_several_targets_are_combined(room):
     targets = [room.target, Target(room.views[1], se3.inverse(room.poses[1]))]
     both = align(room.views[2], targets, room.poses[1], OPTIONS)
     assert_near(both, room.poses[2])
@@ -187,13 +187,13 @@ def test_several_targets_add_up(room):
     assert abs(both.inliers - one.inliers - other.inliers) < 0.02 * both.inliers
 
 
-def test_the_world_may_be_anywhere(room):
+def test_pose_of_world_is_arbitrary(room):
     T = se3.exp([3, -2, 1, 0.4, -0.8, 1.2])
     found = align(room.views[1], [Target(room.views[0], se3.inverse(T))], T, OPTIONS)
     assert_near(found, T @ room.poses[1])
 
 
-def test_threads_change_nothing(room):
+def test_result_is_independent_of_threads(room):
     results = []
     for count in (1, 2):
         with threads(count):
@@ -204,7 +204,7 @@ def test_threads_change_nothing(room):
     assert one.rms_m == two.rms_m
 
 
-def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
+def test_empty_view_stays_at_prediction(room):
     frame = room.frames[1]
     blank = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     T = se3.exp([0.1, 0, 0, 0, 0.1, 0])
@@ -215,7 +215,7 @@ def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
         np.testing.assert_allclose(found.T_world_source, T, atol=1e-9)
 
 
-def test_a_view_beyond_all_bounds_fits_nothing_and_stays_at_the_prediction(room):
+def test_view_with_infinite_planes_stays_at_prediction(room):
     planes = room.views[1].planes.copy()
     planes[60:70, :, :3] = np.inf
     view = replace(room.views[1], planes=planes)
@@ -226,7 +226,7 @@ def test_a_view_beyond_all_bounds_fits_nothing_and_stays_at_the_prediction(room)
     assert len(found.unobservable) == 6
 
 
-def test_points_lie_on_the_fitted_surface(room):
+def test_points_are_on_fitted_surface(room):
     view = room.views[0]
     some = points_of(view, 4)
     every = points_of(view, 1)

@@ -48,7 +48,7 @@ def test_clouds_of_any_size_are_registered(scale, degrees):
     assert len(found.unobservable) == 0
 
 
-def test_half_of_the_views_may_be_missing_in_the_other():
+def test_half_of_each_view_may_be_outside_overlap():
     for k in range(3):
         T = turn(rng(k).normal(size=3), 6)
         source = source_of(relief(4000, 2 * k + 1, 0.0, 1.0, outliers=100), T)
@@ -58,20 +58,20 @@ def test_half_of_the_views_may_be_missing_in_the_other():
         assert 0.4 < found.inlier_ratio < 0.65
 
 
-def test_images_of_a_camera_are_registered():
+def test_images_of_camera_are_registered():
     T = se3.exp([0.05, -0.04, 0.06, 0.05, -0.04, 0.06])
     found = tofuse.register(relief_image(T, 1, 0.003), relief_image(np.eye(4), 0, 0.003))
     assert error(found, T)[0] < 0.002
     assert error(found, T)[1] < 0.1
 
 
-def test_a_view_and_an_array_may_be_mixed():
+def test_view_and_array_may_be_mixed():
     T = turn([1, 2, 0.5], 3)
     found = tofuse.register(view(relief(3000, 1), T), relief(3000, 0))
     assert error(found, T)[0] < 0.003
 
 
-def test_a_real_pair_of_lidar_scans(shared_data):
+def test_real_pair_of_lidar_scans(shared_data):
     folder = shared_data / "lidar_pair_gt"
     source, target = (read_ply(folder / f"{name}.ply").points for name in ("source", "target"))
     T = np.loadtxt(folder / "T_target_source.txt")
@@ -85,7 +85,7 @@ def test_a_real_pair_of_lidar_scans(shared_data):
         assert len(found.unobservable) == 0
 
 
-def test_a_hundred_thousand_points_are_reduced():
+def test_large_clouds_are_downsampled():
     T = turn([1, 2, 0.5], 5)
     found = tofuse.register(source_of(relief(100_000, 1), T), relief(100_000, 0))
     assert found.points <= 20_000
@@ -93,7 +93,7 @@ def test_a_hundred_thousand_points_are_reduced():
     assert error(found, T)[1] < 0.05
 
 
-def test_map_coordinates_keep_their_precision():
+def test_map_coordinates_keep_precision():
     far = np.array([[500_000.0, 5_000_000, 300]])
     shift = np.eye(4)
     shift[:3, 3] = far
@@ -110,14 +110,14 @@ def test_map_coordinates_keep_their_precision():
 
 @pytest.mark.parametrize("noise", [0.001, 0.01])
 @pytest.mark.parametrize(("walls", "count"), [("z", 3), ("x", 3), ("xy", 1), ("xyz", 0)], ids=str)
-def test_what_slides_is_reported_and_left_as_guessed(walls, count, noise):
+def test_unobservable_directions_are_reported_and_stay_as_guessed(walls, count, noise):
     T = se3.exp([0.03, -0.02, 0.02, 0.01, 0.015, -0.01])
     target, source = (box_walls(4000, s, noise, walls) for s in (0, 1))
     guess = T @ se3.exp([0.01, 0.02, -0.01, 0.01, -0.01, 0.01])
     found = tofuse.register(source_of(source, T), target, guess=guess)
     assert found.unobservable.shape == (count, 6)
     np.testing.assert_allclose(np.linalg.norm(found.unobservable, axis=1), 1)
-    # What is held is found, the rest is that of the guess.
+    # Constrained directions are found, the rest is that of the guess.
     remapping = Remapping.of(found.unobservable, source_of(source, T)) if count else None
     missed = se3.inverse(T) @ found.T_target_source
     moved = se3.inverse(guess) @ found.T_target_source
@@ -127,7 +127,7 @@ def test_what_slides_is_reported_and_left_as_guessed(walls, count, noise):
     assert np.linalg.norm(se3.log(missed)) < 0.3 * noise + 2e-3
 
 
-def test_a_ball_can_turn():
+def test_ball_does_not_constrain_rotation():
     d = rng(0).normal(size=(8000, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     d = d[d[:, 2] < 0] * 0.3 + np.array([0, 0, 2])
@@ -137,7 +137,7 @@ def test_a_ball_can_turn():
     np.testing.assert_allclose(se3.transform(found.T_target_source, ball), [[0, 0, 2]], atol=2e-3)
 
 
-def test_hold_projects_motions():
+def test_remapping_projects_motions():
     points = rng(1).normal(size=(50, 3)) + np.array([0, 0, 2])
     slide = np.array([[1.0, 0, 0, 0, 0, 0]])
     remapping = Remapping.of(slide, points)
@@ -149,7 +149,7 @@ def test_hold_projects_motions():
     np.testing.assert_allclose(across, [0, 0.02, 0.03, 0, 0, 0], atol=1e-12)
 
 
-def test_another_method_may_be_given():
+def test_other_method_may_be_given():
     T = turn([1, 2, 0.5], 3)
     source, target = source_of(relief(3000, 1), T), relief(3000, 0)
     found = tofuse.register(source, target, method=Tricp(0.02, points=300, overlap=0.9))
@@ -160,7 +160,7 @@ def test_another_method_may_be_given():
     assert found.T_target_source.tobytes() != other.T_target_source.tobytes()
 
 
-def test_threads_do_not_change_a_bit():
+def test_result_is_independent_of_threads():
     target, source = bumpy_ball(12000, 0, 0.002), bumpy_ball(12000, 1, 0.002)
     results = []
     for count in (1, 2, 5):
@@ -170,7 +170,7 @@ def test_threads_do_not_change_a_bit():
     assert len({r.information.tobytes() for r in results}) == 1
 
 
-def test_averaged_is_the_mean_of_each_cube():
+def test_averaged_is_mean_of_each_cube():
     points = rng(2).uniform(-1, 1, (1000, 3))
     reduced = averaged(view(points), 0.5)
     low = points.astype(np.float32).astype(float).min(0)
@@ -200,7 +200,7 @@ GOOD = np.random.default_rng(0).normal(size=(200, 3))
         (GOOD * 1e12, "coordinates up to"),
     ],
 )
-def test_arrays_that_are_no_clouds_are_refused(bad, message):
+def test_invalid_arrays_are_refused(bad, message):
     with pytest.raises(tofuse.InputError, match=message) as raised:
         tofuse.register(bad, GOOD)
     assert str(raised.value).startswith("source: ")
@@ -221,7 +221,7 @@ def test_arrays_that_are_no_clouds_are_refused(bad, message):
     ],
     ids=["one place", "one place as target", "line", "far apart", "four places"],
 )
-def test_clouds_that_fix_no_motion_are_refused(source, target):
+def test_degenerate_clouds_are_refused(source, target):
     with pytest.raises(tofuse.RegistrationError):
         tofuse.register(source, target, guess=np.eye(4))
 
@@ -233,13 +233,13 @@ def test_empty_views_are_refused():
             tofuse.register(*pair)
 
 
-def test_a_guess_that_is_no_pose_is_refused():
+def test_invalid_guess_is_refused():
     for guess in (np.zeros((4, 4)), np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan)):
         with pytest.raises(tofuse.InputError, match="guess"):
             tofuse.register(GOOD, GOOD, guess=guess)
 
 
-def test_a_few_bad_points_are_dropped():
+def test_non_finite_points_are_dropped():
     T = turn([1, 2, 0.5], 3)
     source, target = source_of(relief(3000, 1), T), relief(3000, 0)
     source[::7] = np.nan
@@ -247,7 +247,7 @@ def test_a_few_bad_points_are_dropped():
     assert error(tofuse.register(source, target), T)[0] < 0.003
 
 
-def test_the_finest_level_is_coarser_where_noise_is_thicker():
+def test_finest_level_depends_on_noise():
     plane = rng(0).uniform(-1, 1, (20000, 3)) * [1, 1, 0] + np.array([0, 0, 2])
     sizes = []
     for noise in (0.0, 0.02):
@@ -262,6 +262,6 @@ def test_the_finest_level_is_coarser_where_noise_is_thicker():
 @pytest.mark.parametrize(
     "make", [lambda: CoarseToFine(resolution=0.0), lambda: CoarseToFine(points=5)]
 )
-def test_senseless_options_are_refused(make):
+def test_invalid_options_are_refused(make):
     with pytest.raises(ValueError, match="must be"):
         make()

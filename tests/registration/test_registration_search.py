@@ -40,7 +40,7 @@ def pair():
     return view(B, seed=1), view(A, seed=2)
 
 
-# The kernels against NumPy
+# The kernels compared with NumPy
 
 
 def random_image(rng, shape=(9, 12)):
@@ -69,7 +69,7 @@ def random_points(rng, count):
 
 
 def looked_up(p, grid, frame):
-    """(N, 5) entries of the grid where points land, and whether they do."""
+    """(N, 5) entries of the grid at the projections of points, and whether they are inside."""
     with np.errstate(divide="ignore", invalid="ignore"):
         u = np.floor((p[:, 0] / p[:, 2] - frame[0]) * frame[2] + 0.5)
         v = np.floor((p[:, 1] / p[:, 2] - frame[1]) * frame[3] + 0.5)
@@ -80,7 +80,7 @@ def looked_up(p, grid, frame):
 
 
 def scored(p, n, light, grid, frame, T, reach):
-    """What `score_grid` sums one way, point by point; weights of and differences in albedo."""
+    """One direction of `score_grid`, point by point; weights and differences of albedo."""
     q, m = se3.transform(T, p.astype(float)), n @ T[:3, :3].T
     plane, inside = looked_up(q, grid, frame)
     r = (plane[:, :3] * q).sum(1) - plane[:, 3]
@@ -98,7 +98,7 @@ def small_poses(rng, count):
     return np.stack([se3.exp(rng.normal(0, 0.15, 6)) for _ in range(count)])
 
 
-def test_every_pose_of_a_grid_is_scored_both_ways():
+def test_poses_of_grid_are_scored_in_both_directions():
     rng = np.random.default_rng(3)
     grids = [random_image(rng), random_image(rng, (11, 10))]
     source, target = random_points(rng, 60), random_points(rng, 50)
@@ -128,14 +128,14 @@ def test_every_pose_of_a_grid_is_scored_both_ways():
             assert scores[a, b] == pytest.approx((there + back - against) / 110, abs=1e-5)
     assert scores.std() > 0.01
     assert 2 < most < 22
-    # A longer exposure says nothing.
+    # A longer exposure changes nothing.
     brighter = grids[0][0].copy()
     brighter[..., 4] += 0.7
     longer = kernels.Resampled(*source, lights[0] + np.float32(0.7), brighter, grids[0][1])
     again = np.full((6, 4), np.nan, np.float32)
     kernels.score_grid(longer, views[1], rotations, moves[None], 0.4, 0.3, again, 0, 6)
     np.testing.assert_allclose(again, scores, atol=1e-5)
-    # A translation of its own for each rotation.
+    # A separate translation for each rotation.
     single = np.full((4, 1), np.nan, np.float32)
     own = np.ascontiguousarray(moves[:, None])
     kernels.score_grid(*views, rotations[:4], own, 0.4, 0.3, single, 0, 4)
@@ -143,7 +143,7 @@ def test_every_pose_of_a_grid_is_scored_both_ways():
 
 
 def residuals(p, n, grid, frame, T, forward, reach, cosine, xi):
-    """Residuals at T exp(xi) of the points that take part at T, and their weights."""
+    """Residuals at T exp(xi) of the points used at T, and their weights."""
 
     def at(pose):
         return se3.transform(pose if forward else se3.inverse(pose), p.astype(float))
@@ -158,8 +158,8 @@ def residuals(p, n, grid, frame, T, forward, reach, cosine, xi):
     return moved[used], ((1 - (r / reach) ** 2) ** 2)[used]
 
 
-def test_a_step_of_the_icp_solves_both_ways_equations():
-    """Its Jacobians against central differences, its solution against NumPy's."""
+def test_icp_step_solves_equations_of_both_directions():
+    """Its Jacobians compared with central differences, its solution with NumPy's."""
     rng = np.random.default_rng(5)
     grids = [random_image(rng), random_image(rng)]
     source, target = random_points(rng, 150), random_points(rng, 150)
@@ -188,11 +188,11 @@ def test_a_step_of_the_icp_solves_both_ways_equations():
     ]
     kernels.refine_poses(*views, np.array([reach]), cosine, unit, poses, 1, 2)
     np.testing.assert_allclose(poses[1], expected, atol=2e-5)
-    np.testing.assert_array_equal(poses[0], np.eye(4))  # not its turn
+    np.testing.assert_array_equal(poses[0], np.eye(4))  # outside the given range
 
 
 def agreed(source, target, T, o):
-    """`agree` one way, without the kernel: (compared, support, violation)."""
+    """One direction of `agree`, without the kernel: (compared, support, violation)."""
     stride = 2
     rows, columns = source.z.shape
     counts = np.zeros(3)
@@ -231,22 +231,22 @@ def agreed(source, target, T, o):
     return counts
 
 
-def test_agreement_counts_what_a_loop_over_the_pixels_counts(pair):
+def test_agreement_matches_loop_over_pixels(pair):
     o = AgreementOptions(points=int(0.25 * pair[0].planar_fraction * pair[0].z.size))
     T = TRUE @ se3.exp([0.02, 0, 0.05, 0, 0.03, 0])
     found = agreement(*pair, T, o)
     counts = agreed(*pair, T, o) + agreed(pair[1], pair[0], se3.inverse(T), o)
-    # A pixel more or less: the kernel takes the camera from a lookup.
+    # A pixel more or less: the kernel projects with a lookup table.
     shares = np.array([found.overlap, found.support, found.violation]) * found.points
     np.testing.assert_allclose(shares, counts, atol=0.004 * found.points)
     assert counts.min() > 50
     assert found.score == pytest.approx(found.support - 2 * found.violation)
 
 
-# What both images say
+# Agreement of two images
 
 
-def test_images_agree_on_the_true_pose(pair):
+def test_images_agree_on_true_pose(pair):
     found = agreement(*pair, TRUE)
     assert found.support > 0.9 * found.overlap > 0.4
     assert found.violation < 0.005
@@ -254,8 +254,8 @@ def test_images_agree_on_the_true_pose(pair):
 
 
 @pytest.mark.parametrize("aside", [0.15, -0.15])
-def test_a_wrong_pose_puts_points_where_the_other_camera_saw_through(pair, aside):
-    """Too near, source points stand before the target's surfaces; too far, the other way round."""
+def test_wrong_pose_violates_free_space(pair, aside):
+    """Too near, source points are in front of the target's surfaces; too far, vice versa."""
     wrong = TRUE.copy()
     wrong[2, 3] += aside
     right, found = agreement(*pair, TRUE), agreement(*pair, wrong)
@@ -263,13 +263,13 @@ def test_a_wrong_pose_puts_points_where_the_other_camera_saw_through(pair, aside
     assert found.score < right.score - 0.5
 
 
-def test_both_ways_are_one(pair):
+def test_agreement_is_symmetric(pair):
     T = TRUE @ se3.exp([0.03, 0.01, 0, 0, 0.02, 0])
     there, back = agreement(*pair, T), agreement(pair[1], pair[0], se3.inverse(T))
     assert back.score == pytest.approx(there.score, abs=1e-3)
 
 
-def test_views_back_to_back_share_nothing(pair):
+def test_opposite_views_do_not_overlap(pair):
     found = agreement(*pair, se3.exp([0, 0, 0, 0, np.pi, 0]))
     assert (found.overlap, found.support, found.score) == (0, 0, 0)
     assert found.rms_m == np.inf
@@ -278,7 +278,7 @@ def test_views_back_to_back_share_nothing(pair):
 # The floor
 
 
-def test_floor_is_found_below_a_table():
+def test_floor_is_found_below_table():
     table = [((0.0, 0.2, 1.6), (1.2, 0.02, 0.5), 0.0)]
     T = camera(0.0, 0.0, 0.0)
     floor = find_floor(view(T, boxes=table), np.array([0.0, 1.0, 0.0]))
@@ -288,7 +288,7 @@ def test_floor_is_found_below_a_table():
     assert np.degrees(np.arccos(floor.normal @ down)) < 0.5
 
 
-def test_floor_is_found_in_a_camera_that_lies_on_its_side():
+def test_floor_is_found_by_camera_on_its_side():
     T = camera(0.0, 0.0, 0.0) @ se3.exp([0, 0, 0, 0, 0, np.pi / 2])
     views = view(T, seed=1), view(T, seed=2)
     floors = find_floors(views)
@@ -297,12 +297,12 @@ def test_floor_is_found_in_a_camera_that_lies_on_its_side():
     for floor in floors:
         assert floor.height == pytest.approx(1.0, abs=0.02)
         assert np.degrees(np.arccos(floor.normal @ down)) < 1
-    # Who knows better what is down is accepted.
+    # Known gravity takes precedence.
     wrong = np.array([0.0, 0.0, 1.0])
     assert find_floors(views, gravity=(wrong, wrong)) is None
 
 
-def test_the_lowest_plane_is_the_one_with_most_points_and_few_below():
+def test_lowest_plane_has_most_points_and_few_below():
     rng = np.random.default_rng(3)
     p = rng.normal(size=(300, 3)) * [1, 0.4, 1] + [0, 0, 3]
     n = rng.normal(size=(300, 3)) * 0.2 + [0, 1, 0]
@@ -315,7 +315,7 @@ def test_the_lowest_plane_is_the_one_with_most_points_and_few_below():
         assert kernels.lowest_plane(p, n, band, tried, cosine, most, 3.0) == tried[on.argmax()]
 
 
-def test_of_poses_that_differ_the_best_stay():
+def test_best_of_distinct_poses_are_kept():
     rng = np.random.default_rng(1)
     said = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
     poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
@@ -331,12 +331,12 @@ def test_of_poses_that_differ_the_best_stay():
     assert _distinct([], DISTINCT_M) == ()
 
 
-def test_no_floor_where_the_camera_looks_at_a_wall():
+def test_no_floor_is_found_in_view_of_wall():
     level = view(camera(0.0, 2.4, 0.0, pitch=0.0), boxes=[])
     assert find_floors((level, level)) is None
 
 
-def test_rough_planes_fill_what_noise_left_open():
+def test_rough_planes_fill_noisy_regions():
     """A view whose far part is much noisier than its noise model has planes only nearby."""
     frame = seen(A, sigma=0.001)
     rng = np.random.default_rng(2)
@@ -356,7 +356,7 @@ def test_rough_planes_fill_what_noise_left_open():
 
 
 @pytest.mark.parametrize("mode", ["planar", "full", "auto", "both"])
-def test_a_large_step_is_found_without_a_hint(pair, mode):
+def test_large_step_is_found_without_guess(pair, mode):
     found = search(*pair, SearchOptions(mode=mode))
     metres, degrees = error(found.T_target_source, TRUE)
     assert metres < 0.02
@@ -376,7 +376,7 @@ def test_known_gravity_is_used(pair):
     assert search(*pair, SearchOptions(mode="planar"), gravity=(aside, aside)) is None
 
 
-def test_a_box_alone_looks_alike_turned_by_a_quarter():
+def test_single_box_is_ambiguous_by_90_degrees():
     box = [((0.0, 0.6, 2.0), (0.4, 0.4, 0.4), 0.4)]
     around = [np.array([0, 0.6, 2.0]) + 2.2 * np.array([np.sin(a), 0, -np.cos(a)]) for a in (0, 1)]
     poses = []
@@ -398,7 +398,7 @@ def test_a_box_alone_looks_alike_turned_by_a_quarter():
         assert said.contradiction < 0.02
 
 
-def test_views_of_different_places_have_little_in_common(pair):
+def test_views_of_different_places_agree_less(pair):
     other = [((-0.3, 0.4, 1.4), (0.15, 0.6, 0.3), 0.1), ((0.6, 0.85, 1.9), (0.4, 0.15, 0.3), 0.0)]
     elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
     found = search(elsewhere, pair[1], SearchOptions())
@@ -406,7 +406,7 @@ def test_views_of_different_places_have_little_in_common(pair):
     assert found.margin < 0.1
 
 
-def test_the_answer_does_not_depend_on_the_number_of_threads(pair):
+def test_result_is_independent_of_threads(pair):
     answers = []
     for count in (1, 3):
         with threads(count):
@@ -416,8 +416,8 @@ def test_the_answer_does_not_depend_on_the_number_of_threads(pair):
         assert a.score == b.score
 
 
-def test_albedo_tells_where_geometry_is_alike():
-    """Bare walls, 27 degrees apart, textured."""
+def test_albedo_resolves_geometric_ambiguity():
+    """Bare textured walls, 27 degrees apart."""
     effects = Effects.none(shot_noise=True)
     recording = simulate_recording("empty-room", every=30, frames=9, effects=effects).select(3)
     views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
@@ -439,15 +439,15 @@ def test_albedo_tells_where_geometry_is_alike():
     assert right["without"] < 4
 
 
-def test_a_view_of_nothing_is_not_searched(pair):
+def test_empty_view_is_not_searched(pair):
     frame = seen(A)
     empty = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     assert search(empty, pair[1]) is None
     assert search(pair[0], empty) is None
 
 
-def test_the_tracker_connects_a_view_after_a_large_step_by_a_search():
-    """It goes on, or is linked to the view before; without searches it begins a component."""
+def test_tracker_connects_view_after_large_step_by_search():
+    """It continues, or is linked to the view before; without searches it starts a component."""
     frames = [seen(A, seed=0), seen(B, seed=1)]
     for searches in (False, True):
         tracker = Keyframes(searches=searches).start(0)
@@ -475,8 +475,8 @@ def test_options_out_of_range_are_refused(wrong):
         SearchOptions(**wrong)
 
 
-def test_recorded_views_are_found_without_a_hint(shared_data):
-    """A Kinect v2 round boxes: neighbours 0.5 m and 26 degrees apart, and the loop's two ends."""
+def test_recorded_views_are_found_without_guess(shared_data):
+    """A Kinect v2 around boxes: neighbours 0.5 m and 26 degrees apart, and the ends of the loop."""
     recording = open_recording(shared_data / "kinectv2_loop" / "recording")
     _, poses = read_tum(shared_data / "kinectv2_loop" / "recording" / "reference_poses.txt")
     views = [prepare_view(frame, SurfaceOptions()) for frame in recording]

@@ -40,7 +40,7 @@ def icp(metric, resolution=0.03, reach=None, points=None, epsilon=1e-3, steps=10
 
 
 def perfect(points, normals, T):
-    """Alignment of a cloud with itself, moved by T, every point with its own partner."""
+    """Alignment of a cloud with itself, moved by T, with every point matched to itself."""
     target = CloudFrame(0, 0.0, points.astype(np.float32), normals=normals.astype(np.float32))
     back = se3.inverse(T)
     source = CloudFrame(
@@ -56,7 +56,7 @@ def perfect(points, normals, T):
 
 
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
-def test_true_pairs_are_aligned_in_a_few_steps(metric):
+def test_true_pairs_are_aligned_in_few_steps(metric):
     T = se3.exp([0.1, -0.2, 0.15, 0.2, -0.1, 0.25])
     points = stone(400, 0)
     normals = rng(1).normal(size=points.shape)
@@ -69,7 +69,7 @@ def test_true_pairs_are_aligned_in_a_few_steps(metric):
     np.testing.assert_allclose(alignment.T_target_source, T, atol=1e-5)
 
 
-def test_point_to_plane_converges_in_fewer_iterations_than_point_to_point():
+def test_point_to_plane_converges_faster_than_point_to_point():
     target = view(stone(3000, 0))
     for k in range(3):
         T = turn(rng(k).normal(size=3), 10)
@@ -82,8 +82,8 @@ def test_point_to_plane_converges_in_fewer_iterations_than_point_to_point():
         assert error(point, T)[1] > 3 * error(plane, T)[1]
 
 
-def test_symmetric_is_zero_for_any_two_points_of_a_ball():
-    # Points slide on their own ball: tangent planes are left, the symmetric error is not.
+def test_symmetric_error_vanishes_on_a_ball():
+    # Points slide on their own ball: they leave the tangent planes, the symmetric error stays zero.
     r = rng(3)
     ball = r.normal(size=(2, 500, 3))
     a, b = ball / np.linalg.norm(ball, axis=2)[..., None]
@@ -101,7 +101,7 @@ def test_symmetric_is_zero_for_any_two_points_of_a_ball():
     assert np.abs(moved - np.eye(4)).max() > 0.01
 
 
-def test_symmetric_converges_faster_than_point_to_plane_from_far_away():
+def test_symmetric_metric_converges_faster_than_point_to_plane():
     target = view(stone(3000, 0), origin=(0, 0, 2))
     iterations = {Symmetric: 0, PointToPlane: 0}
     for k in range(6):
@@ -116,15 +116,15 @@ def test_symmetric_converges_faster_than_point_to_plane_from_far_away():
     assert iterations[Symmetric] < 0.8 * iterations[PointToPlane]
 
 
-def test_gicp_hardly_minds_how_far_pairs_may_be_apart():
-    """Figures 3 to 5 of Segal et al.: the largest distance is no longer hard to choose."""
+def test_gicp_is_insensitive_to_maximum_distance():
+    """Figures 3 to 5 of Segal et al.: the largest distance is easy to choose."""
     worst = {}
     for metric in (PlaneToPlane(), PointToPlane()):
         for reach in (1, 4, 16):
             errors = []
             for k in range(4):
                 T = turn(rng(k).normal(size=3), 2)
-                # Three fifths of the views overlap; pairs of other points are wrong.
+                # The views overlap by three fifths; all other pairs are wrong.
                 target = view(relief(2500, 2 * k, -0.5, 0.5))
                 source = view(relief(2500, 2 * k + 1, -0.1, 0.9), T)
                 method = icp(metric, 0.02, reach, points=800, steps=50)
@@ -136,7 +136,7 @@ def test_gicp_hardly_minds_how_far_pairs_may_be_apart():
 
 
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
-def test_robust_losses_stand_a_tenth_of_gross_errors(metric):
+def test_robust_losses_tolerate_gross_errors(metric):
     T = turn([1, 2, 0.5], 2)
     target = view(relief(3000, 0))
     r = rng(5)
@@ -151,7 +151,7 @@ def test_robust_losses_stand_a_tenth_of_gross_errors(metric):
     assert error(found, T)[0] < 0.002
 
 
-def test_losses_are_their_formulas():
+def test_losses_match_formulas():
     r = np.array([0, 1, 2, 5, 20.0, -1, -2]) * 0.01
     sigma = 1.4826 * 0.02
     x = np.abs(r) / sigma
@@ -163,7 +163,7 @@ def test_losses_are_their_formulas():
     np.testing.assert_allclose(loss_weights("tukey", r, 1e-3), tukey)
 
 
-def test_precise_points_count_more():
+def test_precise_points_have_more_weight():
     """With noise of 1 mm on one half and 2 cm on the other, sigma weights halve the error."""
     squares = np.zeros(2)
     for k in range(6):
@@ -181,7 +181,7 @@ def test_precise_points_count_more():
 
 
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
-def test_information_predicts_the_scatter_of_the_estimates(metric):
+def test_information_predicts_scatter(metric):
     T = turn([1, 2, 0.5], 1)
     chi2 = []
     for k in range(24):
@@ -190,15 +190,15 @@ def test_information_predicts_the_scatter_of_the_estimates(metric):
         xi = se3.log(se3.inverse(T) @ found.T_target_source)
         np.testing.assert_allclose(found.information, found.information.T, rtol=1e-9)
         chi2.append(xi @ found.information @ xi)
-    # Six, were all pairs independent; neighbours share the noise of their plane fits.
+    # Six if all pairs were independent; neighbours share the noise of their plane fits.
     assert 3 < np.median(chi2) < 20
 
 
-def test_information_is_about_the_sources_origin():
+def test_information_refers_to_source_origin():
     target, source = view(relief(1500, 0)), view(relief(1500, 1))
     method = icp(PointToPlane(), reach=3)
     here = method.register(source, target, np.eye(4), rng())
-    # The same source in a frame that was moved: T' = T S^-1, xi' = Ad(S) xi.
+    # The same source in a moved frame: T' = T S^-1, xi' = Ad(S) xi.
     S = se3.exp([0.3, -0.5, 1, 0.4, -0.3, 0.2])
     moved = CloudFrame.of(se3.transform(S, source.points), index=1)
     moved = replace(moved, origin=se3.transform(S, np.zeros((1, 3)))[0])
@@ -219,7 +219,7 @@ SLIDES = {
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
 @pytest.mark.parametrize("scene", SLIDES)
 @pytest.mark.parametrize("noise", [0.002, 0.01])
-def test_directions_that_slide_are_found(scene, noise, metric):
+def test_degenerate_directions_are_found(scene, noise, metric):
     make, count = SLIDES[scene]
     source, target = view(make(3000, 1, noise)), view(make(3000, 2, noise))
     found = icp(metric, resolution=0.06, reach=2, steps=3).register(
@@ -233,8 +233,8 @@ def test_directions_that_slide_are_found(scene, noise, metric):
         assert np.abs(found.unobservable[:, [2, 3, 4]]).max() < 0.05
 
 
-def test_cross_information_of_a_wall_is_nil_where_the_plain_one_is_not():
-    # Noise in normals makes the plain information of sliding large: the cross-information not.
+def test_cross_information_of_wall_is_not_inflated_by_noise():
+    # Noise of the normals inflates the plain information about sliding, not the cross-information.
     source, target = (view(box_walls(3000, s, 0.01, "z")) for s in (1, 2))
     n = np.arange(3000)
     data, model = Points.of(source, n), Points.of(target, n)
@@ -248,21 +248,21 @@ def test_cross_information_of_a_wall_is_nil_where_the_plain_one_is_not():
     assert cross[2, 2] == pytest.approx(plain[2, 2], rel=0.05)
 
 
-def test_point_to_point_says_nothing_of_what_slides():
+def test_point_to_point_reports_no_degenerate_directions():
     source, target = (view(box_walls(500, s, 0.01, "z")) for s in (1, 2))
     found = icp(PointToPoint(), steps=3).register(source, target, np.eye(4), rng())
     assert found.unobservable.shape == (0, 6)
 
 
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
-def test_without_normals_it_says_so(metric):
+def test_missing_normals_are_reported(metric):
     line = view(np.outer(np.linspace(0, 1, 50), [1, 1, 1]))
     with pytest.raises(RegistrationError, match="have normals"):
         icp(metric).register(line, line, np.eye(4), rng())
 
 
 @pytest.mark.parametrize("metric", [*SURFACE_METRICS, PointToPoint()])
-def test_a_guess_that_is_no_exact_rotation_does_no_harm(metric):
+def test_inexact_rotation_of_guess_is_tolerated(metric):
     T = turn([1, 2, 0.5], 3)
     source, target = view(relief(1000, 1), T), view(relief(1000, 0))
     guess = np.round(T, 4)
@@ -273,7 +273,7 @@ def test_a_guess_that_is_no_exact_rotation_does_no_harm(metric):
 
 
 @pytest.mark.parametrize("metric", SURFACE_METRICS)
-def test_threads_do_not_change_a_bit(metric):
+def test_result_is_independent_of_threads(metric):
     T = turn([1, 2, 0.5], 3)
     p, q = relief(6000, 1), relief(6000, 0)
     found = []

@@ -62,7 +62,7 @@ def _sigmas(C):
 
 @pytest.fixture(scope="module")
 def corner_errors():
-    """Whitened errors (N, 6) of a corner that only noise disturbs, by two covariances."""
+    """Whitened errors (N, 6) of a corner with noise only, by two covariances."""
     T = se3.exp([0.004, -0.003, 0.005, 0.002, -0.003, 0.002])
     ours, plain = [], []
     for k in range(40):
@@ -78,20 +78,20 @@ def corner_errors():
     return np.array(ours), np.array(plain)
 
 
-def test_covariance_holds_errors_of_noise(corner_errors):
+def test_covariance_covers_errors_of_noise(corner_errors):
     ours, _ = corner_errors
     within = np.mean(np.abs(ours) < 1.96)
     assert within > 0.88
-    # Not so wide that it says nothing.
+    # Not so wide as to be useless.
     assert np.sqrt(np.mean(ours**2)) > 0.3
 
 
-def test_plain_information_is_too_sure(corner_errors):
+def test_plain_information_is_overconfident(corner_errors):
     ours, plain = corner_errors
     assert np.sqrt(np.mean(plain**2)) > 1.5 * np.sqrt(np.mean(ours**2))
 
 
-def test_patches_that_disagree_widen_the_covariance():
+def test_inconsistent_patches_increase_covariance():
     T = se3.exp([0.01, 0, 0, 0, 0.01, 0])
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     bend = 0.02 * np.sin(2 * np.pi * u / 44) * np.sin(2 * np.pi * v / 36)
@@ -103,7 +103,7 @@ def test_patches_that_disagree_widen_the_covariance():
     assert (found[1] > 1.5 * found[0]).sum() >= 3
 
 
-def test_hidden_errors_grow_with_the_change_of_the_view():
+def test_hidden_errors_grow_with_change_of_view():
     steps = [se3.exp(np.array([0.02, 0, 0, 0, 0.03, 0]) * k) for k in (0, 1, 3)]
     found = []
     for T in steps:
@@ -114,7 +114,7 @@ def test_hidden_errors_grow_with_the_change_of_the_view():
     assert (found[1] < found[2]).all()
 
 
-def test_what_a_wall_leaves_open_is_as_uncertain_as_the_prediction():
+def test_degenerate_directions_of_wall_have_prior_uncertainty():
     wall = [(0.0, 0.0, 1.0, 2.0)]
     target, source = _view(0, wall), _view(1, wall)
     targets, aligned = _aligned(source, target, np.eye(4))
@@ -127,7 +127,7 @@ def test_what_a_wall_leaves_open_is_as_uncertain_as_the_prediction():
     assert (np.linalg.eigvalsh(C) > 0).all()
 
 
-def test_covariance_is_the_same_for_any_number_of_threads():
+def test_covariance_is_independent_of_threads():
     from tofuse.kernels.threads import threads
 
     T = se3.exp([0.01, 0, 0.01, 0, 0.01, 0])
@@ -151,7 +151,7 @@ def _made_patches(means, weights, change=0.0):
     )
 
 
-def test_seen_errors_are_told_from_noise_by_their_size():
+def test_systematic_errors_are_distinguished_from_noise_by_size():
     rng = np.random.default_rng(4)
     weights = np.full(48, 1e2)  # noise of 10 cm
     options = UncertaintyOptions(noise_pixels=1.0)
@@ -162,8 +162,8 @@ def test_seen_errors_are_told_from_noise_by_their_size():
     assert 4 < ratio < 25
 
 
-def test_residuals_near_the_limit_do_not_make_a_direction_unknown():
-    """The slope that the robust weights leave may vanish there, and have any sign."""
+def test_residuals_near_limit_do_not_inflate_uncertainty():
+    """The slope of the robust weights may vanish there, and have any sign."""
     found = _made_patches(np.zeros(48), np.full(48, 1e2))
     steep = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
     values, vectors = np.linalg.eigh(found.cross[:6, :6])
@@ -178,7 +178,7 @@ def test_residuals_near_the_limit_do_not_make_a_direction_unknown():
 
 
 @pytest.mark.parametrize("information", [-0.1, 0.0, 0.001, 0.1])
-def test_less_information_never_means_a_smaller_sigma(information):
+def test_less_information_never_reduces_sigma(information):
     """Also where the cross information is negative, because noise dominates the normals."""
     diagonal = np.array([100.0, 100.0, information, 100.0, 100.0, 100.0, 1.0])
     H = np.diag(np.maximum(diagonal, 0.0))
@@ -190,7 +190,7 @@ def test_less_information_never_means_a_smaller_sigma(information):
     np.testing.assert_allclose(sigma[[0, 1, 3, 4, 5]], 0.1, rtol=1e-3)
 
 
-def test_prior_takes_only_the_unobservable_directions():
+def test_prior_applies_to_unobservable_directions_only():
     C = np.diag([1e-6] * 3 + [1e-7] * 3)
     directions = np.eye(6)[[0]]
     out = with_prior(C, directions, np.full(6, 0.3))
@@ -198,7 +198,7 @@ def test_prior_takes_only_the_unobservable_directions():
     np.testing.assert_allclose(out[1:, 1:], C[1:, 1:], atol=1e-18)
 
 
-def test_no_direction_is_less_certain_than_the_prediction():
+def test_uncertainty_is_bounded_by_prediction():
     prior = np.array([0.3] * 3 + [0.2] * 3)
     turned = se3.exp(np.array([0.0, 0, 0, 0.4, -0.3, 0.2]))[:3, :3]
     axes = np.kron(np.eye(2), turned)
@@ -212,7 +212,7 @@ def test_no_direction_is_less_certain_than_the_prediction():
 
 
 def test_tile_sums_match_numpy():
-    """Distances alone, summed pixel by pixel."""
+    """Geometric residuals only, summed pixel by pixel."""
     T = se3.exp([0.01, -0.01, 0.02, 0.004, 0.01, -0.006])
     target, source = _view(0, CORNER), _view(1, CORNER, T)
     inverse_z = source.planes[..., 3]
@@ -267,7 +267,7 @@ def test_tile_sums_match_numpy():
         np.testing.assert_allclose(sums, wanted, rtol=0.02, atol=0.002 * np.abs(wanted).max())
     np.testing.assert_array_equal(whole[tiles.PHOTO], 0)
     assert expected[..., tiles.COUNT].sum() > 500
-    # A pixel whose projection lies on the border of two may land on either.
+    # A pixel that projects onto the border of two may be assigned to either.
     assert np.abs(found[..., tiles.COUNT] - expected[..., tiles.COUNT]).sum() <= 4
     scale = np.abs(expected).max((0, 1))
     assert np.abs(found - expected).max((0, 1)) == pytest.approx(0 * scale, abs=0.02 * scale.max())
@@ -275,7 +275,7 @@ def test_tile_sums_match_numpy():
     assert (np.abs(found - expected).max((0, 1))[same] < 0.03 * scale[same]).all()
 
 
-def test_faked_information_is_what_random_tilts_give():
+def test_spurious_information_matches_random_tilts():
     rng = np.random.default_rng(6)
     points = rng.uniform([-1, -1, 1], [1, 1, 3], (300, 3)).astype(np.float32)
     normals = rng.normal(size=(300, 3))
@@ -301,8 +301,8 @@ def test_faked_information_is_what_random_tilts_give():
     np.testing.assert_allclose(found, total, atol=0.02 * np.abs(total).max())
 
 
-def test_common_tilts_do_not_hold_a_wall():
-    """A wall that the camera bows the same way in every view still slides."""
+def test_common_tilts_do_not_constrain_wall():
+    """A wall with the same distortion by the camera in every view still slides."""
     wall = [(0.0, 0.0, 1.0, 2.0)]
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     bow = 0.01 * (((u - 43.5) / 44) ** 2 + ((v - 35.5) / 36) ** 2)
@@ -316,7 +316,7 @@ def test_common_tilts_do_not_hold_a_wall():
     assert found.change < 0.01
 
 
-def test_common_errors_do_not_hide_what_a_corner_holds():
+def test_common_errors_do_not_hide_constraints_of_corner():
     target, source = _view(0, CORNER), _view(1, CORNER)
     _, aligned = _aligned(source, target, np.eye(4))
     assert len(aligned.unobservable) == 0

@@ -14,7 +14,7 @@ from tofuse.registration.verification import (
 
 
 def aligned(outliers=0.1, in_front=0.01, noise=2.0, albedo=0.04, compared=2000, rms_m=0.01):
-    """An alignment with these fractions of outliers and of points in free space."""
+    """An alignment with these fractions of outliers and of free-space violations."""
     return Aligned(
         np.eye(4),
         True,
@@ -37,7 +37,7 @@ def aligned(outliers=0.1, in_front=0.01, noise=2.0, albedo=0.04, compared=2000, 
 
 
 def taught(count=60, seed=0, spread=0.15, **usual):
-    """What is usual for a camera whose views fit like this, give or take."""
+    """Usual fit of a camera whose views have these statistics, with some spread."""
     rng = np.random.default_rng(seed)
     known = UsualFit()
     for _ in range(count):
@@ -48,7 +48,7 @@ def taught(count=60, seed=0, spread=0.15, **usual):
     return known
 
 
-# How views of a camera usually fit
+# Usual fit of a camera's views
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def taught(count=60, seed=0, spread=0.15, **usual):
         {"albedo": 0.0},
     ],
 )
-def test_of_a_camera_that_is_not_known_much_is_usual(fit):
+def test_unknown_camera_tolerates_moderate_fits(fit):
     found = UsualFit().assess(aligned(**fit))
     assert found.usual
     assert found.excess == 0
@@ -79,7 +79,7 @@ def test_of_a_camera_that_is_not_known_much_is_usual(fit):
         ({"albedo": 3.0}, "albedo differences 60.0 times as large as usual"),
     ],
 )
-def test_but_not_everything(fit, words):
+def test_unknown_camera_rejects_extreme_fits(fit, words):
     found = UsualFit().assess(aligned(**fit))
     assert not found.usual
     assert words in found.reason
@@ -94,8 +94,8 @@ def test_too_few_inliers_determine_no_pose():
     assert UsualFit().assess(aligned(compared=100, outliers=0.0)).usual
 
 
-def test_what_is_usual_is_learnt_of_each_camera():
-    """A third of outliers is as ever for one camera, and out of the ordinary for another."""
+def test_usual_fit_is_learned_per_camera():
+    """A third of outliers is usual for one camera, and unusual for another."""
     many, few = taught(outliers=0.3), taught(outliers=0.03)
     third = aligned(outliers=0.3)
     assert many.assess(third).usual
@@ -120,26 +120,26 @@ def test_each_statistic_has_its_own_range(usual, twice, far):
     assert not known.assess(aligned(**far)).usual
 
 
-def test_however_even_a_recording_the_next_view_may_be_of_another_kind():
+def test_range_is_not_too_narrow_for_uniform_recordings():
     known = taught(200, spread=0.0, outliers=0.1)
     assert known.assess(aligned(outliers=0.18)).usual
     assert not known.assess(aligned(outliers=0.5)).usual
 
 
-def test_a_few_wrong_ones_do_not_change_what_is_usual():
+def test_few_outlier_views_do_not_change_usual_fit():
     """Location and spread are medians."""
     known = taught(outliers=0.05)
     for _ in range(15):
         known.learn(aligned(outliers=0.7), 2.0)
     assert not known.assess(aligned(outliers=0.7)).usual
-    # The order does not matter.
+    # The order is irrelevant.
     other = UsualFit()
     for _ in range(15):
         other.learn(aligned(outliers=0.7), 2.0)
     assert not all(other.assess(aligned(outliers=x)).usual for x in (0.05, 0.9))
 
 
-def test_the_stricter_the_fewer_are_usual():
+def test_stricter_limits_accept_fewer_fits():
     fits = [aligned(outliers=x) for x in np.linspace(0, 0.9, 40)]
     counts = []
     for sigmas in (1.0, 3.0, 6.0):
@@ -147,7 +147,7 @@ def test_the_stricter_the_fewer_are_usual():
         for _ in range(20):
             known.learn(aligned(), 2.0)
         found = [known.assess(fit) for fit in fits]
-        # From some fraction on all are unusual, the more so the more outliers there are.
+        # Beyond some fraction all are unusual, with an excess that grows with the outliers.
         usual = [f.usual for f in found]
         assert usual == sorted(usual, reverse=True)
         excess = [f.excess for f in found if not f.usual]
@@ -156,7 +156,7 @@ def test_the_stricter_the_fewer_are_usual():
     assert counts[0] < counts[1] <= counts[2]
 
 
-def test_the_noise_scale_is_known_after_some_alignments():
+def test_noise_scale_is_learned_from_alignments():
     known = UsualFit()
     assert known.noise_scale == 0
     assert known.rms_fraction == 0
@@ -165,14 +165,14 @@ def test_the_noise_scale_is_known_after_some_alignments():
     known = taught(150, noise=8.0, spread=0.1)
     assert known.noise_scale == pytest.approx(8.0, rel=0.1)
     assert known.rms_fraction == pytest.approx(0.005)
-    # What can't be measured teaches nothing.
+    # Statistics that cannot be measured are not learned.
     for noise in (0.0, np.inf):
         known.learn(aligned(noise=noise, rms_m=np.inf), 2.0)
     assert known.noise_scale == pytest.approx(8.0, rel=0.1)
     assert known.rms_fraction == pytest.approx(0.005)
 
 
-def test_images_are_compared_as_coarsely_as_the_camera_errs():
+def test_tolerance_of_agreement_follows_rms_of_camera():
     fine, coarse = self_scaled(UsualFit()), UsualFit()
     for _ in range(10):
         coarse.learn(aligned(rms_m=0.1), 2.0)
@@ -180,7 +180,7 @@ def test_images_are_compared_as_coarsely_as_the_camera_errs():
     assert self_scaled(coarse).floor_fraction > fine.floor_fraction
 
 
-def test_views_of_another_scale_are_not_compared():
+def test_views_of_different_scale_are_not_comparable():
     assert comparable(2.0, 2.0)
     assert comparable(2.0, 5.0)
     assert not comparable(2.0, 20.0)

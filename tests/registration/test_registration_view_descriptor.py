@@ -17,7 +17,7 @@ from tofuse.sensor.models import camera_model
 
 @pytest.fixture(scope="module")
 def views():
-    """A rotation in the room, every 19 degrees."""
+    """A rotation in the room, in steps of 19 degrees."""
     scene, path = build("room")
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")
@@ -32,7 +32,7 @@ def descriptors(views):
     return np.stack([view_descriptor(view) for view in views])
 
 
-def test_a_descriptor_is_the_mean_log_depth_and_albedo_of_each_cell(views, descriptors) -> None:
+def test_descriptor_is_mean_log_depth_and_albedo_of_cells(views, descriptors) -> None:
     view = views[0]
     made = descriptors[0]
     assert made.shape == (2, 9, 12)
@@ -57,7 +57,7 @@ def test_a_descriptor_is_the_mean_log_depth_and_albedo_of_each_cell(views, descr
     np.testing.assert_array_equal(view_descriptor(empty)[0, :, 6:], made[0, :, 6:])
 
 
-def test_the_same_place_is_the_most_similar(descriptors) -> None:
+def test_same_view_is_most_similar(descriptors) -> None:
     for k, descriptor in enumerate(descriptors):
         far = dissimilarity(descriptor, descriptors, 0.25)
         assert far[k] == 0
@@ -65,14 +65,14 @@ def test_the_same_place_is_the_most_similar(descriptors) -> None:
 
 
 def test_neighbours_are_more_similar_than_distant_views(descriptors) -> None:
-    """They share more than half of what they see: at a shift of half the width each comes first."""
+    """They overlap by more than half: with a shift of half the width a neighbour ranks first."""
     for k, descriptor in enumerate(descriptors[:-1]):
         far = dissimilarity(descriptor, descriptors, 0.5)
         far[k] = np.inf
         assert {k - 1, k + 1} & set(np.argsort(far)[:2]), k
 
 
-def test_one_against_many_is_what_all_against_each_other_are(descriptors) -> None:
+def test_dissimilarity_to_many_matches_mutual_dissimilarity(descriptors) -> None:
     mutual = mutual_dissimilarity(descriptors, 0.25)
     for k, descriptor in enumerate(descriptors):
         np.testing.assert_array_equal(
@@ -85,5 +85,5 @@ def test_unknown_cells_are_dissimilar(descriptors) -> None:
     nothing = np.full_like(descriptor, np.nan)
     far = dissimilarity(descriptor, np.stack([nothing, descriptor, descriptor + 10.0]), 0.25)
     assert far[1] == 0
-    # What differs by the same everywhere is exposure, to the albedo, but another place, to depth.
+    # A constant difference is exposure for albedo, but another place for depth.
     np.testing.assert_allclose(far[[0, 2]], [1.0, 0.5], atol=1e-5)

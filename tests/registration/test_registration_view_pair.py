@@ -44,7 +44,7 @@ def far(pair):
     return tofuse.register(*pair)
 
 
-def test_a_pair_far_apart_is_found_and_accepted(far):
+def test_distant_pair_is_found_and_accepted(far):
     metres, degrees = error(far.T_target_source)
     assert metres < 0.02
     assert degrees < 0.5
@@ -67,8 +67,8 @@ def falling(frame: RangeFrame, exponent: float) -> RangeFrame:
 
 
 @pytest.mark.parametrize("exponent", [0.0, 4.0, 8.0])
-def test_the_falloff_of_the_amplitude_is_estimated(pair, far, exponent):
-    """A pattern that is fixed to the camera neither moves the pose nor contradicts it."""
+def test_amplitude_falloff_is_estimated(pair, far, exponent):
+    """A pattern that is fixed to the camera neither biases the pose nor contradicts it."""
     views = [surface(falling(frame, exponent)) for frame in pair]
     said = agreement(*views, TRUE)
     assert said.falloff == pytest.approx(exponent, abs=0.5)
@@ -83,14 +83,14 @@ def test_the_falloff_of_the_amplitude_is_estimated(pair, far, exponent):
     assert degrees < 0.2
 
 
-def test_the_covariance_tells_how_large_the_error_is(far):
+def test_covariance_covers_error(far):
     gap = se3.log(se3.inverse(far.T_target_source) @ TRUE)
     assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_camera_on_its_side_is_found(quarters):
-    # Beyond the reach of the exhaustive search, whose poses are upright.
+def test_camera_on_its_side_is_found(quarters):
+    # Outside the exhaustive search, whose poses are upright.
     image = seen(at(-0.3, 0.4, 0.4), 1)
     turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters)
     rays = np.rot90(image.camera.rays() @ turn.T.astype(np.float32), -quarters)
@@ -121,7 +121,7 @@ def test_views_of_different_rooms_are_rejected(pair):
         assert found.reason
 
 
-def test_views_of_one_room_that_share_nothing_are_rejected(pair):
+def test_views_of_one_room_without_overlap_are_rejected(pair):
     away = seen(at(-0.4, 0.3, 0.1 + np.pi), 5)
     found = tofuse.register(away, pair[1])
     assert not found.believed
@@ -136,7 +136,7 @@ def wall(T_world_camera, index, noise=0.004):
     return RangeFrame(index, 0.0, CAMERA, z.astype(np.float32))
 
 
-def test_a_flat_wall_is_degenerate_and_says_so():
+def test_flat_wall_is_reported_degenerate():
     T = se3.exp([0.3, 0.1, 0.1, 0.05, 0.15, 0.02])
     found = tofuse.register(wall(T, 1), wall(np.eye(4), 0))
     assert len(found.unobservable) == 3
@@ -145,21 +145,21 @@ def test_a_flat_wall_is_degenerate_and_says_so():
     assert "3 directions are degenerate" in found.reason
 
 
-def test_what_a_wall_does_not_hold_stays_as_guessed():
+def test_degenerate_directions_stay_as_guessed():
     T = se3.exp([0.3, 0.1, 0.1, 0.05, 0.15, 0.02])
     guess = T @ se3.exp([0, 0, 0.04, 0.02, 0.02, 0])
     found = tofuse.register(wall(T, 1), wall(np.eye(4), 0), guess=guess)
     assert len(found.unobservable) == 3
     assert not found.believed
-    # Along the wall's normal it is found, across as guessed.
+    # The distance to the wall is found; along the wall the pose stays as guessed.
     gap = found.T_target_source @ se3.inverse(T)
     normal_error = gap[2, 3] + (gap[2, :3] - [0, 0, 1]) @ [0, 0, 2]
     assert abs(normal_error) < 0.003
     assert np.linalg.norm((se3.inverse(guess) @ found.T_target_source)[:2, 3]) < 0.05
 
 
-def test_a_room_that_repeats_fits_in_several_ways():
-    # Posts at equal distances along a wall, seen from two places that are one and a half apart.
+def test_repetitive_room_is_ambiguous():
+    # Posts at equal distances along a wall, from two places one and a half spacings apart.
     posts = tuple(((0.6 * k, 0.2, 1.6), (0.1, 0.9, 0.1), 0.0) for k in range(-12, 13))
     room = {"half": (9.0, 1.1, 1.8), "boxes": posts, "spots": 0}
     source, target = (seen(at(x, -0.6, 0.0), k, **room) for k, x in enumerate((0.3, -0.6)))
@@ -171,23 +171,23 @@ def test_a_room_that_repeats_fits_in_several_ways():
     assert "another pose fits nearly as well" in found.reason
 
 
-def test_a_good_guess_is_followed_without_a_search(pair):
+def test_good_guess_is_used_without_search(pair):
     near = seen(A @ se3.exp([0.1, 0.02, -0.05, 0.02, 0.1, 0.0]), 2)
     true = se3.exp([0.1, 0.02, -0.05, 0.02, 0.1, 0.0])
     found = tofuse.register(near, pair[1], guess=true @ se3.exp([0.02, 0, 0.02, 0, 0.03, 0]))
-    assert found.margin is None  # nothing was compared with it
+    assert found.margin is None  # no rival was evaluated
     assert found.believed
     assert error(found.T_target_source, true)[0] < 0.01
 
 
-def test_a_wrong_guess_is_not_trusted(pair, far):
+def test_wrong_guess_is_not_trusted(pair, far):
     for wrong in ([0.8, 0, -0.5, 0, 0.6, 0], [0, 0.6, 0, 0.4, 0, 0.3]):
         found = tofuse.register(*pair, guess=se3.exp(wrong))
         assert found.believed
         assert error(found.T_target_source, far.T_target_source)[0] < 0.02
 
 
-def test_a_small_scene_is_registered_as_a_large_one(pair, far):
+def test_small_scene_is_registered_like_large_one(pair, far):
     small = [replace(f, depth=f.depth * np.float32(0.25)) for f in pair]
     found = tofuse.register(*small)
     assert found.believed
@@ -198,7 +198,7 @@ def test_a_small_scene_is_registered_as_a_large_one(pair, far):
     assert np.degrees(se3.angle(gap)) < 1
 
 
-def test_threads_do_not_change_a_bit(pair, far):
+def test_result_is_independent_of_threads(pair, far):
     for count in (1, 5):
         with threads(count):
             found = tofuse.register(*pair)
@@ -221,7 +221,7 @@ def test_empty_images_are_refused(pair):
                 tofuse.register(*views)
 
 
-def test_equal_depths_are_rejected(pair):
+def test_constant_depths_are_rejected(pair):
     flat = replace(pair[0], depth=np.full_like(pair[0].depth, 1.5), amplitude_image=None)
     for views in ((flat, flat), (flat, pair[1])):
         found = tofuse.register(*views)
@@ -229,7 +229,7 @@ def test_equal_depths_are_rejected(pair):
         assert found.reason
 
 
-def test_a_bad_guess_is_refused(pair):
+def test_invalid_guess_is_refused(pair):
     for guess in (np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)):
         with pytest.raises(tofuse.InputError, match="guess"):
             tofuse.register(*pair, guess=guess)
@@ -243,7 +243,7 @@ def test_few_pixels_are_registered_but_rejected(pair):
     assert "1 direction is degenerate" in found.reason
 
 
-def test_other_methods_do_not_say(pair):
+def test_other_methods_state_no_acceptance(pair):
     found = tofuse.register(*pair, guess=TRUE, method=CoarseToFine())
     assert found.believed is None
     assert found.probability is None
@@ -254,7 +254,7 @@ def said(support, contradiction, overlap=0.6):
     return Agreement(overlap, support, contradiction * overlap, 0.0, 0.01, 1000, support)
 
 
-def test_the_probability_follows_the_evidence():
+def test_probability_follows_evidence():
     good = Evidence.of(said(0.5, 0.0), 0.3)
     assert good.probability > 0.95
     for worse in (
@@ -266,20 +266,20 @@ def test_the_probability_follows_the_evidence():
         Evidence.of(said(0.5, 0.0), -0.1).probability
         == Evidence.of(said(0.5, 0.0), 0.0).probability
     )
-    # What supports a pose is in its lead; where nothing was compared, it counts itself.
+    # Support is part of the margin; where no rival was evaluated, it counts by itself.
     assert Evidence.of(said(0.9, 0.0)).probability > 0.98 > Evidence.of(said(0.3, 0.0)).probability
     assert Evidence.of(said(0.9, 0.1)).probability < Evidence.of(said(0.9, 0.0)).probability
 
 
-def test_the_reason_names_what_speaks_against_it():
+def test_reason_names_contrary_evidence():
     words = Evidence.of(said(0.1, 0.2), 0.01, 2).objection()
     for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
         assert part in words
     assert Evidence.of(said(0.6, 0.0), 0.3).objection() == ""
 
 
-def test_what_is_usual_for_the_camera_decides_how_views_must_fit(pair):
-    """The same view, but a box stands in front of the camera."""
+def test_usual_fit_of_camera_decides_acceptance(pair):
+    """The same view, but with a box in front of the camera."""
     box = ((0.0, 0.2, 1.05), (0.35, 0.4, 0.1), 0.0)
     target, near = surface(pair[1]), A @ se3.exp([0.02, 0, 0, 0, 0.02, 0])
     plain, blocked = (surface(seen(near, 8, boxes=b)) for b in (BOXES, (*BOXES, box)))
@@ -291,29 +291,29 @@ def test_what_is_usual_for_the_camera_decides_how_views_must_fit(pair):
     assert follow(blocked, target, np.eye(4), usual=usual) is None
 
 
-def test_an_alignment_is_followed_if_it_holds_both_ways(pair):
+def test_alignment_is_accepted_if_consistent_in_both_directions(pair):
     true = se3.exp([0.08, 0, 0.05, 0, 0.1, 0])
     target, source = surface(pair[1]), surface(seen(A @ true, 8))
     found = follow(source, target, np.eye(4))
-    assert found.margin is None  # nothing was compared with it
+    assert found.margin is None  # no rival was evaluated
     assert error(found.T_target_source, true)[0] < 0.01
     back = follow(target, source, np.eye(4))
     assert error(back.T_target_source, se3.inverse(true))[0] < 0.01
-    # From far off nothing is found, rather than something wrong.
+    # From a distant start nothing is found, rather than a wrong pose.
     off = follow(source, target, se3.exp([0.5, 0.2, 0.6, 0.2, 1.2, 0]))
     assert off is None or error(off.T_target_source, true)[0] < 0.02
 
 
-def test_a_clear_lead_outweighs_degenerate_directions():
-    """Poses along them would fit as well."""
+def test_large_margin_outweighs_degenerate_directions():
+    """Otherwise poses along them would fit as well."""
     for margin in (0.02, 0.05):
         held, loose = (Evidence(0.6, 0.0, margin, k).probability for k in (0, 1))
         assert loose < held
     assert Evidence(0.6, 0.0, 0.2, 1).probability == Evidence(0.6, 0.0, 0.2).probability
 
 
-def test_a_square_room_without_furniture_is_rejected():
-    """Each corner is like the next: two poses fit as well."""
+def test_empty_square_room_is_rejected():
+    """Each corner resembles the next: two poses fit equally well."""
     bare = {"boxes": (), "spots": 0, "half": (1.8, 1.1, 1.8)}
     views = [surface(seen(at(0, 0, yaw), k, **bare)) for k, yaw in enumerate((0.0, np.pi / 4))]
     found = register_pair(views[1], views[0])
@@ -321,8 +321,8 @@ def test_a_square_room_without_furniture_is_rejected():
     assert "another pose" in found.reason
 
 
-def test_the_largest_overlap_along_a_wall_is_no_evidence():
-    """Any place along it fits; the one where the views cover each other has the most points."""
+def test_largest_overlap_along_wall_is_no_evidence():
+    """Any place along it fits; the one where the views overlap entirely has the most points."""
     views = []
     for k, x in enumerate((0.0, 0.2)):
         frame = seen(at(x, 1.0, 0.0, pitch=0.0), k, boxes=(), spots=0)
@@ -339,7 +339,7 @@ def test_prepared_views_of_different_scale_are_not_compared(pair):
     assert follow(small, target, np.eye(4)) is None
 
 
-def test_a_search_and_an_alignment_that_agree_need_nothing_else(pair):
+def test_consistent_search_and_alignment_stand_alone(pair):
     target = surface(pair[1])
     near, far = (
         register_pair(surface(seen(A @ se3.exp(xi), 8)), target, always_search=True)

@@ -42,7 +42,7 @@ CANVAS = "#viewer .stage canvas"
 
 
 def rested(seen):
-    """The picture once nothing moves: with all triangles, and smooth edges."""
+    """The image at rest: with all triangles, and smooth edges."""
     seen.rest()
     return seen.pixels(CANVAS)
 
@@ -57,7 +57,7 @@ def middle(page):
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-def test_model_turns_and_toggles_switch(browser, report):
+def test_model_rotates_and_toggles_switch(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         first = ready(seen)
@@ -89,7 +89,7 @@ def test_model_turns_and_toggles_switch(browser, report):
         seen.check()
 
 
-def test_colours_of_values_are_those_of_the_bar(browser, report):
+def test_colours_of_values_match_colour_bar(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         ready(seen)
@@ -105,7 +105,7 @@ def test_colours_of_values_are_those_of_the_bar(browser, report):
             now = rested(seen)
             assert changed(was, now) > 0.01, by
             assert bar.locator("span").first.inner_text().startswith(end)
-            # Nothing is lit: what is drawn has a colour of the bar.
+            # There is no shading: drawn pixels have colours of the bar.
             drawn = now[60:-90, 8:-8, ::-1].reshape(-1, 3)
             drawn = drawn[drawn.max(1) > 90][::37]
             off = np.abs(drawn[:, None] - ramp).max(2).min(1)
@@ -115,7 +115,7 @@ def test_colours_of_values_are_those_of_the_bar(browser, report):
         seen.check()
 
 
-def test_two_taps_measure_with_an_error(browser, report):
+def test_two_taps_measure_distance_with_error(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         ready(seen)
@@ -146,7 +146,7 @@ def test_two_taps_measure_with_an_error(browser, report):
         seen.check()
 
 
-def test_section_cuts_and_is_taken_back(browser, report):
+def test_section_cuts_and_is_reset(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         whole = ready(seen)
@@ -187,7 +187,7 @@ def test_screenshot_and_full_screen(browser, report, tmp_path):
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_reason_leads_to_its_frames(browser, report, size):
+def test_reason_links_to_its_frames(browser, report, size):
     with opened(browser, report, viewport=size) as seen:
         page = seen.page
         before = ready(seen)
@@ -210,7 +210,7 @@ def test_a_reason_leads_to_its_frames(browser, report, size):
         seen.check()
 
 
-def test_cameras_and_the_time_line_choose_frames(browser, report):
+def test_cameras_and_timeline_select_frames(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         ready(seen)
@@ -224,14 +224,14 @@ def test_cameras_and_the_time_line_choose_frames(browser, report):
         page.locator("#viewer [data-close]").click()
         through = rested(seen)
         assert changed(outside, through) > 0.2
-        ink = through[..., 0] - through[..., 2]  # no camera is in the way
+        ink = through[..., 0] - through[..., 2]  # no camera is drawn
         assert (ink > 100).sum() < 20
         page.get_by_role("button", name="Reset").click()
         rested(seen)
         seen.check()
 
 
-def test_a_phone_scrolls_past_the_model(browser, report):
+def test_phone_scrolls_past_model(browser, report):
     with opened(browser, report, viewport=PHONE, has_touch=True, is_mobile=True) as seen:
         page = seen.page
         first = ready(seen)
@@ -248,14 +248,14 @@ def test_a_phone_scrolls_past_the_model(browser, report):
 
         swipe(120, 0)
         assert page.evaluate("scrollY") == 0
-        assert changed(first, rested(seen)) > 0.05  # a finger across turns it
+        assert changed(first, rested(seen)) > 0.05  # a horizontal swipe rotates it
         swipe(0, -160)
         seen.rest()
         assert page.evaluate("scrollY") > 80
         seen.check()
 
 
-def test_slider_shows_frames_and_why_one_is_lost(browser, report):
+def test_slider_shows_frames_and_reason_of_loss(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
         shot = "#player img[data-kind=range]"
@@ -267,7 +267,7 @@ def test_slider_shows_frames_and_why_one_is_lost(browser, report):
         seen.rest()
         assert page.locator("#frame-description").inner_text().startswith("Frame 4: tracked")
         assert changed(first, seen.pixels(shot)) > 0.1
-        assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is chosen
+        assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is selected
         page.get_by_role("button", name="Next with a problem").click()
         said = page.locator("#frame-description").inner_text()
         assert said.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
@@ -278,7 +278,7 @@ def test_slider_shows_frames_and_why_one_is_lost(browser, report):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_looks_follow_the_reader(browser, report, scheme, size):
+def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
     with opened(browser, report, viewport=size, color_scheme=scheme) as seen:
         page = seen.page
         brightness = page.evaluate(
@@ -287,8 +287,8 @@ def test_looks_follow_the_reader(browser, report, scheme, size):
         assert (min(brightness) > 200) == (scheme == "light")
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         ready(seen)
-        # The model fills the canvas, all but a border on all sides.
-        bright = seen.pixels(CANVAS)[8:-8, 8:-8].max(-1) > 60  # its corners are round
+        # The model fills the canvas, except for a border on all sides.
+        bright = seen.pixels(CANVAS)[8:-8, 8:-8].max(-1) > 60  # the corners are rounded
         rows, columns = bright.any(1), bright.any(0)
         assert not rows[[0, -1]].any()
         assert not columns[[0, -1]].any()
@@ -296,7 +296,7 @@ def test_looks_follow_the_reader(browser, report, scheme, size):
         seen.check()
 
 
-def test_without_scripts_there_is_a_picture_and_the_first_frame(browser, report):
+def test_page_without_scripts_shows_image_and_first_frame(browser, report):
     with opened(browser, report, viewport=PHONE, java_script_enabled=False) as seen:
         assert seen.page.locator("#viewer .stage > img").is_visible()
         assert seen.page.locator("#player img").first.is_visible()
@@ -304,7 +304,7 @@ def test_without_scripts_there_is_a_picture_and_the_first_frame(browser, report)
         seen.check()
 
 
-def test_a_long_recording_of_large_images_stays_below_the_limit(tmp_path):
+def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
     result, extras = make_room()
     rng = np.random.default_rng(0)
     collector = FrameSamples()
@@ -316,7 +316,7 @@ def test_a_long_recording_of_large_images_stays_below_the_limit(tmp_path):
     kept = collector.all
     assert 80 <= len(kept) <= 200
     assert sum(s.index % 7 == 0 for s in kept) >= 20
-    # Pure noise, the worst there is for an image format, in all of them.
+    # All of them pure noise, the worst case for image compression.
     detailed = replace(result, diagnostics=replace(result.diagnostics, samples=kept))
     write_report(detailed, tmp_path / "r.html", replace(extras, pictures=draw(kept)))
     assert (tmp_path / "r.html").stat().st_size < 20e6

@@ -100,7 +100,7 @@ class Page(HTMLParser):
             self.rows[-1][-1] += data
 
     def row(self, *start):
-        """The one table row that begins with these cells."""
+        """The only table row that starts with these cells."""
         (found,) = [r for r in self.rows if tuple(r[: len(start)]) == start]
         return found
 
@@ -134,7 +134,7 @@ ORDER = [
 ]
 
 
-def test_sections_come_in_order_and_the_model_first(shown):
+def test_sections_are_ordered_with_model_first(shown):
     assert list(shown.sections) == [name for name in ORDER if name != "recording"]
     text = " ".join(shown.sections["verdict"].split())
     assert "Degraded: use this model with care." in text
@@ -144,7 +144,7 @@ def test_sections_come_in_order_and_the_model_first(shown):
     assert f"{len(room()[0].cloud):,} points" in shown.sections["frames"]
 
 
-def test_nothing_is_fetched_from_elsewhere(shown, tmp_path):
+def test_page_has_no_external_resources(shown, tmp_path):
     assert shown.links
     assert all(link.startswith(("#", "data:")) for link in shown.links)
     write_report(room()[0], tmp_path / "r.html", room()[1])
@@ -156,21 +156,21 @@ def test_nothing_is_fetched_from_elsewhere(shown, tmp_path):
     assert len(text) < 20e6
 
 
-def test_identifiers_are_unique_and_contents_lead_somewhere(shown):
+def test_identifiers_are_unique_and_links_resolve(shown):
     assert len(shown.ids) == len(set(shown.ids))
     anchors = {link[1:] for link in shown.links if link.startswith("#")}
     assert anchors <= set(shown.ids)
     assert set(ORDER) - {"recording"} <= anchors
 
 
-def test_same_result_gives_the_same_file(tmp_path):
+def test_same_result_gives_same_file(tmp_path):
     result, extras = room()
     for name in "ab":
         write_report(result, tmp_path / name, extras)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_errors_shown_are_those_against_the_reference(shown):
+def test_errors_are_relative_to_reference(shown):
     result, extras = room()
     assert "Estimated minus reference" in shown.sections["error"]
     for name, poses in (("Before", result.diagnostics.sequential), ("After", result.trajectory)):
@@ -191,7 +191,7 @@ def test_errors_shown_are_those_against_the_reference(shown):
     assert f"most at frame {worst}." in shown.sections["cameras"]
 
 
-def test_without_a_reference_the_displacement_is_shown(tmp_path):
+def test_displacement_is_shown_without_reference(tmp_path):
     result, extras = room()
     got = page(tmp_path, result, replace(extras, reference=None))
     assert "Displacement from the first camera" in got.sections["error"]
@@ -215,13 +215,13 @@ def test_true_and_measured_sizes(shown, tmp_path):
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_a_turned_model_is_measured_along_its_own_sides(exact, tmp_path):
+def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
     rng = np.random.default_rng(2)
     surface = rng.uniform(-0.5, 0.5, (20_000, 3))
     axis = rng.integers(0, 3, len(surface))
     surface[np.arange(len(surface)), axis] = rng.choice([-0.5, 0.5], len(surface))
     box = surface * [0.3, 0.4, 0.6]
-    # Tilted as well where the truth tells what is upright; a cloud alone can only be turned.
+    # Tilted as well if the truth defines the vertical; a cloud alone can only be rotated about it.
     T = se3.exp([0.2, 0, 1, 0.3 if exact else 0, 0.4, -0.1 if exact else 0])
     points = se3.transform(T, box).astype(np.float32)
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.zeros(3))
@@ -233,21 +233,21 @@ def test_a_turned_model_is_measured_along_its_own_sides(exact, tmp_path):
             assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
 
 
-def test_a_camera_that_hardly_moves_is_drawn_in_millimetres():
+def test_small_motion_is_drawn_in_millimetres():
     points = np.random.default_rng(2).uniform(-1, 1, (500, 3))
     for size, unit in ((3.0, "m"), (0.01, "mm")):
         drawn = plots.model(size * points, np.zeros((1, 3)), None, "above", measured=None, label="")
         assert f"forward, {unit}<" in drawn
 
 
-def test_reasons_of_one_kind_are_said_together(tmp_path):
+def test_reasons_of_one_kind_are_grouped(tmp_path):
     reasons = tuple(Reason("loop_gap", ((k, 90),), f"Loop {k}-90 drifted.") for k in range(7))
     reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
     text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
     said = " ".join(text.sections["verdict"].split())
     assert said.count("Distances across the loop may be distorted") == 1
     assert all(r.text in said for r in reasons)
-    # The gravest comes first, wherever it stands.
+    # The gravest reason comes first, wherever it was.
     assert said.index("Only one.") > said.rindex("drifted.")
 
 
@@ -260,7 +260,7 @@ def test_reasons_name_their_frames(tmp_path):
 
 
 def in_parts(number=20):
-    """Frames 0 to 9 in the main component, 10 and 11 linked to it, the rest apart."""
+    """Frames 0 to 9 in the main component, 10 and 11 linked to it, the rest separate."""
     result = many(number)
     poses = np.tile(np.eye(4), (number, 1, 1))
     poses[:, 0, 3] = 0.01 * np.arange(number)
@@ -297,7 +297,7 @@ def test_components_are_listed_with_their_own_models(tmp_path):
     assert not any("component" in t for t in plain.titles)
 
 
-def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):
+def test_filters_show_fractions_of_recording_and_frame(shown):
     result, extras = room()
     (_, raw), (_, first), (_, second) = extras.filter_steps
     here = [1 - len(first) / len(raw), 1 - len(second) / len(first)]
@@ -306,7 +306,7 @@ def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):
         assert shown.row(name) == [name, f"{100 * whole:.1f} %", f"{100 * part:.1f} %"]
 
 
-def test_each_frame_says_why_it_is_lost(shown):
+def test_lost_frames_state_their_reason(shown):
     assert len([t for t in shown.titles if t.startswith("Frame ")]) == 24
     assert any(
         t.startswith("Frame 9: lost – too few correspondences: 31 of 1000") for t in shown.titles
@@ -326,7 +326,7 @@ def test_loops_timings_and_objective(shown):
     assert "no timestamps.txt" in shown.sections["settings"]
 
 
-def test_arrays_come_back_as_they_were():
+def test_packed_arrays_round_trip():
     rng = np.random.default_rng(3)
     for array in (
         rng.integers(0, 2**16, (50, 3)).astype(np.uint16),
@@ -339,8 +339,8 @@ def test_arrays_come_back_as_they_were():
         np.testing.assert_array_equal(back, array)
 
 
-def test_viewer_holds_a_surface_with_not_too_many_faces():
-    # A wavy sheet of far more faces than a phone should draw.
+def test_viewer_mesh_is_simplified():
+    # A wavy sheet with far more faces than a phone should draw.
     n = 520
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
     z = 2 + 0.05 * np.sin(6 * x)
@@ -369,7 +369,7 @@ def test_viewer_holds_a_surface_with_not_too_many_faces():
     assert packed(make_scene(result, rows))["model"]["faces"] is None
 
 
-def test_view_opens_on_the_side_that_shows_most():
+def test_initial_view_shows_most_of_the_surface():
     scene = make_scene(room()[0], {})
     for k in (0, 2, 5):
         yaw = YAW + k * np.pi / 4
@@ -377,20 +377,20 @@ def test_view_opens_on_the_side_that_shows_most():
         normals = np.tile(facing, (len(scene.points), 1))
         found = opening_yaw(replace(scene, normals=normals))
         assert np.cos(found - yaw) == pytest.approx(1)
-    # What looks alike from all sides is shown as ever.
+    # A model without a preferred side has the default view.
     normals = np.random.default_rng(0).normal(0, 1, (len(scene.points), 3))
     assert opening_yaw(replace(scene, normals=normals)) == YAW
     assert opening_yaw(replace(scene, normals=None)) == YAW
 
 
-def test_nothing_is_black_where_no_image_showed_a_colour():
+def test_points_without_colour_are_not_black():
     colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
     shown = seen_colors(colors)
     assert shown[0].tolist() == list(UNSEEN)
     np.testing.assert_array_equal(shown[1:], colors[1:])
 
 
-def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
+def test_viewer_contains_model_cameras_and_loops(shown):
     result, extras = room()
     subject = Subject.of(result, extras)
     R = subject.straight
@@ -414,7 +414,7 @@ def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
         assert not found[~known].any()
 
 
-def test_model_can_be_coloured_by_what_its_points_know():
+def test_model_can_be_coloured_by_attributes_of_points():
     points = np.array([[0, -2.0, 1], [0, -1, 1], [0, 0, 1], [1, 0, 2]], np.float32)
     cloud = Cloud(
         points,
@@ -431,14 +431,14 @@ def test_model_can_be_coloured_by_what_its_points_know():
     }
     assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
     assert (np.diff(of["views"]) > 0).all()
-    # The bar is of what is constrained; what is not lies beyond its end, and is named there.
+    # The bar covers constrained points; unconstrained ones are beyond its end, and named there.
     accuracy = found["accuracy"]
     assert of["accuracy"][3] == 255
     np.testing.assert_allclose(np.diff(of["accuracy"][:3]), np.log(2) / np.log(1.049), atol=1)
     assert accuracy.low == pytest.approx(0.00196, rel=0.1)
     assert accuracy.high == pytest.approx(0.00784, rel=0.1)
     assert accuracy.said[2].endswith("mm or not constrained")
-    # The page reads it back from the byte, for the ± of a distance.
+    # The page decodes the byte, for the ± of a distance.
     low, high = accuracy.span
     assert low * (high / low) ** (of["accuracy"][1] / 255) == pytest.approx(0.00392, rel=0.03)
     # Cameras are coloured by the same bar.
@@ -446,18 +446,18 @@ def test_model_can_be_coloured_by_what_its_points_know():
     assert wider.high == pytest.approx(0.05)
 
 
-def test_viewer_thins_a_large_model(tmp_path):
+def test_viewer_thins_large_model(tmp_path):
     points = np.random.default_rng(1).uniform(-2, 2, (200_000, 3)).astype(np.float32)
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))
     got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
     scene = json.loads(got.scripts[0])
     assert scene["count"] == len(unpack(scene["model"]["points"], "<u2", 3)) == 150_000
     assert scene["model"]["normals"] is None
-    assert scene["center"][0] == pytest.approx(100, abs=0.1)  # the offset counts
+    assert scene["center"][0] == pytest.approx(100, abs=0.1)  # includes the offset
     assert "150,000 of 200,000 points are shown" in got.sections["model"]
 
 
-def test_what_comes_from_outside_is_escaped(tmp_path):
+def test_external_text_is_escaped(tmp_path):
     bad = "</script><script>alert('1')</script><b>&"
     result, extras = room()
     d = result.diagnostics
@@ -486,7 +486,7 @@ def test_what_comes_from_outside_is_escaped(tmp_path):
 
 
 def many(number):
-    """A long recording whose every third frame is lost, for another reason each time."""
+    """A long recording in which every third frame is lost, each for another reason."""
     frames = [
         FrameRecord(
             k, k / 10, "lost" if k % 3 == 1 else "tracked", f"reason {k}" if k % 3 == 1 else ""
@@ -506,7 +506,7 @@ def many(number):
     )
 
 
-def test_a_long_recording_stays_readable(tmp_path):
+def test_long_recording_stays_readable(tmp_path):
     got = page(tmp_path, many(2000), ReportExtras("long"))
     titles = [t for t in got.titles if t.startswith("Frame ")]
     assert len(titles) == 500
@@ -515,7 +515,7 @@ def test_a_long_recording_stays_readable(tmp_path):
     assert "150 more are not shown" in got.sections["loops"]
 
 
-def test_ten_thousand_frames_are_told_in_a_page_that_opens(tmp_path):
+def test_page_of_ten_thousand_frames_stays_small(tmp_path):
     got = page(tmp_path, many(10_000), ReportExtras("very long"))
     assert (tmp_path / "report.html").stat().st_size < 4e6
     titles = [t for t in got.titles if t.startswith("Frame ")]
@@ -604,7 +604,7 @@ POOR = {
 
 
 @pytest.mark.parametrize("name", POOR)
-def test_poor_results_give_a_sensible_report(name, tmp_path):
+def test_poor_results_give_complete_report(name, tmp_path):
     result, extras = POOR[name]
     got = page(tmp_path, result, extras)
     assert [s for s in ORDER if s != "recording" or extras.clouds] == list(got.sections)
@@ -615,7 +615,7 @@ def test_poor_results_give_a_sensible_report(name, tmp_path):
     assert f"{verdict}:" in got.sections["verdict"]
 
 
-def test_poor_results_say_what_is_missing(tmp_path):
+def test_poor_results_state_what_is_missing(tmp_path):
     got = page(tmp_path, *POOR["one cloud"])
     assert "Nothing was optimised" in got.sections["objective"]
     assert "No loop closure was found" in got.sections["loops"]
@@ -630,7 +630,7 @@ def test_poor_results_say_what_is_missing(tmp_path):
 
 
 @pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \""), '\u202e\u062e\u0631<b>"x"', ""])
-def test_any_name_of_a_file_is_shown(title, tmp_path):
+def test_any_file_name_is_shown(title, tmp_path):
     result, extras = room()
     record = replace(result.diagnostics.frames[9], reason=title)
     frames = (*result.diagnostics.frames[:9], record, *result.diagnostics.frames[10:])
@@ -644,14 +644,14 @@ def test_any_name_of_a_file_is_shown(title, tmp_path):
     assert any(f"Frame 9: lost – {shown}" in t or not title for t in got.titles)
 
 
-def test_reasons_point_at_their_frames(shown):
+def test_reasons_link_to_their_frames(shown):
     text = re.findall(r'class="where" href="#frames" data-ranges="(.*?)">(.*?)<', shown.text)
     assert ("[[9, 10]]", "Show frames 9–10") in text
     assert ("[[9, 10]]", "frames 9–10") in text  # the table of problems
     assert ("[[0, 0], [23, 23]]", "0 and 23") in text  # a loop closure
 
 
-def test_an_unwritable_place_leaves_nothing(tmp_path):
+def test_unwritable_path_leaves_no_file(tmp_path):
     (tmp_path / "report.html").mkdir()
     with pytest.raises(OutputError, match="report"):
         write_report(lonely(), tmp_path / "report.html", ReportExtras("x"))

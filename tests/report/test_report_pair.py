@@ -42,18 +42,18 @@ def sheet(seed: int, low: float = 0.0, high: float = 1.0, z: float = 1.0) -> np.
     return np.column_stack([flat, z + rng.normal(0, 0.003, len(flat))])
 
 
-def test_distances_are_those_of_the_surfaces_not_of_the_noise() -> None:
+def test_distances_are_between_surfaces_not_noise() -> None:
     ours, theirs = sheet(1, z=1.012), sheet(2)
     found = distances(ours, theirs, np.arange(len(ours)))
     assert np.isfinite(found).mean() > 0.97
     assert np.median(found) == pytest.approx(0.012, abs=5e-4)
-    # Beside the other surface there is no counterpart, however near its edge is.
+    # Beside the other surface there is no counterpart, however close its edge.
     aside = distances(sheet(3, 1.1, 1.5), theirs, np.arange(6000))
     assert np.isinf(aside).mean() > 0.97
     assert np.isinf(distances(ours[:9], theirs, np.arange(9))).all()
 
 
-def test_colors_run_to_the_end_of_the_bar_and_then_to_grey() -> None:
+def test_colors_saturate_at_end_of_bar_and_turn_grey() -> None:
     colors = distance_colors(np.array([0, 0.005, 0.01, 0.03, 0.05, np.inf]), 0.01)
     assert len(np.unique(colors[:3], axis=0)) == 3
     assert (colors[3] == colors[2]).all()
@@ -67,7 +67,7 @@ def decoded(data: dict, mode: str, which: str) -> np.ndarray:
     return layer["low"] + steps / 65535 * np.array(layer["extent"])
 
 
-def test_layers_are_where_the_poses_put_them() -> None:
+def test_layers_are_placed_by_poses() -> None:
     others, points = relief(900, 1), se3.transform(se3.inverse(T), relief(800, 2))
     start = se3.exp([0.3, 0, 0, 0, 0, 0.2])
     scene = pair_scene(pair(points, others, start=start))
@@ -83,11 +83,11 @@ def test_layers_are_where_the_poses_put_them() -> None:
     assert scene.fraction > 0.8
     assert scene.median_m < 0.01
     assert scene.cap_m * 1000 in (1, 2, 5, 10, 20)
-    # All is framed by what is to be seen; the same, so that nothing jumps.
+    # All are framed by the visible content, identically, so that nothing jumps.
     assert data["outlines"]["before"] == data["outlines"]["after"]
 
 
-def test_a_pose_that_is_wrong_shows() -> None:
+def test_wrong_pose_is_visible() -> None:
     others, points = relief(3000, 1), se3.transform(se3.inverse(T), relief(3000, 2))
     right = pair_scene(pair(points, others))
     wrong = pair_scene(pair(points, others, pose=se3.exp([0, 0, 0.03, 0, 0, 0]) @ T))
@@ -100,7 +100,7 @@ def test_a_pose_that_is_wrong_shows() -> None:
         assert not filled[[0, -1]].all(1).any()
 
 
-def test_a_start_far_away_has_a_frame_of_its_own() -> None:
+def test_distant_start_has_its_own_frame() -> None:
     points = relief(500, 1)
     far = se3.exp([50.0, 0, 0, 0, 0, 0])
     data = packed(pair_scene(pair(points, points, pose=np.eye(4), start=far)))
@@ -120,7 +120,7 @@ def test_large_views_are_thinned() -> None:
     ("format", "center", "up"), [("ply", (0, 0, 0), False), ("las", (0, 0, 0), True),
                                  ("ply", (5e5, 4e6, 0), True)],
 )  # fmt: skip
-def test_maps_and_scans_stand_upright(format, center, up) -> None:  # noqa: A002
+def test_maps_and_scans_are_upright(format, center, up) -> None:  # noqa: A002
     """Down is y for the viewer; in a map up is z."""
     points = relief(500, 1)
     scene = pair_scene(pair(points, points, pose=np.eye(4), format=format, center=center))

@@ -1,4 +1,4 @@
-"""The small picture of a model, in the table of a batch."""
+"""The thumbnail of a model, in the table of a batch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scene_of(points: np.ndarray) -> Scene:
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
-def test_the_model_fills_the_picture_wherever_it_is(scale: float) -> None:
+def test_model_fills_the_thumbnail(scale: float) -> None:
     rng = np.random.default_rng(3)
     shape = np.array([1.0, 0.6, 0.4])
     points = scale * (rng.uniform(-1, 1, (20_000, 3)) * shape + [40.0, -7.0, 3.0])
@@ -34,6 +34,6 @@ def test_the_model_fills_the_picture_wherever_it_is(scale: float) -> None:
     assert abs(np.mean([columns.min(), columns.max()]) - 80) < 15
 
 
-def test_there_may_be_nothing_to_see() -> None:
+def test_empty_model_has_a_thumbnail() -> None:
     assert render_thumbnail(scene_of(np.zeros((0, 3))), SIZE).shape == (100, 160, 3)
     assert render_thumbnail(scene_of(np.ones((1, 3))), SIZE).shape == (100, 160, 3)

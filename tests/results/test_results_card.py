@@ -22,7 +22,7 @@ def of(accuracy, verdict="good", reasons=()):
     return replace(made, diagnostics=diagnostics)
 
 
-def test_a_good_result() -> None:
+def test_good_result() -> None:
     said = SEPARATOR.join(card(of(KNOWN)))
     assert said.startswith("±24 mm (95 %) over ")
     assert said.endswith(" · weakest: frame 17, 29 mm")
@@ -30,7 +30,7 @@ def test_a_good_result() -> None:
     assert "to improve" not in said
 
 
-def test_what_would_improve_it() -> None:
+def test_improvement_is_suggested() -> None:
     reasons = (
         Reason("moving_objects", ((0, 1),), "Something moves."),
         Reason("uncertain_poses", ((0, 1),), "The poses may be off."),
@@ -39,7 +39,7 @@ def test_what_would_improve_it() -> None:
     assert last == "to improve: revisit these places, or keep corners and texture in view there"
 
 
-def test_what_is_not_bounded_or_not_assessed() -> None:
+def test_unbounded_and_unassessed_accuracy() -> None:
     assert bound(Accuracy(), 5.0) == "accuracy not assessed"
     assert weakest_frame(Accuracy()) == ""
     loose = Accuracy(np.inf, 0.1, np.inf, True, WorstFrame(4, np.inf, 0.1), (4, 5, 6, 9))
@@ -56,7 +56,7 @@ def test_lengths(metres, said) -> None:
 
 
 @pytest.mark.parametrize("text", ["30mm", "3cm", "0.03", "0.03m", "3e-2", " 30 mm "])
-def test_a_tolerance_has_units(text, room_recording, tmp_path) -> None:
+def test_tolerance_has_units(text, room_recording, tmp_path) -> None:
     from tofuse.cli.parser import make_parser
 
     words = ["run", str(room_recording), "--out", str(tmp_path), "--tolerance", text]
@@ -64,7 +64,7 @@ def test_a_tolerance_has_units(text, room_recording, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("text", ["0", "-1mm", "3 km", "mm", "nan", "inf", "1e999", "", "3mmm"])
-def test_what_is_no_tolerance_is_refused(text, room_recording, tmp_path, capsys) -> None:
+def test_invalid_tolerance_is_refused(text, room_recording, tmp_path, capsys) -> None:
     words = ["run", str(room_recording), "--out", str(tmp_path / "out"), f"--tolerance={text}"]
     with pytest.raises(SystemExit) as ended:
         main(words)

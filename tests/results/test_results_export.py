@@ -36,7 +36,7 @@ T_UP_WORLD = se3.exp(np.array([0, 0, 0, 2.6, 0.4, -0.3]))
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """A result of three poses, frame 3 of the recording being lost, and a small bent surface."""
+    """A result of three poses, with frame 3 of the recording lost, and a small curved surface."""
     folder = tmp_path / "result"
     folder.mkdir()
     frames = [{"index": k, "timestamp": t} for k, t in ((1, 0.1), (2, 0.2), (3, 0.3), (5, 0.5))]
@@ -53,7 +53,7 @@ def result(tmp_path: Path) -> Path:
     faces = np.concatenate([np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)])
     columns = {
         "normals": normals,
-        # Smooth, so that no picture of them can be off by more than its rounding.
+        # Smooth, so that a texture has only rounding errors.
         "color": np.round(60 + 40 * points @ [[3, 0, 1], [0, 3, 1], [5, 0, 0]]).astype(np.uint8),
         "scalars": {
             "views": rng.integers(1, 900, 30).astype(np.int32),
@@ -78,7 +78,7 @@ def expected(result: Path) -> SimpleNamespace:
     )
 
 
-def test_ply_of_a_run(result: Path, expected) -> None:
+def test_ply_read_by_trimesh(result: Path, expected) -> None:
     trimesh = pytest.importorskip("trimesh")
     mesh = trimesh.load(result / "mesh.ply", process=False)
     np.testing.assert_array_equal(mesh.vertices, expected.points)
@@ -158,7 +158,7 @@ def test_e57(result: Path, expected) -> None:
 
 @pytest.fixture
 def upright(expected) -> SimpleNamespace:
-    """The surface as it should stand, as `run.json` says."""
+    """The surface in its upright orientation, as stated in `run.json`."""
     R = T_UP_WORLD[:3, :3]
     return SimpleNamespace(
         points=expected.points @ R.T,
@@ -169,7 +169,7 @@ def upright(expected) -> SimpleNamespace:
 
 
 def check_surface(upright, points, faces, normals, color, *, exact: float = 2e-5) -> None:
-    """What another program read is what was written, whatever vertices stand twice at seams."""
+    """What another program read equals what was written, whatever vertices are doubled at seams."""
     points = np.asarray(points, float)
     distance = np.linalg.norm(points[:, None] - upright.points[None], axis=2)
     near = distance.argmin(1)
@@ -184,7 +184,7 @@ def check_surface(upright, points, faces, normals, color, *, exact: float = 2e-5
 
 
 @pytest.mark.parametrize("name", ["glb", "gltf", "obj", "stl"])
-def test_surfaces_by_trimesh(name: str, result: Path, upright) -> None:
+def test_surfaces_read_by_trimesh(name: str, result: Path, upright) -> None:
     trimesh = pytest.importorskip("trimesh")
     (path,) = export(result, [name])
     (mesh,) = trimesh.load_scene(path, process=False, maintain_order=True).geometry.values()
@@ -194,7 +194,7 @@ def test_surfaces_by_trimesh(name: str, result: Path, upright) -> None:
 
 
 @pytest.mark.parametrize("name", ["glb", "obj", "stl"])
-def test_surfaces_by_open3d(name: str, result: Path, upright) -> None:
+def test_surfaces_read_by_open3d(name: str, result: Path, upright) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d is not installed")
     (path,) = export(result, [name])
     mesh = open3d.io.read_triangle_mesh(str(path))
@@ -202,7 +202,7 @@ def test_surfaces_by_open3d(name: str, result: Path, upright) -> None:
     color = None
     if name != "stl":
         (image,) = (np.asarray(each) for each in mesh.textures if not each.is_empty())
-        # Places of the corners of triangles, from the lower left; each vertex has one.
+        # UV coordinates of the corners of triangles, from the lower left; each vertex has one.
         uv = np.zeros((len(points), 2))
         uv[faces.ravel()] = np.asarray(mesh.triangle_uvs)
         color = sampled(image, uv)
@@ -211,14 +211,14 @@ def test_surfaces_by_open3d(name: str, result: Path, upright) -> None:
 
 
 def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at places (N, 2) from the upper left corner."""
+    """Colours (N, 3) at UV coordinates (N, 2) from the upper left corner."""
     size = np.array(image.shape[1::-1])
     u, v = np.rint(uv * size - 0.5).astype(int).clip(0, size - 1).T
     return image[v, u, :3]
 
 
-def test_usdz_by_its_specification(result: Path, upright) -> None:
-    """The archive by the words of the specification, and the scene's text by hand."""
+def test_usdz_matches_specification(result: Path, upright) -> None:
+    """The archive is checked by the specification, the scene by its text."""
     (path,) = export(result, ["usdz"])
     data = path.read_bytes()
     with zipfile.ZipFile(path) as archive:
@@ -249,7 +249,7 @@ def test_usdz_by_its_specification(result: Path, upright) -> None:
     np.testing.assert_allclose([low, high], [points.min(0), points.max(0)], atol=1e-5)
 
 
-def test_usdz_by_openusd(result: Path, upright) -> None:
+def test_usdz_read_by_openusd(result: Path, upright) -> None:
     usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
     from pxr import UsdGeom, UsdShade
 
@@ -271,7 +271,7 @@ def test_usdz_by_openusd(result: Path, upright) -> None:
     assert file.resolvedPath.endswith("mesh.usdz[texture.jpg]")
 
 
-def test_many_triangles_have_colours_of_vertices(result: Path, upright, monkeypatch) -> None:
+def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr("tofuse.results.export._MAX_TEXTURED_FACES", 10)
     glb, obj, usdz = export(result, ["glb", "obj", "usdz"])
@@ -281,7 +281,7 @@ def test_many_triangles_have_colours_of_vertices(result: Path, upright, monkeypa
     document, arrays = parse(glb)
     (primitive,) = document["meshes"][0]["primitives"]
     found = arrays[primitive["attributes"]["COLOR_0"]][:, :3] / 65535
-    # What glTF holds is linear light, by the inverse of sRGB.
+    # glTF stores linear light, by the inverse of sRGB.
     s = upright.color / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(found, light, atol=1e-4)
@@ -292,8 +292,8 @@ def test_many_triangles_have_colours_of_vertices(result: Path, upright, monkeypa
     np.testing.assert_allclose(numbers, light, atol=1e-4)
 
 
-def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
-    """A texture keeps what lies between the few vertices that are left."""
+def test_simplified_surfaces_keep_colours(result: Path) -> None:
+    """A texture preserves the colours between the few remaining vertices."""
     trimesh = pytest.importorskip("trimesh")
     n = 120
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
@@ -313,7 +313,7 @@ def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
     assert 50 < len(mesh.faces) <= 200
     assert len(trimesh.load(stl).faces) <= 200
     image = np.array(mesh.visual.material.baseColorTexture.convert("RGB")).astype(int)
-    # Places within triangles, between vertices, have the colours that the full mesh has there.
+    # Points within triangles, between vertices, have the colours of the full mesh.
     weights = np.random.default_rng(3).dirichlet([1, 1, 1], (20, len(mesh.faces)))
     uv = np.einsum("kfi,fic->kfc", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
     p = np.einsum("kfi,fic->kfc", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
@@ -324,7 +324,7 @@ def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
     assert np.abs(found[:, 1] - (127 + 120 * np.cos(6 * p[:, 1]))).max() < 20
 
 
-def test_laz_has_the_same_bytes_again_in_parts(result: Path, monkeypatch) -> None:
+def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) -> None:
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     (path,) = export(result, ["laz"])
@@ -378,7 +378,7 @@ def test_log_tum_and_kitti_by_open3d(result: Path) -> None:
         np.testing.assert_allclose(found, POSES, atol=1e-9)
 
 
-def test_log_has_the_numbers_of_the_frames(result: Path) -> None:
+def test_log_contains_frame_indices(result: Path) -> None:
     (path,) = export(result, ["log"])
     lines = path.read_text().splitlines()
     assert [lines[k] for k in (0, 5, 10)] == ["1 1 2", "2 2 3", "5 5 6"]
@@ -386,7 +386,7 @@ def test_log_has_the_numbers_of_the_frames(result: Path) -> None:
     np.testing.assert_allclose(block, POSES[1], atol=1e-15)
 
 
-def test_by_the_command_line(result: Path, tmp_path: Path, capsys) -> None:
+def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert set(EXPORTS) == set(FORMATS)
     out = tmp_path / "new" / "files"
     assert main(["export", str(result), "las", "kitti", "--out", str(out)]) == 0
@@ -406,7 +406,7 @@ def test_by_the_command_line(result: Path, tmp_path: Path, capsys) -> None:
     assert "use one of" in capsys.readouterr().err
 
 
-def test_what_is_not_there(result: Path, monkeypatch) -> None:
+def test_missing_surface_and_package_are_reported(result: Path, monkeypatch) -> None:
     (result / "mesh.ply").unlink()
     with pytest.raises(InputError, match="clouds without a camera model have no surface"):
         export(result, ["obj"])
@@ -416,7 +416,7 @@ def test_what_is_not_there(result: Path, monkeypatch) -> None:
     assert not (result / "cloud.e57").exists()
 
 
-def test_an_empty_cloud(result: Path) -> None:
+def test_empty_cloud(result: Path) -> None:
     write_ply(result / "cloud.ply", GeometryRecord(np.zeros((0, 3))))
     laspy = pytest.importorskip("laspy")
     pypcd4 = pytest.importorskip("pypcd4")
@@ -427,11 +427,11 @@ def test_an_empty_cloud(result: Path) -> None:
         export(result, ["e57"])
 
 
-def test_one_process_at_a_time_writes_beside_a_result(result: Path, tmp_path: Path) -> None:
+def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> None:
     with OutputFolder(result, overwrite=True):
         with pytest.raises(OutputError, match="is being written by another process"):
             export(result, ["kitti"])
-        assert export(result, ["kitti"], tmp_path / "other")[0].exists()  # the old one is whole
+        assert export(result, ["kitti"], tmp_path / "other")[0].exists()  # the old result
     seen: list[OutputError] = []
 
     def during(_result: object, _path: Path) -> None:
@@ -446,8 +446,8 @@ def test_one_process_at_a_time_writes_beside_a_result(result: Path, tmp_path: Pa
     assert not (result / LOCK).exists()
 
 
-def test_the_lock_of_a_component_is_that_of_its_result(result: Path) -> None:
-    """A run replaces its components' folders as a whole, so nothing of ours may lie there."""
+def test_component_uses_lock_of_its_result(result: Path) -> None:
+    """A run replaces its component folders as a whole, so they must contain no lock files."""
     part = result / "component-1"
     shutil.copytree(result, result.parent / "copy")
     shutil.move(result.parent / "copy", part)
@@ -459,7 +459,7 @@ def test_the_lock_of_a_component_is_that_of_its_result(result: Path) -> None:
     assert not list(part.glob(".tofuse-*"))
 
 
-def test_a_result_that_is_replaced_meanwhile_is_no_result(result: Path, tmp_path: Path) -> None:
+def test_result_replaced_during_export_is_refused(result: Path, tmp_path: Path) -> None:
     def during(_result: object, _path: Path) -> None:
         os.utime(result / "run.json", ns=(1, 1))
 

@@ -1,4 +1,4 @@
-"""Ownership of an output folder: nothing is changed before it is established, by one process."""
+"""Ownership of an output folder is established, by one process, before anything is changed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tofuse.results.pair import pair_folder
 FILE = ["file", 6, 0.0]
 RUN = {"schema": 1, "version": "0", "verdict": "good"}
 
-# What somebody may have left as a plan: nothing of it may be followed.
+# Plans that may be left in a folder by others: none of them may be followed.
 PLANS: dict[str, object] = {
     "of version 0.1": {"files": [], "old": ["precious.txt"]},
     "a list": [],
@@ -72,7 +72,7 @@ def planted(folder: Path, plan: object, name: str) -> None:
 @pytest.mark.parametrize("name", ["plan.json", "undo.json"])
 @pytest.mark.parametrize("theirs", [True, False], ids=["beside a result", "beside none"])
 @pytest.mark.parametrize("plan", PLANS)
-def test_no_plan_of_somebody_else_is_followed(tmp_path, plan, theirs, name) -> None:
+def test_foreign_plans_are_not_followed(tmp_path, plan, theirs, name) -> None:
     out = tmp_path / "out"
     out.mkdir()
     planted(out, PLANS[plan], name)
@@ -85,7 +85,7 @@ def test_no_plan_of_somebody_else_is_followed(tmp_path, plan, theirs, name) -> N
         assert "\n" not in str(caught.value)
         assert len(str(caught.value)) < 500
         assert contents(tmp_path) == before
-    if plan not in ("was changed", "no result made"):  # which a reader would not ask
+    if plan not in ("was changed", "no result made"):  # these are not checked by readers
         with pytest.raises(InputError):
             finish_interrupted(out)
     assert contents(tmp_path) == before
@@ -118,7 +118,7 @@ def test_links_are_never_followed(tmp_path, what) -> None:
     assert contents(tmp_path) == before
 
 
-def test_what_lies_in_hidden_folders_of_ours_and_is_not_ours_stays(tmp_path) -> None:
+def test_foreign_files_in_staging_folder_are_kept(tmp_path) -> None:
     staging = tmp_path / STAGING
     staging.mkdir()
     (staging / "precious.txt").write_text("mine")
@@ -127,7 +127,7 @@ def test_what_lies_in_hidden_folders_of_ours_and_is_not_ours_stays(tmp_path) -> 
     assert (staging / "precious.txt").read_text() == "mine"
 
 
-def test_a_result_of_another_kind_is_not_recovered(tmp_path) -> None:
+def test_result_of_other_kind_is_not_recovered(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     planted(tmp_path, {"new": {}, "old": {"run.json": FILE}}, "plan.json")
     before = contents(tmp_path)
@@ -158,7 +158,7 @@ def holder(out: Path) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("end", ["ends", "is killed"])
-def test_a_second_run_is_refused_and_told_by_whom(tmp_path, end) -> None:
+def test_second_run_is_refused_and_names_first(tmp_path, end) -> None:
     out = tmp_path / "out"
     with holder(out) as first:
         with pytest.raises(OutputError) as caught:
@@ -169,7 +169,7 @@ def test_a_second_run_is_refused_and_told_by_whom(tmp_path, end) -> None:
         if end == "is killed":
             first.kill()
     if end == "is killed":
-        assert (out / LOCK).exists()  # and is taken over
+        assert (out / LOCK).exists()  # is taken over
     with OutputFolder(out) as mine:
         assert mine.path == out
         note = json.loads((out / LOCK).read_text())
@@ -179,7 +179,7 @@ def test_a_second_run_is_refused_and_told_by_whom(tmp_path, end) -> None:
     assert not (out / LOCK).exists()
 
 
-def test_where_there_are_no_locks_the_note_decides(tmp_path, monkeypatch) -> None:
+def test_note_decides_where_locks_are_unsupported(tmp_path, monkeypatch) -> None:
     def none(_handle: int) -> None:
         raise OSError(38, "no locks available")
 
@@ -204,7 +204,7 @@ def test_where_there_are_no_locks_the_note_decides(tmp_path, monkeypatch) -> Non
             Claim(lock, what="out").release()
 
 
-def test_a_reader_waits_for_no_moves_and_finishes_stopped_ones(tmp_path, monkeypatch) -> None:
+def test_reader_refuses_running_moves_and_finishes_interrupted_ones(tmp_path, monkeypatch) -> None:
     write_result(result(seed=1), OutputFolder(tmp_path))
     folder, moves, move = OutputFolder(tmp_path, overwrite=True), [], os.replace
 
@@ -213,7 +213,7 @@ def test_a_reader_waits_for_no_moves_and_finishes_stopped_ones(tmp_path, monkeyp
             moves.append(target)
             if len(moves) > 3:
                 with pytest.raises(InputError, match=f"pid {os.getpid()}"):
-                    finish_interrupted(tmp_path)  # while they go on
+                    finish_interrupted(tmp_path)  # during the moves
                 raise OSError(5, "gone")
         move(source, target)
 
@@ -232,7 +232,7 @@ def test_a_reader_waits_for_no_moves_and_finishes_stopped_ones(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("theirs", ["notes.txt", "depth/mine.txt", "link"])
-def test_a_demo_replaces_no_recording_with_something_else_in_it(tmp_path, theirs) -> None:
+def test_demo_does_not_replace_recording_with_foreign_files(tmp_path, theirs) -> None:
     recording = tmp_path / "recording"
     (recording / "truth").mkdir(parents=True)
     (recording / "depth").mkdir()

@@ -21,7 +21,7 @@ from tofuse.results.types import FrameRecord
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
 
 
-def test_a_new_folder_and_its_parents_are_made(tmp_path) -> None:
+def test_new_folder_and_its_parents_are_made(tmp_path) -> None:
     out = tmp_path / "a" / "b"
     write_result(result(), OutputFolder(out), lambda r, f: (f / "report.html").write_text("x"))
     assert set(contents(out)) == FILES | {"report.html"}
@@ -29,16 +29,16 @@ def test_a_new_folder_and_its_parents_are_made(tmp_path) -> None:
     assert is_result(out)
 
 
-def test_folders_that_were_made_go_when_nothing_is_written(tmp_path) -> None:
+def test_new_folders_are_removed_if_nothing_is_written(tmp_path) -> None:
     OutputFolder(tmp_path / "a" / "b").discard()
     assert list(tmp_path.iterdir()) == []
     mine = tmp_path / "mine"
     mine.mkdir()
     OutputFolder(mine).discard()
-    assert mine.is_dir()  # was there before
+    assert mine.is_dir()  # existed before
 
 
-def test_an_earlier_result_is_only_replaced_when_asked(tmp_path) -> None:
+def test_earlier_result_is_replaced_only_on_request(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     before = contents(tmp_path)
     with pytest.raises(OutputError, match="contains an earlier result; pass --overwrite"):
@@ -50,14 +50,14 @@ def test_an_earlier_result_is_only_replaced_when_asked(tmp_path) -> None:
 
 @pytest.mark.parametrize("name", ["photo.jpg", "run.json", "trajectory.txt", ".hidden"])
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, name, overwrite) -> None:
+def test_foreign_folder_is_unchanged(tmp_path, name, overwrite) -> None:
     (tmp_path / name).write_text('{"a": 1}')
     with pytest.raises(OutputError, match="is not empty and contains no earlier result"):
         OutputFolder(tmp_path, overwrite=overwrite)
     assert contents(tmp_path) == {name: b'{"a": 1}'}
 
 
-def test_a_file_or_a_place_below_a_file(tmp_path) -> None:
+def test_file_as_folder_or_parent_is_refused(tmp_path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
     with pytest.raises(OutputError, match="is a file; pass a folder as --out"):
@@ -67,7 +67,7 @@ def test_a_file_or_a_place_below_a_file(tmp_path) -> None:
     assert file.read_text() == "mine"
 
 
-def test_what_a_killed_run_left_does_not_count(tmp_path) -> None:
+def test_files_of_killed_run_are_ignored(tmp_path) -> None:
     left = tmp_path / STAGING
     left.mkdir()
     (left / "trajectory.txt").write_text("half")
@@ -77,7 +77,7 @@ def test_what_a_killed_run_left_does_not_count(tmp_path) -> None:
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
-def test_a_failure_while_writing_changes_nothing(tmp_path, overwrite, failure) -> None:
+def test_failure_while_writing_changes_nothing(tmp_path, overwrite, failure) -> None:
     out = tmp_path / "out"
     if overwrite:
         write_result(result(), OutputFolder(out))
@@ -98,7 +98,7 @@ def test_a_failure_while_writing_changes_nothing(tmp_path, overwrite, failure) -
 
 
 @pytest.mark.parametrize("when", range(8))
-def test_a_failure_while_moving_puts_everything_back(tmp_path, monkeypatch, when) -> None:
+def test_failure_while_moving_is_rolled_back(tmp_path, monkeypatch, when) -> None:
     write_result(result(), OutputFolder(tmp_path))
     before = contents(tmp_path)
     folder = OutputFolder(tmp_path, overwrite=True)
@@ -122,8 +122,8 @@ def test_a_failure_while_moving_puts_everything_back(tmp_path, monkeypatch, when
 @pytest.mark.parametrize(
     ("moved", "back"), [(k, None) for k in range(9)] + [(8, k) for k in range(8)]
 )
-def test_moves_that_were_cut_off_are_finished_by_the_next(tmp_path, monkeypatch, moved, back):
-    """Of nine moves some were done when the run was killed; or one failed, and it was undoing."""
+def test_interrupted_moves_are_finished_by_next_run(tmp_path, monkeypatch, moved, back):
+    """Some of nine moves were done when the run was killed; or one failed, during the rollback."""
     write_result(result(), OutputFolder(tmp_path))
     (tmp_path / "mesh.glb").write_text("an earlier run had a surface")
     before = contents(tmp_path)
@@ -146,7 +146,7 @@ def test_moves_that_were_cut_off_are_finished_by_the_next(tmp_path, monkeypatch,
     monkeypatch.undo()
     assert len(moves) == moved + 1 + (0 if back is None else back + 1)
     assert (tmp_path / "run.json").exists() == (moved == 0)
-    for _ in range(2):  # what has been finished stays so
+    for _ in range(2):  # the second time changes nothing
         OutputFolder(tmp_path, overwrite=True).discard()
         if back is None:
             assert {p.name for p in tmp_path.iterdir()} == FILES
@@ -155,7 +155,7 @@ def test_moves_that_were_cut_off_are_finished_by_the_next(tmp_path, monkeypatch,
             assert contents(tmp_path) == before
 
 
-def test_run_json_is_what_the_contract_says(tmp_path) -> None:
+def test_run_json_matches_contract(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     data = json.loads((tmp_path / "run.json").read_text(), parse_constant=lambda c: pytest.fail(c))
     assert list(data) == [
@@ -226,14 +226,14 @@ def test_components_are_in_run_json(tmp_path) -> None:
     assert all(set(c) == {"frames", "T_main_component", "joined"} for c in data["components"])
     assert [frame["component"] for frame in data["frames"]] == [0, 1, 2, None]
     assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1]
-    # What version 0.1 wrote knows no components.
+    # Results of version 0.1 have no components.
     del data["components"]
     for frame in data["frames"]:
         del frame["component"]
     assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1, 2]
 
 
-def test_exit_status_counts_frames_outside_the_main_model() -> None:
+def test_exit_status_counts_frames_outside_main_model() -> None:
     r = torn()
     d = r.diagnostics
     assert exit_status(r) == 3
@@ -243,7 +243,7 @@ def test_exit_status_counts_frames_outside_the_main_model() -> None:
     assert exit_status(replace(r, diagnostics=replace(d, frames=skipped))) == 0
 
 
-def test_a_component_with_a_model_of_its_own_has_a_folder(tmp_path) -> None:
+def test_component_with_its_own_model_has_a_folder(tmp_path) -> None:
     seen = []
 
     def report(r, folder) -> None:
@@ -256,13 +256,13 @@ def test_a_component_with_a_model_of_its_own_has_a_folder(tmp_path) -> None:
     assert set(contents(tmp_path)) == made
     assert is_result(tmp_path / "component-2")
     assert (tmp_path / "component-2/run.json").read_text().count("component-2") == 0
-    # Only what is apart and has a model.
+    # Only for separate components with a model.
     write_result(torn(parts=1), OutputFolder(tmp_path, overwrite=True))
     assert set(contents(tmp_path)) == FILES
     assert {p.name for p in tmp_path.iterdir()} == FILES
 
 
-def test_folders_of_an_earlier_result_are_replaced(tmp_path) -> None:
+def test_folders_of_earlier_result_are_replaced(tmp_path) -> None:
     write_result(torn(seed=1), OutputFolder(tmp_path))
     (tmp_path / "component-7").mkdir()
     (tmp_path / "component-7/cloud.pcd").write_text("exported")
@@ -276,7 +276,7 @@ def test_folders_of_an_earlier_result_are_replaced(tmp_path) -> None:
 
 @pytest.mark.parametrize("how", ["note", "folder", "link inside", "link", "file", "dangling"])
 @pytest.mark.parametrize("when", ["before", "meanwhile"])
-def test_a_folder_with_something_of_somebody_else_stays(tmp_path, how, when) -> None:
+def test_component_folder_with_foreign_files_is_kept(tmp_path, how, when) -> None:
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "cloud.ply").write_text("precious")
@@ -308,11 +308,11 @@ def test_a_folder_with_something_of_somebody_else_stays(tmp_path, how, when) -> 
     assert own.is_symlink() == (how in ("link", "dangling"))
 
 
-def test_a_link_in_place_of_a_file_is_put_back(tmp_path, monkeypatch) -> None:
+def test_link_in_place_of_file_is_restored(tmp_path, monkeypatch) -> None:
     out = tmp_path / "out"
     write_result(result(), OutputFolder(out))
     (out / "cloud.ply").rename(tmp_path / "cloud.ply")
-    (out / "cloud.ply").symlink_to("../cloud.ply")  # leads nowhere from another folder
+    (out / "cloud.ply").symlink_to("../cloud.ply")  # broken if read from another folder
     folder, move = OutputFolder(out, overwrite=True), os.replace
 
     def fails(source, target) -> None:
@@ -327,7 +327,7 @@ def test_a_link_in_place_of_a_file_is_put_back(tmp_path, monkeypatch) -> None:
     assert (out / "cloud.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()
 
 
-def test_an_error_in_a_component_names_its_file(tmp_path, monkeypatch) -> None:
+def test_error_in_component_names_its_file(tmp_path, monkeypatch) -> None:
     def report(_result, folder) -> None:
         raise OutputError("can't be written", where=folder / "report.html")
 
@@ -367,7 +367,7 @@ def test_folders_are_moved_as_safely_as_files(tmp_path, monkeypatch, moved, undo
         assert read_run_json(tmp_path / name)["seed"] == 2
 
 
-def test_only_frames_with_a_pose_have_a_line(tmp_path) -> None:
+def test_only_frames_with_pose_are_written(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     lines = (tmp_path / "trajectory.txt").read_text().splitlines()
     values = [line.split() for line in lines if not line.startswith("#")]
@@ -391,7 +391,7 @@ def test_plain_values() -> None:
         ("\xff", "is not text"),
     ],
 )
-def test_a_broken_run_json(tmp_path, text, message) -> None:
+def test_invalid_run_json(tmp_path, text, message) -> None:
     file = tmp_path / "run.json"
     file.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=message):

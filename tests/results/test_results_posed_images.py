@@ -37,7 +37,7 @@ TABLE = RayTable(np.array(BROWN.rays()))
 
 
 def opencv_rays(data: dict[str, float]) -> np.ndarray:
-    """x/z and y/z (H, W, 2) of a lens by OpenCV, from the numbers of transforms.json."""
+    """x/z and y/z (H, W, 2) of a lens by OpenCV, from the numbers in transforms.json."""
     w, h = int(data["w"]), int(data["h"])
     K = np.array([[data["fl_x"], 0, data["cx"]], [0, data["fl_y"], data["cy"]], [0, 0, 1]])
     v, u = np.mgrid[0:h, 0:w] + 0.5
@@ -54,7 +54,7 @@ def opencv_rays(data: dict[str, float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [PLAIN, BROWN, BENT, WIDE, RATIO, TABLE])
-def test_nerfstudio_puts_points_where_they_are(tmp_path: Path, camera: Camera) -> None:
+def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Camera) -> None:
     result = made_result(tmp_path, camera)
     (folder,) = export(result, ["nerfstudio"])
     data = json.loads((folder / "transforms.json").read_text())
@@ -71,7 +71,7 @@ def test_nerfstudio_puts_points_where_they_are(tmp_path: Path, camera: Camera) -
         rays = opencv_rays(data)
         seen = z > 0
         assert seen.mean() > (0.9 if kept else 0.7)
-        # From OpenGL's axes into the world; then the plane is where the camera saw it.
+        # From OpenGL's axes to the world; then the plane is where the camera measured it.
         local = np.concatenate([rays, np.ones((*z.shape, 1))], -1) * z[..., None] * [1, -1, -1]
         world = local[seen] @ T[:3, :3].T + T[:3, 3]
         camera_axes = (world - POSES[k, :3, 3]) @ POSES[k, :3, :3]
@@ -100,7 +100,7 @@ def test_nerfstudio_puts_points_where_they_are(tmp_path: Path, camera: Camera) -
 
 
 @pytest.mark.parametrize("camera", [PLAIN, BROWN, BENT, RATIO, WIDE, TABLE])
-def test_colmap_by_pycolmap(tmp_path: Path, camera: Camera) -> None:
+def test_colmap_read_by_pycolmap(tmp_path: Path, camera: Camera) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
     result = made_result(tmp_path, camera)
     (folder,) = export(result, ["colmap"])
@@ -126,7 +126,7 @@ def test_colmap_by_pycolmap(tmp_path: Path, camera: Camera) -> None:
         assert point.color.tolist() == [77, 77, 77]
 
 
-def test_colmap_by_hand(tmp_path: Path) -> None:
+def test_colmap_text_files(tmp_path: Path) -> None:
     """The text files, for machines without pycolmap."""
     result = made_result(tmp_path, BROWN)
     (folder,) = export(result, ["colmap"], every=2)
@@ -143,14 +143,14 @@ def test_colmap_by_hand(tmp_path: Path) -> None:
     ]
 
 
-def test_rectified_where_asked_for(tmp_path: Path) -> None:
+def test_images_are_rectified_on_request(tmp_path: Path) -> None:
     (folder,) = export(made_result(tmp_path, BROWN), ["colmap"], pinhole=True)
     text = (folder / "sparse" / "0" / "cameras.txt").read_text()
     assert " PINHOLE " in text
     assert "OPENCV" not in text
 
 
-def test_amplitude_stands_in_for_colour(tmp_path: Path) -> None:
+def test_amplitude_replaces_missing_colour(tmp_path: Path) -> None:
     """The image is the albedo: equal at all distances, and masked without a measurement."""
     (folder,) = export(made_result(tmp_path, PLAIN, color="amplitude"), ["nerfstudio"])
     data = json.loads((folder / "transforms.json").read_text())
@@ -164,7 +164,7 @@ def test_amplitude_stands_in_for_colour(tmp_path: Path) -> None:
         assert (mask[4:] == 255).all()
 
 
-def test_the_corrected_camera_is_written(tmp_path: Path) -> None:
+def test_corrected_camera_is_written(tmp_path: Path) -> None:
     config = {"corrections": [{"part": "camera-errors", "focal": 0.05, "offset_m": 0.1}]}
     (folder,) = export(made_result(tmp_path, PLAIN, config=config), ["nerfstudio"])
     data = json.loads((folder / "transforms.json").read_text())
@@ -173,8 +173,8 @@ def test_the_corrected_camera_is_written(tmp_path: Path) -> None:
     assert z[18, 23] == pytest.approx(1000 * plane(PLAIN, 0)[18, 23] + 100, abs=1)
 
 
-def test_colour_of_phones_is_as_large_as_recorded(tmp_path: Path) -> None:
-    """Depth stays as it is; the lens is that of the image. A frame without colour has no image."""
+def test_colour_of_phones_keeps_recorded_size(tmp_path: Path) -> None:
+    """Depth is unchanged; the lens is that of the image. A frame without colour has no image."""
     recording = tmp_path / "scan"
     made_dumps.make_polycam(recording)
     (recording / "keyframes" / "images" / "5250000.jpg").unlink()
@@ -198,7 +198,7 @@ def test_colour_of_phones_is_as_large_as_recorded(tmp_path: Path) -> None:
         depth = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
         assert image.shape[:2] == (frame["h"], frame["w"]) == (192, 256)
         assert depth.shape == (24, 32)
-        # The lens is given for 1920 x 1440 pixels, from the middle of the first.
+        # The lens is given for 1920 x 1440 pixels, from the centre of the first.
         assert frame["fl_x"] == pytest.approx((made_phones.FX + k) * 256 / 1920)
         assert frame["cx"] == pytest.approx((made_phones.CX + 0.5) * 256 / 1920)
     assert read_ply(folder / "points.ply").color.tolist() == [[128, 128, 128]]
@@ -231,7 +231,7 @@ def _damaged(result: Path) -> None:
         (_damaged, "is damaged"),
     ],
 )
-def test_what_can_not_be_exported_is_told(
+def test_impossible_exports_are_refused(
     tmp_path: Path, spoil: Callable[[Path], None], says: str, capsys
 ) -> None:
     result = made_result(tmp_path, PLAIN)
@@ -245,12 +245,12 @@ def test_what_can_not_be_exported_is_told(
     assert sorted(p.name for p in result.iterdir()) == ["cloud.ply", "run.json", "trajectory.txt"]
 
 
-def test_depth_alone_is_refused(tmp_path: Path) -> None:
+def test_recording_without_colour_or_amplitude_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="neither colour nor amplitude"):
         export(made_result(tmp_path, PLAIN, color="none"), ["nerfstudio"])
 
 
-def test_folders_are_replaced_only_where_they_are_ours(tmp_path: Path) -> None:
+def test_only_own_folders_are_replaced(tmp_path: Path) -> None:
     result = made_result(tmp_path, PLAIN)
     (folder,) = export(result, ["colmap"])
     with pytest.raises(OutputError, match="--overwrite"):

@@ -46,7 +46,7 @@ def made(tmp_path_factory) -> SimpleNamespace:
 
 
 def checked(tile: dict, parent: dict | None, folder: Path) -> int:
-    """What 3D Tiles 1.1 asks of a tile (sections 7.1 to 7.5); how many there are."""
+    """Check the requirements of 3D Tiles 1.1 (sections 7.1 to 7.5); return the number of tiles."""
     assert set(tile) <= {
         *("boundingVolume", "geometricError", "refine", "content", "children", "extras"),
     }
@@ -64,13 +64,13 @@ def checked(tile: dict, parent: dict | None, folder: Path) -> int:
         uri = tile["content"]["uri"]
         document, arrays = parse(folder / uri)
         assert document["asset"]["version"] == "2.0"
-        # glTF has y up, tiles z: x, -z, y. All of it lies in the boxes of all tiles above.
+        # glTF has y up, tiles z: x, -z, y. All points are inside the boxes of all tiles above.
         p = arrays[0].astype(float)
         turned = np.stack([p[:, 0], -p[:, 2], p[:, 1]], -1)
         inside = np.abs((turned - box[:3]) @ np.linalg.inv(axes))
         assert inside.max() <= 1 + 1e-6
     children = tile.get("children")
-    assert children is None or len(children) >= 1  # left out where there are none
+    assert children is None or len(children) >= 1  # absent if there are none
     count = 1
     for child in children or []:
         mine = np.array(child["boundingVolume"]["box"])
@@ -80,7 +80,7 @@ def checked(tile: dict, parent: dict | None, folder: Path) -> int:
     return count
 
 
-def test_a_tileset_is_what_the_specification_asks_for(made) -> None:
+def test_tileset_matches_specification(made) -> None:
     document = json.loads((made.folder / "tileset.json").read_text())
     assert set(document) == {"asset", "geometricError", "root", "extras"}
     assert document["asset"]["version"] == "1.1"
@@ -94,7 +94,7 @@ def test_a_tileset_is_what_the_specification_asks_for(made) -> None:
 
 
 def meshes(made, level):
-    """The meshes of a level, back in the world."""
+    """The meshes of a level, in world coordinates."""
     out = []
     for path in sorted(made.folder.glob(f"{level}-*.glb")):
         glb = read_glb(path)
@@ -102,7 +102,7 @@ def meshes(made, level):
     return out
 
 
-def test_the_finest_level_is_the_surface(made) -> None:
+def test_finest_level_is_the_surface(made) -> None:
     parts = meshes(made, 0)
     assert len(parts) >= 36
     found = np.concatenate([points[faces].reshape(-1, 9) for points, faces, _ in parts])
@@ -113,7 +113,7 @@ def test_the_finest_level_is_the_surface(made) -> None:
     leaves = [tile for tile in made.root.walk() if not tile.children]
     assert sum(tile.faces for tile in leaves) == len(made.mesh.faces) == made.tiled.faces
     assert all(tile.error_m == 0 for tile in leaves)
-    # What is known of a vertex comes along.
+    # Attributes of vertices are kept.
     # By x and y, which are multiples of 1 cm.
     key = {tuple(p): k for k, p in enumerate(np.round(made.mesh.vertices[:, :2], 2).tolist())}
     points, _, glb = parts[7]
@@ -125,8 +125,8 @@ def test_the_finest_level_is_the_surface(made) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_there_is_no_crack_between_tiles_of_a_level(made, level) -> None:
-    """Each edge is of two triangles, in whatever tiles, but for the border of the surface."""
+def test_tiles_of_a_level_have_no_cracks(made, level) -> None:
+    """Each edge belongs to two triangles, in whatever tiles, except at the surface border."""
     edges = []
     for points, faces, _ in meshes(made, level):
         p = np.round(points, 5)
@@ -141,7 +141,7 @@ def test_there_is_no_crack_between_tiles_of_a_level(made, level) -> None:
     assert (count > 2).mean() < 0.001
 
 
-def test_levels_are_as_near_to_the_surface_as_they_say(made) -> None:
+def test_levels_are_within_stated_error(made) -> None:
     faces = []
     for level in range(made.tiled.levels):
         tiles_of = [t for t in made.root.walk() if t.content and t.content.startswith(f"{level}-")]
@@ -157,14 +157,14 @@ def test_levels_are_as_near_to_the_surface_as_they_say(made) -> None:
     assert made.tiled.levels == 4  # 180 cells, 32 across a tile: 6, 3, 2, 1
 
 
-def test_tiles_are_written_alike_again(made, tmp_path, monkeypatch) -> None:
+def test_tiles_are_reproducible(made, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
     write_tiles(made.mesh, R, tmp_path / "again")
     for path in made.folder.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_what_is_put_together_to_nothing_is_still_below_a_root(tmp_path, monkeypatch) -> None:
+def test_levels_without_triangles_keep_a_root(tmp_path, monkeypatch) -> None:
     """Two specks far apart: at some level neither has a triangle left."""
     monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 4)
     small = waves(2)
@@ -188,7 +188,7 @@ def test_what_is_put_together_to_nothing_is_still_below_a_root(tmp_path, monkeyp
     assert root.high[0] > 43
 
 
-def test_a_single_triangle_and_slivers_end_in_one_tile(tmp_path) -> None:
+def test_single_triangle_and_slivers_give_one_tile(tmp_path) -> None:
     one = waves(1).rows(np.array([True, False]))
     (level,) = levels(one)
     assert level.places == ((0, 0, 0),)
@@ -198,7 +198,7 @@ def test_a_single_triangle_and_slivers_end_in_one_tile(tmp_path) -> None:
     assert level.mesh is one
 
 
-def test_damaged_tilesets_are_told_in_one_line(made, tmp_path) -> None:
+def test_damaged_tilesets_are_refused_in_one_line(made, tmp_path) -> None:
     good = (made.folder / "tileset.json").read_text()
     path = tmp_path / "tileset.json"
     for wrong in (
@@ -222,7 +222,7 @@ def test_damaged_tilesets_are_told_in_one_line(made, tmp_path) -> None:
         read_tileset(path)
 
 
-def test_boxes_come_back_in_the_axes_of_gltf(tmp_path) -> None:
+def test_boxes_round_trip_in_gltf_axes(tmp_path) -> None:
     tile = Tile(np.array([-1.0, 2, 3]), np.array([1.0, 5, 9]), 0.5, "0-0-0-0.glb", 7)
     write_tileset(tmp_path / "t.json", tile, generator="", extras={"a": 1})
     found, extras = read_tileset(tmp_path / "t.json")
@@ -233,7 +233,7 @@ def test_boxes_come_back_in_the_axes_of_gltf(tmp_path) -> None:
     np.testing.assert_allclose(np.diag(np.reshape(box[3:], (3, 3))), [1, 3, 1.5])
 
 
-def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
+def test_glb_round_trip_and_foreign_files_are_refused(tmp_path) -> None:
     mesh = waves(4)
     path = tmp_path / "a.glb"
     color = np.repeat(np.arange(25, dtype=np.uint8)[:, None] * 10, 3, 1)
@@ -262,7 +262,7 @@ def small_limits(monkeypatch) -> None:
     monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
 
 
-def test_a_large_result_has_tiles_an_overview_and_all_else(tmp_path, small_limits) -> None:
+def test_large_result_has_tiles_and_overview(tmp_path, small_limits) -> None:
     result, _ = make_room()
     mesh = waves()
     result = replace(result, mesh=mesh)
@@ -287,21 +287,21 @@ def test_a_large_result_has_tiles_an_overview_and_all_else(tmp_path, small_limit
         np.testing.assert_allclose(
             laspy.read(out / "cloud.laz").xyz, result.cloud.points, atol=0.51e-4
         )
-    # A small result takes its place, tiles and all.
+    # A small result replaces it, including the tiles.
     small = replace(result, mesh=waves(10))
     write_result(small, OutputFolder(out, overwrite=True))
     assert not (out / "tiles").exists()
     assert not (out / "cloud.laz").exists()
     assert json.loads((out / "run.json").read_text())["tiles"] is None
     assert len(read_glb(out / "mesh.glb").faces) == 200
-    # But not where somebody has put something into them.
+    # But not if the folder contains foreign files.
     write_result(result, OutputFolder(out, overwrite=True))
     (out / "tiles" / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="is not a file of an earlier result"):
         OutputFolder(out, overwrite=True)
 
 
-def test_a_glb_is_small_and_a_ply_is_whole(tmp_path, monkeypatch) -> None:
+def test_glb_is_simplified_and_ply_is_complete(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(tiles, "OVERVIEW_BYTES", 600_000)
     result, _ = make_room()
     result = replace(result, mesh=waves())
@@ -312,7 +312,7 @@ def test_a_glb_is_small_and_a_ply_is_whole(tmp_path, monkeypatch) -> None:
     assert len(read_ply(out / "mesh.ply").faces) == len(waves().faces)
 
 
-def test_tiles_are_grey_where_no_image_showed_a_colour(tmp_path) -> None:
+def test_tiles_without_colour_are_grey(tmp_path) -> None:
     colors = np.full((len(waves()), 3), 200, np.uint8)
     colors[::2] = 0
     write_tiles(replace(waves(), color=colors), np.eye(3), tmp_path)
@@ -321,7 +321,7 @@ def test_tiles_are_grey_where_no_image_showed_a_colour(tmp_path) -> None:
         assert set(shown[:, 0].tolist()) <= {142, 200}
 
 
-def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
+def test_component_may_be_tiled_too(tmp_path, small_limits) -> None:
     result, _ = make_room()
     own = replace(result, mesh=waves())
     first = replace(result.components[0], result=None) if result.components else None
@@ -332,7 +332,7 @@ def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
     out = tmp_path / "out"
     write_result(both, OutputFolder(out))
     assert is_tiles(out / "component-1" / "tiles")
-    write_result(both, OutputFolder(out, overwrite=True))  # is known as ours
+    write_result(both, OutputFolder(out, overwrite=True))  # is recognised as a result
     assert is_tiles(out / "component-1" / "tiles")
     (out / "component-1" / "tiles" / "more.glb").write_text("")
     with pytest.raises(OutputError, match="component-1"):
@@ -340,10 +340,10 @@ def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
 
 
 @pytest.mark.parametrize("stopped_at", [0, 1, 3, 6, 12])
-def test_moves_that_were_stopped_are_finished_with_all_tiles(
+def test_interrupted_moves_are_finished_with_all_tiles(
     tmp_path, small_limits, monkeypatch, stopped_at
 ) -> None:
-    """Nothing is half of one result and half of another, tiles of a component included."""
+    """Results are never mixed, including tiles of a component."""
     first, _ = make_room()
     apart = Component(((0, 9),), None, None, replace(first, mesh=waves(90)))
     main = Component(((10, 23),), np.eye(4), None, None)
@@ -373,7 +373,7 @@ def test_moves_that_were_stopped_are_finished_with_all_tiles(
     assert is_tiles(out / "tiles")
 
 
-def test_the_overview_is_as_fine_as_fits(tmp_path, small_limits) -> None:
+def test_overview_is_as_fine_as_size_limit_allows(tmp_path, small_limits) -> None:
     tiled: TilingSummary = write_tiles(waves(), np.eye(3), tmp_path)
     write_glb(
         tmp_path / "o.glb",
@@ -382,5 +382,5 @@ def test_the_overview_is_as_fine_as_fits(tmp_path, small_limits) -> None:
     size = 32 * len(tiled.overview) + 12 * len(tiled.overview.faces)
     assert 300_000 < size <= 600_000
     assert max(path.stat().st_size for path in tmp_path.glob("0-*.glb")) < 600_000
-    # Of small surfaces it is all there is.
+    # For small surfaces it is the surface itself.
     assert write_tiles(small := waves(50), np.eye(3), tmp_path / "s").overview is small

@@ -50,7 +50,7 @@ def written(folder: Path, count: int = 2) -> Path:
     return folder
 
 
-def test_still_cameras_are_placed_from_one_instant() -> None:
+def test_static_cameras_are_calibrated_from_one_instant() -> None:
     found = calibrate_cameras([camera(k, images(k)) for k in range(3)], ["a", "b", "c"])
     assert found.how == "one instant"
     assert not found.rig.unplaced
@@ -61,7 +61,7 @@ def test_still_cameras_are_placed_from_one_instant() -> None:
     assert {(d.a, d.b) for d in found.rig.disagreement} >= {("cam0", "cam1"), ("cam1", "cam2")}
 
 
-def test_a_camera_that_looks_elsewhere_is_named() -> None:
+def test_camera_without_overlap_is_named() -> None:
     wall = RangeFrame(0, 0.0, CAMERA, np.full((96, 128), 1.7, np.float32), "z", None)
     cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
     found = calibrate_cameras(cameras, ["a", "b", "c"])
@@ -69,13 +69,13 @@ def test_a_camera_that_looks_elsewhere_is_named() -> None:
     assert found.rig.unplaced["cam2"]
 
 
-def test_images_of_a_still_scene_become_one() -> None:
+def test_images_of_static_scene_are_averaged() -> None:
     cameras = [camera(k, images(k, 6)) for k in range(2)]
     assert not moves(cameras, "auto")
     assert calibrate_cameras(cameras, ["a", "b"]).how == "one instant"
 
 
-def test_a_camera_can_not_stand_still_while_another_moves() -> None:
+def test_static_camera_beside_moving_camera_is_refused() -> None:
     rng = np.random.default_rng(0)
     turned = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
     frames = [
@@ -86,7 +86,7 @@ def test_a_camera_can_not_stand_still_while_another_moves() -> None:
         moves([camera(0, images(0, 8)), camera(1, frames)], "auto")
 
 
-def test_names_tell_cameras_apart() -> None:
+def test_names_distinguish_cameras() -> None:
     assert unique_names([Path("/a/left"), Path("/a/right")]) == ["left", "right"]
     assert unique_names([Path("/a/x/depth"), Path("/a/y/depth")]) == ["x/depth", "y/depth"]
 
@@ -98,7 +98,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 0
     assert "cam2" in capsys.readouterr().out
     assert [c.name for c in read_rig(out).cameras] == ["cam0", "cam1", "cam2"]
-    # It is not overwritten unasked.
+    # It is not overwritten by default.
     assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 2
     capsys.readouterr()
 
@@ -109,7 +109,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["rig", "check", str(out), *cameras[:2]]) == 2
     assert "3 cameras" in capsys.readouterr().err
 
-    # The folder opens like a recording, and is one model.
+    # The folder opens like a recording, and gives one model.
     recording = open_recording(folder)
     assert recording.format == "rig"
     assert len(recording) == 6
@@ -120,7 +120,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, of_images = read_tum(tmp_path / "model" / "trajectory.txt")
     stated = read_rig(out).cameras
     assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
-    # Its accuracy is that of the rig, and not of one camera that jumps from place to place.
+    # Its accuracy is that of the rig, not that of one camera jumping from place to place.
     told = json.loads((tmp_path / "model" / "run.json").read_text())
     assert told["verdict"] == "good"
     assert 0.005 < told["accuracy"]["position_m"] < 0.03
@@ -130,7 +130,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "cam1, cam2</td>" in report
     assert ">cam2</text>" in report or ">cam2<" in report
 
-    # Each frame is known by its camera: in the file, in the report and in the viewer.
+    # The camera of each frame is stated: in the file, in the report and in the viewer.
     told = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
     assert told == {"cameras": ["cam0", "cam1", "cam2"], "of_frames": [0, 1, 2, 0, 1, 2]}
     assert tofuse.load(tmp_path / "model").recording["rig"] == told
@@ -144,7 +144,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert shown.of_frames.tolist() == told["of_frames"]
 
 
-def test_a_knocked_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_displaced_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]
     out = tmp_path / "rig.json"
@@ -159,7 +159,7 @@ def test_a_knocked_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture
     assert [line.split()[0] for line in said if "moved by" in line] == ["cam2"]
 
 
-def test_a_rig_that_contradicts_the_images_is_marked(tmp_path: Path) -> None:
+def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]
     knocked = relative(STANDS)
@@ -174,7 +174,7 @@ def test_a_rig_that_contradicts_the_images_is_marked(tmp_path: Path) -> None:
     assert "cam2" not in said
 
 
-def test_a_rig_folder_without_one_camera_is_refused(
+def test_rig_folder_with_missing_camera_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = written(tmp_path / "rig", 1)
@@ -185,10 +185,10 @@ def test_a_rig_folder_without_one_camera_is_refused(
         open_recording(folder)
 
 
-def test_a_ring_is_drawn_upright() -> None:
+def test_ring_is_drawn_upright() -> None:
     poses = upright(np.stack(relative(around((0.4, 0, 0.5), 1.6, 0.5, 6))))
     heights = poses[:, 1, 3]
     assert np.ptp(heights) < 1e-9  # though the first camera looks down on the others
-    # The first still looks forward, and not to a side.
+    # The first still looks forward, not sideways.
     assert abs(poses[0, 0, 2]) < 1e-9
     assert poses[0, 2, 2] > 0.7

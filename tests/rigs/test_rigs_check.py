@@ -19,7 +19,7 @@ def truth(count: int = 4) -> list[np.ndarray]:
 
 
 def measured(poses: list[np.ndarray], rng: np.random.Generator) -> Rig:
-    """A rig as a calibration with a known covariance gives it; of the first, nothing is unknown."""
+    """A rig as given by a calibration with a known covariance; the first camera is exact."""
     C = np.diag(SIGMA**2)
     cameras = [RigCamera("0", "", np.eye(4), np.zeros((6, 6)))]
     for k, T in enumerate(poses[1:], 1):
@@ -34,12 +34,12 @@ def test_no_false_alarm() -> None:
         any(m.moved for m in compare(measured(truth(), rng), measured(truth(), rng)))
         for _ in range(100)
     )
-    assert alarms <= 4  # at a level of 1 %; five of a hundred happen once in 300 times
+    assert alarms <= 4  # at a level of 1 %; five of a hundred occur once in 300 times
 
 
 @pytest.mark.parametrize("which", [0, 1, 3])
 @pytest.mark.parametrize("by", [[0.005, 0, 0, 0, 0, 0], [0, 0, 0, 0, np.radians(0.3), 0]])
-def test_the_camera_that_was_knocked_is_named(which: int, by: list[float]) -> None:
+def test_displaced_camera_is_named(which: int, by: list[float]) -> None:
     rng = np.random.default_rng(2)
     before, after = truth(), truth()
     after[which] = after[which] @ se3.exp(by)
@@ -51,8 +51,8 @@ def test_the_camera_that_was_knocked_is_named(which: int, by: list[float]) -> No
     assert motion.chance < 0.01
 
 
-def test_systematic_errors_recur_in_the_same_scene() -> None:
-    """A camera that moved by 5 mm is found there; elsewhere systematic errors might explain it."""
+def test_systematic_errors_recur_in_same_scene() -> None:
+    """A displacement of 5 mm is found there; elsewhere systematic errors could explain it."""
     rng = np.random.default_rng(4)
     before, after = truth(), truth()
     after[2] = after[2] @ se3.exp([0.005, 0, 0, 0, 0, 0])
@@ -70,7 +70,7 @@ def test_systematic_errors_recur_in_the_same_scene() -> None:
     assert found[2].chance < 0.01 < found[2].chance_elsewhere
 
 
-def test_a_camera_that_can_not_be_placed_is_not_checked() -> None:
+def test_unplaced_camera_is_not_checked() -> None:
     rng = np.random.default_rng(3)
     stated, found = measured(truth(), rng), measured(truth(), rng)
     found = replace(found, cameras=found.cameras[:3], unplaced={"3": "it sees nothing"})

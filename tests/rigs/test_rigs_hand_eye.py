@@ -22,7 +22,7 @@ def mounted() -> np.ndarray:
 def tracks(
     seed: int = 0, path=None, millimetres: float = 2.0, degrees: float = 0.07
 ) -> tuple[Track, Track]:
-    """Two cameras with errors that last half a second, one at 30.03 Hz, one at 30.14."""
+    """Two cameras with errors that are correlated over half a second, at 30.03 and 30.14 Hz."""
     rng = np.random.default_rng([seed, 7])
     path = path or wander((0, 0, 1.2), (0.9, 0.5), 9.0)
     out = []
@@ -39,7 +39,7 @@ def tracks(
     return out[0], out[1]
 
 
-def test_clocks_are_told_by_when_the_rig_turns() -> None:
+def test_clocks_are_synchronised_by_rotations() -> None:
     a, b = tracks()
     lag = clock_of(a, b)
     assert lag is not None
@@ -55,7 +55,7 @@ def test_clocks_that_start_hours_apart_are_synchronised() -> None:
     assert lag.seconds == pytest.approx(OFFSET - 7200.0, abs=0.004)
 
 
-def test_signals_that_have_nothing_in_common_tell_no_lag() -> None:
+def test_unrelated_signals_determine_no_lag() -> None:
     rng = np.random.default_rng(1)
     times = np.arange(300) / 30
     lag = lag_between(times, rng.normal(size=300), times, rng.normal(size=300))
@@ -72,16 +72,16 @@ def test_hand_eye_finds_pose_and_clock() -> None:
     assert found.time_offset_s == pytest.approx(OFFSET, abs=0.002)
 
 
-def test_without_errors_hand_eye_is_exact() -> None:
+def test_hand_eye_is_exact_without_errors() -> None:
     a, b = tracks(millimetres=0.0, degrees=0.0)
     found = hand_eye(a, b, 0.0)
     off = se3.inverse(found.T_a_b) @ mounted()
-    # What is left is the interpolation between frames.
+    # The remaining error is that of interpolation between frames.
     assert np.linalg.norm(off[:3, 3]) < 0.0003
     assert found.time_offset_s == pytest.approx(OFFSET, abs=0.0003)
 
 
-def test_covariance_covers() -> None:
+def test_covariance_covers_errors() -> None:
     squares = []
     for seed in range(40):
         a, b = tracks(seed)
@@ -92,10 +92,10 @@ def test_covariance_covers() -> None:
     assert 0.8 <= inside <= 1.0
 
 
-def test_a_turn_about_one_axis_leaves_the_height_open() -> None:
+def test_rotation_about_one_axis_does_not_constrain_height() -> None:
     a, b = tracks(path=lambda t: rotation([0, 0.7 * t + 0.3 * np.sin(2 * t), 0]))
     found = hand_eye(a, b, 0.0)
-    # Along the axis of the turn, in b's frame.
+    # Along the rotation axis, in b's frame.
     axis = found.T_a_b[:3, :3].T @ [0.0, 1.0, 0.0]
     sigma = np.sqrt(axis @ found.covariance[:3, :3] @ axis)
     assert sigma > 0.1

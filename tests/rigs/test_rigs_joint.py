@@ -55,7 +55,7 @@ def found(seed: int):
     return refine_together(views, disturbed(truth, seed)), truth
 
 
-def test_cameras_end_where_they_are() -> None:
+def test_camera_poses_are_recovered() -> None:
     placed, truth = found(0)
     off = se3.inverse(placed.poses) @ truth
     assert np.array_equal(placed.poses[0], np.eye(4))
@@ -63,7 +63,7 @@ def test_cameras_end_where_they_are() -> None:
     assert np.degrees(se3.angle(off)).max() < 0.15
 
 
-def test_covariance_is_of_the_size_of_the_errors() -> None:
+def test_covariance_matches_size_of_errors() -> None:
     squares = []
     for seed in range(6):
         placed, truth = found(seed)
@@ -74,7 +74,7 @@ def test_covariance_is_of_the_size_of_the_errors() -> None:
     assert 1.5 < np.median(squares) < 12.0
 
 
-def test_systematic_errors_of_the_ranges_are_in_the_covariance() -> None:
+def test_covariance_includes_systematic_range_errors() -> None:
     """Each camera's ranges are distorted smoothly, as by multipath: the poses absorb it."""
     rng = np.random.default_rng(8)
     by_random, by_all = [], []
@@ -90,7 +90,7 @@ def test_systematic_errors_of_the_ranges_are_in_the_covariance() -> None:
     assert np.median(by_all) > 0.5
 
 
-def test_the_depth_offset_of_one_camera_is_found() -> None:
+def test_depth_offset_of_one_camera_is_found() -> None:
     views, truth = rig(1, offset=0.008)
     placed = refine_together(views, disturbed(truth, 1))
     sigma = np.sqrt(placed.random_covariance[2][6, 6])
@@ -100,7 +100,7 @@ def test_the_depth_offset_of_one_camera_is_found() -> None:
     assert np.sqrt(placed.covariance[2][6, 6]) > 3 * sigma
 
 
-def test_surfaces_disagree_more_where_a_camera_is_wrong() -> None:
+def test_displaced_camera_increases_disagreement() -> None:
     views, truth = rig(2)
     right = disagreements(views, truth)
     wrong = truth.copy()
@@ -111,7 +111,7 @@ def test_surfaces_disagree_more_where_a_camera_is_wrong() -> None:
     assert moved[0, 1] == right[0, 1]
 
 
-def test_cameras_that_share_nothing_are_not_known() -> None:
+def test_cameras_without_overlap_are_not_calibrated() -> None:
     views, truth = rig(3)
     apart = [v for v in views if v.camera in (0, 1)]
     apart = [apart[0], View(1, 1, apart[1].kept)]  # at another instant

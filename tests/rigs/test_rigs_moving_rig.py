@@ -1,4 +1,4 @@
-"""A rig carried through a room: from the trajectories of the cameras to the rig and back."""
+"""A moving rig: from the trajectories of the cameras to the rig and back."""
 
 from functools import cache
 
@@ -66,7 +66,7 @@ def calibrated() -> Calibration:
     return calibrate_cameras(cameras(), ["a", "b"])
 
 
-def test_a_walk_tells_where_the_cameras_are() -> None:
+def test_moving_rig_is_calibrated_from_its_trajectories() -> None:
     found = calibrated()
     assert found.how == "a walk"
     assert not found.rig.unplaced
@@ -79,7 +79,7 @@ def test_a_walk_tells_where_the_cameras_are() -> None:
     assert e @ np.linalg.solve(camera.covariance, e) < 22.5  # 99.9 % of chi-square, 6 degrees
 
 
-def test_each_instant_of_a_walk_has_one_pose() -> None:
+def test_each_instant_of_moving_rig_has_one_pose() -> None:
     rig = calibrated().rig
     source = RigSource(rig, [camera.recording for camera in cameras()])
     recording = Recording.of(source, "rig", "rig")
@@ -89,7 +89,7 @@ def test_each_instant_of_a_walk_has_one_pose() -> None:
     truth = np.stack([path(t) for t in found.times])
     off = se3.inverse(se3.inverse(truth[0]) @ truth) @ found.poses
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.003
-    # The clocks run freely: each image is where its camera was at a time of its own.
+    # The clocks are independent: each image has its own time.
     images = np.stack(
         [
             path(t) @ (mounted() if camera else np.eye(4))
@@ -102,7 +102,7 @@ def test_each_instant_of_a_walk_has_one_pose() -> None:
     between = se3.inverse(found.result.trajectory[::2]) @ found.result.trajectory[1::2]
     strayed = se3.inverse(between) @ rig.cameras[1].T_rig_camera
     assert np.degrees(se3.angle(strayed)).max() > 0.2  # at times of the first camera's images
-    # The second camera sees a single wall for a while; the first one knows where the rig is.
+    # The second camera sees a single wall for a while; the first one constrains the rig pose.
     assert result_is_bounded(found.result)
 
 
@@ -113,7 +113,7 @@ def result_is_bounded(result) -> bool:
     return d.accuracy.position_m < 0.02
 
 
-def test_views_of_all_cameras_refine_the_path_of_the_rig() -> None:
+def test_views_of_all_cameras_refine_path_of_rig() -> None:
     rig = calibrated().rig
     recording = Recording.of(RigSource(rig, [c.recording for c in cameras()]), "rig", "rig")
     of_rig = np.repeat(np.arange(len(recording) // 2), 2)
@@ -143,7 +143,7 @@ def test_views_of_all_cameras_refine_the_path_of_the_rig() -> None:
     assert len(found.measured) > 100
 
 
-def test_halves_of_the_images_show_systematic_errors() -> None:
+def test_split_half_reveals_systematic_errors() -> None:
     times = np.arange(40) / 20.0
     world = np.stack([path(t) for t in times])
     fit = HandEye(mounted(), np.eye(6), np.eye(4), 0.0, 0.0, len(times), np.ones(6))
@@ -156,7 +156,7 @@ def test_halves_of_the_images_show_systematic_errors() -> None:
     together._halves = [(tracks(error), tracks(-error))]
     found = together.systematic(1, fit)
     np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)
-    # One half alone that moves does not constrain the camera.
+    # Motion of a single half does not constrain the camera.
     together._halves = [(tracks(error), tracks(0 * error))]
     np.testing.assert_allclose(together.systematic(1, fit), 0, atol=1e-7)
 
@@ -173,13 +173,13 @@ def clock_between(first: Track, second: Track) -> tuple[float, list[str]]:
     return _clock(cameras(), [first, second], 1, notes), notes
 
 
-def test_clocks_that_differ_by_an_hour_are_aligned_by_the_rotations() -> None:
+def test_clocks_an_hour_apart_are_aligned_by_rotations() -> None:
     offset, notes = clock_between(walked(), walked(3600.0, mounted()))
     assert abs(offset - 3600.0) < 0.01
     assert "cam1 differs by 3600" in notes[0]
 
 
-def test_cameras_that_rotated_differently_are_refused() -> None:
+def test_cameras_with_different_rotations_are_refused() -> None:
     first = walked()
     rng = np.random.default_rng(2)
     turns = np.cumsum(rng.normal(size=(len(first.times), 3)) * 0.05, axis=0)
@@ -191,7 +191,7 @@ def test_cameras_that_rotated_differently_are_refused() -> None:
         clock_between(first, Track(first.times + 3600.0, other))
 
 
-def test_without_rotation_the_clocks_are_assumed_to_agree() -> None:
+def test_clocks_are_assumed_equal_without_rotation() -> None:
     first = walked()
     still = np.tile(np.eye(4), (len(first.times), 1, 1))
     still[:, 0, 3] = 0.1 * first.times
@@ -201,13 +201,13 @@ def test_without_rotation_the_clocks_are_assumed_to_agree() -> None:
     assert "does not determine its clock" in note
 
 
-def test_a_single_pose_is_no_trajectory() -> None:
+def test_single_pose_is_no_trajectory() -> None:
     with pytest.raises(RegistrationError, match="has no trajectory"):
         clock_between(walked(), Track(np.zeros(1), np.eye(4)[None]))
 
 
 def on_a_cart(distance: float, noise: float = 1e-3) -> HandEye:
-    """Two cameras on a cart that drives `distance` m on a flat floor and turns."""
+    """Two cameras on a cart that drives `distance` m on a flat floor and rotates."""
     times = np.arange(180) / 30.0
     world = np.tile(np.eye(4), (len(times), 1, 1))
     world[:, :3, :3] = se3.so3_exp(np.outer(0.8 * np.sin(1.3 * times), [0.0, 1.0, 0.0]))
@@ -222,24 +222,24 @@ def on_a_cart(distance: float, noise: float = 1e-3) -> HandEye:
     return hand_eye(track(np.eye(4)), track(mounted()), 0.0)
 
 
-def test_rotation_about_one_axis_leaves_the_spacing_along_it_unconstrained() -> None:
+def test_rotation_about_one_axis_does_not_constrain_spacing_along_it() -> None:
     fit = on_a_cart(1.0)
     assert "rotate the rig about two axes" in _too_uncertain(fit, 2.0)
     off = fit.T_a_b[:3, 3] - mounted()[:3, 3]
     R = fit.T_a_b[:3, :3]
     sigma = np.sqrt(np.diag(R @ fit.covariance[:3, :3] @ R.T))
-    assert sigma[1] > 0.5  # along the axis, whatever noise seems to say
+    assert sigma[1] > 0.5  # along the axis, whatever noise suggests
     assert sigma[[0, 2]].max() < 0.01
     assert (np.abs(off) < 3 * sigma + 1e-4).all()
 
 
-def test_rotation_in_place_leaves_the_heading_unconstrained_too() -> None:
+def test_rotation_in_place_does_not_constrain_heading_either() -> None:
     fit = on_a_cart(0.0)
     e = se3.log(se3.inverse(fit.T_a_b) @ mounted())
     assert "rotate the rig about two axes" in _too_uncertain(fit, 2.0)
     assert e @ np.linalg.solve(fit.covariance, e) < 16.8  # 99 % of chi-square, 6 degrees
 
 
-def test_motion_in_all_directions_constrains_the_camera() -> None:
+def test_motion_in_all_directions_constrains_camera() -> None:
     fit = hand_eye(walked(), walked(0.0, mounted()), 0.0)
     assert _too_uncertain(fit, 2.0) == ""

@@ -11,7 +11,7 @@ from tofuse.rigs.inputs import open_cameras
 from tofuse.rigs.joint import View, disagreements
 
 
-def test_surfaces_agree_better_than_under_the_reference_poses(shared_data) -> None:
+def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     folder = shared_data / "azure_kinect_rig"
     paths = sorted(p for p in folder.iterdir() if p.is_dir())
     cameras = open_cameras(paths)
@@ -20,7 +20,7 @@ def test_surfaces_agree_better_than_under_the_reference_poses(shared_data) -> No
     reference = json.loads((folder / "reference_T_world_camera.json").read_text())
     T = np.array([np.reshape(reference[camera.name], (4, 4)) for camera in cameras])
     T = se3.inverse(T[0]) @ T
-    # COLMAP's poses are good to 1 or 2 cm and about a degree.
+    # COLMAP's poses are accurate to 1 or 2 cm and about a degree.
     off = se3.inverse(np.array([c.T_rig_camera for c in rig.cameras])) @ T
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.04
     assert np.degrees(se3.angle(off)).max() < 1.5

@@ -29,7 +29,7 @@ def board(centre: np.ndarray, half: float) -> Board:
 
 
 def phase(t: float) -> float:
-    """Faster and slower, so that no other offset fits as well."""
+    """Of varying speed, so that no other offset fits as well."""
     return 2.1 * t + 1.3 * np.sin(0.9 * t) + 0.7 * np.sin(2.3 * t + 1)
 
 
@@ -59,7 +59,7 @@ def calibrated(clock_s: float, moving: Callable[[float], Board]) -> Calibration:
     return calibrate_cameras([filmed(0, 0.0, moving), filmed(1, clock_s, moving)], ["a", "b"])
 
 
-def test_clocks_are_aligned_by_what_moves_and_all_instants_count() -> None:
+def test_clocks_are_aligned_by_motion_and_all_instants_are_used() -> None:
     found = calibrated(100.0, towards)
     assert found.how == "60 instants"
     camera = found.rig.cameras[1]
@@ -70,13 +70,13 @@ def test_clocks_are_aligned_by_what_moves_and_all_instants_count() -> None:
     assert np.degrees(se3.angle(off)) < 0.05
 
 
-def test_clocks_that_the_motion_does_not_align_are_refused() -> None:
+def test_clocks_not_determined_by_motion_are_refused() -> None:
     with pytest.raises(InputError, match="no motion that both see determines the offset"):
         calibrated(100.0, sideways)
 
 
 def costs_at(lags: np.ndarray, noise: float, motion: Callable[[np.ndarray], np.ndarray], seed: int):
-    """Distances between surfaces at lags, of ten instants with different fractions that move."""
+    """Distances between surfaces at lags, of ten instants with different moving fractions."""
     rng = np.random.default_rng(seed)
     still, moves = rng.normal(5, 0.5, (10, 1)), rng.uniform(0.3, 1.7, (10, 1))
     return still + moves * motion(lags / INTERVAL_S) + rng.normal(0, noise, (10, len(lags)))
@@ -85,22 +85,22 @@ def costs_at(lags: np.ndarray, noise: float, motion: Callable[[np.ndarray], np.n
 LAGS = np.arange(-6, 7) * INTERVAL_S
 
 
-def test_noise_makes_no_lag() -> None:
+def test_noise_gives_no_lag() -> None:
     found = [minimum_cost_lag(LAGS, costs_at(LAGS, 0.3, np.zeros_like, s)) for s in range(200)]
     assert sum(lag is not None for lag in found) <= 1
 
 
-def test_the_lag_of_minimum_distance_is_interpolated() -> None:
+def test_lag_of_minimum_distance_is_interpolated() -> None:
     for seed in range(20):
         costs = costs_at(LAGS, 0.05, lambda x: np.minimum((x - 1.3) ** 2, 9), seed)
         assert abs(minimum_cost_lag(LAGS, costs) - 1.3 * INTERVAL_S) < 0.1 * INTERVAL_S
 
 
-def test_of_a_periodic_motion_the_smallest_lag_is_taken() -> None:
+def test_smallest_lag_of_periodic_motion_is_used() -> None:
     for seed in range(20):
         costs = costs_at(LAGS, 0.05, lambda x: 1 - np.cos(2 * np.pi * (x - 0.2) / 5), seed)
         assert abs(minimum_cost_lag(LAGS, costs) - 0.2 * INTERVAL_S) < 0.1 * INTERVAL_S
 
 
-def test_a_lag_at_the_end_is_none() -> None:
+def test_lag_at_end_of_range_is_rejected() -> None:
     assert minimum_cost_lag(LAGS, costs_at(LAGS, 0.05, lambda x: (x - 7) ** 2, 0)) is None

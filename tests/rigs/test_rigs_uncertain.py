@@ -4,7 +4,7 @@ from tofuse.results.types import Reason
 from tofuse.rigs.run import _of_calibration
 
 
-def test_uncertain_poses_of_static_cameras_are_those_of_the_calibration() -> None:
+def test_uncertain_poses_of_static_cameras_are_attributed_to_rig() -> None:
     found = _of_calibration(Reason("uncertain_poses", ((0, 3),), "Poses may be off by 45 mm."))
     assert (found.code, found.ranges) == ("uncertain_rig", ((0, 3),))
     assert "45 mm" in found.text

@@ -13,7 +13,7 @@ def test_curve_is_linear_between_knots_and_constant_outside() -> None:
     np.testing.assert_allclose(correction.correct(measured), [[0, 0.4, 1.3, 2.9, 9.1]], atol=1e-6)
 
 
-def test_offset_of_each_pixel_is_subtracted_and_invalid_stays_invalid() -> None:
+def test_pixel_offset_is_subtracted_and_invalid_stays_invalid() -> None:
     pixel = np.array([[0.01, -0.02], [0.5, 0.0]], np.float32)
     correction = DepthCorrection(np.array([0.0]), np.array([0.0]), pixel)
     measured = np.array([[1, 0], [0.2, 2]], np.float32)
@@ -21,7 +21,7 @@ def test_offset_of_each_pixel_is_subtracted_and_invalid_stays_invalid() -> None:
 
 
 @pytest.mark.parametrize("with_pixels", [False, True])
-def test_what_is_saved_is_loaded(tmp_path, with_pixels) -> None:
+def test_saved_correction_is_loaded(tmp_path, with_pixels) -> None:
     pixel = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32) * 0.01
     one = DepthCorrection(np.linspace(0, 5, 11), np.sin(np.arange(11.0)), pixel)
     one = one if with_pixels else DepthCorrection(one.range_m, one.bias_m)
@@ -43,7 +43,7 @@ def test_what_is_saved_is_loaded(tmp_path, with_pixels) -> None:
         ({"range_m": ["a"], "bias_m": [0.0]}, "range_m"),
     ],
 )
-def test_bad_files_are_refused_in_one_line(tmp_path, arrays, said) -> None:
+def test_invalid_files_are_refused_in_one_line(tmp_path, arrays, said) -> None:
     path = tmp_path / "correction.npz"
     np.savez(path, **arrays)
     with pytest.raises(InputError, match=said) as error:
@@ -53,7 +53,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, arrays, said) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut"])
-def test_files_that_are_no_npz_are_refused(tmp_path, content) -> None:
+def test_invalid_and_missing_npz_files_are_refused(tmp_path, content) -> None:
     path = tmp_path / "correction.npz"
     path.write_bytes(content)
     with pytest.raises(InputError):

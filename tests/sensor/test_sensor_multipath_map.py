@@ -36,12 +36,12 @@ def everywhere(surfaces: Surfaces) -> np.ndarray:
 
 
 def turned(angle_rad: float) -> np.ndarray:
-    """T_world_camera of a camera turned to the right."""
+    """T_world_camera of a camera rotated to the right."""
     return se3.exp(np.array([0, 0, 0, 0, angle_rad, 0]))
 
 
 def seen_from(T: np.ndarray, *planes: Plane) -> Seen:
-    """The planes of the world, seen from a pose; they go on for ever."""
+    """Infinite planes of the world, seen from a pose."""
     moved = []
     for normal, d in planes:
         n = np.array(normal) / np.linalg.norm(normal)
@@ -49,7 +49,7 @@ def seen_from(T: np.ndarray, *planes: Plane) -> Seen:
     return Seen(*moved, albedo=ALBEDO)  # type: ignore[arg-type]
 
 
-def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
+def test_cells_tile_surroundings_of_image_up_to_lamp_cone() -> None:
     rays = CAMERA.rays().astype(float)
     half = 0.5 / CAMERA.fx
     low, high = rays.min((0, 1)) - half, rays.max((0, 1)) + half
@@ -57,7 +57,7 @@ def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
     left, right = around.rays - around.pitch / 2, around.rays + around.pitch / 2
     overlap = np.clip(np.minimum(right, high) - np.maximum(left, low), 0, None).prod(1)
     assert overlap.max() < 1e-6
-    # Whole cells next to the image, so that nothing is left out beside it.
+    # Whole cells next to the image, so that there is no gap.
     beside = np.isclose(right[:, 0], low[0], atol=1e-6)
     inside = (around.rays[:, 1] > low[1]) & (around.rays[:, 1] < high[1])
     assert around.fraction[beside & inside].sum() * around.pitch[1] == pytest.approx(
@@ -68,9 +68,9 @@ def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
     assert around.fraction.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
 
 
-def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
+def test_map_recalls_planes_and_albedo_after_rotation() -> None:
     known = ReflectorMap()
-    # To and fro, so that the newest view is the one in the middle.
+    # Back and forth, so that the newest view is the one in the middle.
     for angle in (-0.5, 0.5, 0.0):
         T = turned(angle)
         surfaces = surfaces_of(seen_from(T, LEFT, RIGHT, FLOOR))
@@ -82,7 +82,7 @@ def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
     sides = np.abs(around.rays[:, 0]) > 0.6
     assert found[sides & (np.abs(around.rays[:, 1]) < 0.3)].all()
     off = np.abs(around.albedo[found] / (ALBEDO * GAIN) - 1)
-    # Next to an edge a node may be given to the other plane.
+    # Next to an edge a node may be assigned to the other plane.
     assert np.percentile(off, 95) < 0.01
     near = found & (np.abs(around.rays[:, 1]) < 0.2)
     normals = -around.planes / np.linalg.norm(around.planes, axis=1, keepdims=True).clip(1e-9)
@@ -95,12 +95,12 @@ def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
         )
 
 
-def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -> None:
+def test_mapped_wall_improves_compensation() -> None:
     whole = Seen(LEFT, RIGHT, FLOOR)
     known = ReflectorMap()
     surfaces = surfaces_of(whole)
     known.add(surfaces, everywhere(surfaces), np.eye(4))
-    # The image ends before the corner; the light of what it leaves out is there all the same.
+    # The image ends before the corner; the light of the cropped part remains.
     part = np.s_[:, :26]
     image = whole.image
     cut = ToFImage(
@@ -119,7 +119,7 @@ def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -
     assert np.median(errors[1]) < 0.2 * np.median(whole.bias[part])
 
 
-def test_views_are_remembered_by_motion_and_no_more_than_a_fixed_number() -> None:
+def test_views_are_stored_by_motion_up_to_a_limit() -> None:
     known = ReflectorMap()
     surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
     trusted = everywhere(surfaces)
@@ -138,11 +138,11 @@ def test_views_are_remembered_by_motion_and_no_more_than_a_fixed_number() -> Non
         known.add(surfaces, trusted, T)
         sizes.append(len(known.patches))
     assert sizes[-1] == sizes[-20] == max(sizes) < 110 * one
-    # The oldest ones went.
+    # The oldest ones were removed.
     assert known.patches[:, 0].min() > 20
 
 
-def test_only_what_stands_still_is_remembered() -> None:
+def test_only_trusted_surfaces_are_stored() -> None:
     surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
     trusted = everywhere(surfaces)
     trusted[:, : trusted.shape[1] // 2] = False
@@ -152,7 +152,7 @@ def test_only_what_stands_still_is_remembered() -> None:
     assert (known.patches[:, 0] > -0.1).all()
 
 
-def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
+def test_correction_uses_map_only_with_poses() -> None:
     world = (LEFT, RIGHT, FLOOR)
     T = turned(0.45)
     first = replace(seen_from(T, *world).frame(), index=0)
@@ -162,7 +162,7 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
         corrector = Multipath(gain=GAIN).start(MultipathModel(columns=30))
         corrector.apply(first, None)
         if placed:
-            # Of another frame: says nothing.
+            # The pose of another frame is ignored.
             corrector.add_pose(second, np.eye(4))
             corrector.add_pose(first, T)
         fixed = corrector.apply(second, T_expected)
@@ -172,7 +172,7 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
     guessed = corrected(False, np.eye(4))
     np.testing.assert_array_equal(corrected(True, None), guessed)
     assert np.abs(corrected(True, np.eye(4)) - guessed).max() > 2e-4
-    # Nothing of the view was left by the filters.
+    # The filters removed the whole view.
     corrector = Multipath(gain=GAIN).start(MultipathModel(columns=30))
     corrector.apply(first, None)
     corrector.add_pose(first.keep(np.zeros(first.depth.shape, bool)), T)
@@ -182,15 +182,15 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
 
 
 @dataclass(frozen=True)
-class Listening(Correction, Corrector):
-    """Changes nothing, and notes what it hears."""
+class Recorder(Correction, Corrector):
+    """Changes nothing, and records its calls."""
 
     expected: list[np.ndarray | None] = field(default_factory=list)
     heard: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
-    def start(self) -> Listening:
+    def start(self) -> Recorder:
         return self
 
     def apply(self, frame: Frame, T_world_camera: np.ndarray | None = None) -> Frame:
@@ -201,8 +201,8 @@ class Listening(Correction, Corrector):
         self.heard.append((frame.index, T_world_camera))
 
 
-def test_the_mapper_tells_corrections_where_frames_are_and_where_the_next_is_expected() -> None:
-    ear = Listening()
+def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
+    ear = Recorder()
     mapper = Mapper(replace(from_method("default"), corrections=(ear,)))
     world = (LEFT, RIGHT, FLOOR)
     frames = [replace(seen_from(turned(0.03 * k), *world).frame(), index=k) for k in range(5)]
@@ -219,5 +219,5 @@ def test_the_mapper_tells_corrections_where_frames_are_and_where_the_next_is_exp
     assert ear.expected[2] is not None
     motion = se3.inverse(tracked[0]) @ tracked[1]
     np.testing.assert_allclose(ear.expected[2], tracked[1] @ motion, atol=1e-9)
-    # Lost in between: nobody knows where it is.
+    # After a lost frame the pose is unknown.
     assert ear.expected[4] is None

@@ -38,13 +38,13 @@ def frame(depth: float | np.ndarray = 2.0, **channels: object) -> RangeFrame:
     return RangeFrame(0, 0.0, CAMERA, image(depth), "range", **channels)  # type: ignore[arg-type]
 
 
-def test_noise_falls_as_one_over_amplitude() -> None:
+def test_noise_is_inversely_proportional_to_amplitude() -> None:
     amplitudes = np.geomspace(10, 1000, 40)
     sigma = DARK.sigma(frame(amplitude_image=image(amplitudes)))
     np.testing.assert_allclose(sigma * amplitudes, 2.0, rtol=1e-6)
 
 
-def test_shot_noise_falls_as_one_over_the_root() -> None:
+def test_shot_noise_falls_with_square_root_of_amplitude() -> None:
     model = replace(DARK, amplitude=AmplitudeLaw(0.5, 0.0))
     amplitudes = np.geomspace(10, 1000, 40)
     sigma = model.sigma(frame(amplitude_image=image(amplitudes)))
@@ -52,7 +52,7 @@ def test_shot_noise_falls_as_one_over_the_root() -> None:
 
 
 @pytest.mark.parametrize("kind", ["raw", "range_compensated"])
-def test_noise_of_one_albedo_grows_with_the_squared_range(kind: str) -> None:
+def test_noise_of_constant_albedo_grows_with_squared_range(kind: str) -> None:
     ranges = np.linspace(1, 5, 40)
     amplitude = 500.0 / ranges**2 if kind == "raw" else np.full(40, 500.0)
     seen = frame(ranges, amplitude_image=image(amplitude), amplitude_kind=kind)
@@ -60,7 +60,7 @@ def test_noise_of_one_albedo_grows_with_the_squared_range(kind: str) -> None:
 
 
 @pytest.mark.parametrize("power", [0.0, 3.0, 4.0])
-def test_compensated_amplitude_lost_its_falloff(power: float) -> None:
+def test_compensated_amplitude_excludes_falloff(power: float) -> None:
     model = replace(DARK, amplitude=AmplitudeLaw(0.0, 2.0, falloff=power))
     seen = frame(amplitude_image=image(500.0), amplitude_kind="range_compensated")
     expected = 2.0 * 4.0 / 500.0 * ray_lengths(CAMERA) ** power
@@ -69,7 +69,7 @@ def test_compensated_amplitude_lost_its_falloff(power: float) -> None:
     np.testing.assert_allclose(model.sigma(raw), 2.0 / 500.0, rtol=1e-5)
 
 
-def test_terms_add_in_squares_up_to_the_ceiling() -> None:
+def test_terms_add_in_squares_up_to_ceiling() -> None:
     model = NoiseModel("all", RangeLaw(0.01, 0.0), AmplitudeLaw(0.3, 2.0, 0.02), ceiling_m=1.0)
     sigma = model.sigma(frame(amplitude_image=image(50.0)))
     assert sigma[0, 0] == pytest.approx(math.sqrt(0.02**2 + 0.09 / 50 + (2 / 50) ** 2))
@@ -78,7 +78,7 @@ def test_terms_add_in_squares_up_to_the_ceiling() -> None:
     np.testing.assert_allclose(model.sigma(frame(amplitude_image=amplitude))[0, :3], 1.0)
 
 
-def test_confidence_is_monotone_and_levels_beyond_the_table_are_the_last() -> None:
+def test_confidence_is_monotone_and_saturates_at_last_level() -> None:
     model = NoiseModel("table", RangeLaw(1.0, 0.0), confidence=ConfidenceLaw((0.3, 0.1, 0.03), 1.0))
     levels = np.broadcast_to(np.arange(40, dtype=np.uint8), (30, 40))
     sigma = model.sigma(frame(2.0, confidence_image=levels))
@@ -86,7 +86,7 @@ def test_confidence_is_monotone_and_levels_beyond_the_table_are_the_last() -> No
     np.testing.assert_allclose(sigma[0, :5], [0.6, 0.2, 0.06, 0.06, 0.06], rtol=1e-6)
 
 
-def test_every_family_trusts_more_light_and_more_confidence_and_less_range() -> None:
+def test_noise_of_every_family_is_monotone() -> None:
     for model in NOISE.values():
         ramp = np.linspace(0.5, 6, 40)
         plain = model.sigma(frame(ramp))
@@ -98,7 +98,7 @@ def test_every_family_trusts_more_light_and_more_confidence_and_less_range() -> 
         assert (np.diff(model.sigma(frame(2.0, confidence_image=levels))[0]) <= 0).all()
 
 
-def test_which_law_decides() -> None:
+def test_precedence_of_laws() -> None:
     model = replace(NOISE["sr4000"], name="x")
     full = frame(
         amplitude_image=image(300.0),
@@ -112,7 +112,7 @@ def test_which_law_decides() -> None:
     assert model.law(frame()) == "range"
 
 
-def test_invalid_pixels_have_none_and_z_has_less_than_the_range() -> None:
+def test_invalid_pixels_have_no_sigma_and_z_less_than_range() -> None:
     depth = image(2.0)
     depth[3, 4] = 0
     seen = frame(depth)
@@ -123,15 +123,15 @@ def test_invalid_pixels_have_none_and_z_has_less_than_the_range() -> None:
     np.testing.assert_allclose(z[0, 0] * ray_lengths(CAMERA)[0, 0], sigma[0, 0], rtol=1e-6)
 
 
-def test_z_images_have_the_noise_of_their_range() -> None:
+def test_z_images_have_noise_of_their_range() -> None:
     seen = frame(2.0 + np.arange(40) / 40)
     as_z = RangeFrame(0, 0.0, CAMERA, seen.z, "z")
     model = NOISE["unknown"]
     np.testing.assert_allclose(model.sigma(as_z), model.sigma(seen), rtol=1e-5)
 
 
-def test_a_tilted_wall_is_noisier_by_its_change_in_a_pixel() -> None:
-    # z = d / (n . ray) for a plane at 60 degrees: the change to the next pixel, as it is.
+def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
+    # z = d / (n . ray) for a plane at 60 degrees: the exact change to the next pixel.
     normal = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     rays = np.dstack([CAMERA.rays(), np.ones((30, 40))])
     z = (-2.0 / (rays @ normal)).astype(np.float32)
@@ -144,7 +144,7 @@ def test_a_tilted_wall_is_noisier_by_its_change_in_a_pixel() -> None:
     sigma = model.sigma(seen)[15, 15:25]
     distance = np.linalg.norm(seen.point_image[15], axis=-1)
     change = np.abs(np.gradient(distance))[15:25]
-    # The step to the neighbour is taken across the ray: within the obliqueness of these rays.
+    # The step to the neighbour is perpendicular to the ray: within the obliqueness of these rays.
     np.testing.assert_allclose(sigma, 0.29 * change, rtol=0.12)
     assert (model.sigma(seen, np.ones((30, 40), np.float32)) < 1e-5).all()
     unknown = np.full((30, 40), np.nan, np.float32)
@@ -166,7 +166,7 @@ def twin(seen: RangeFrame, model: NoiseModel, cosine: np.ndarray) -> np.ndarray:
     return np.where(r > 0, np.sqrt(variance), 0)
 
 
-def test_kernel_against_numpy_with_any_number_of_threads() -> None:
+def test_kernel_matches_numpy_for_any_number_of_threads() -> None:
     rng = np.random.default_rng(3)
     depth = rng.uniform(0.5, 5, (30, 40)) * (rng.random((30, 40)) < 0.9)
     amplitude = rng.uniform(0, 1000, (30, 40)).astype(np.float32)
@@ -222,7 +222,7 @@ def test_json_round_trip(tmp_path: Path) -> None:
         ({"range": None}, "range"),
     ],
 )
-def test_nonsense_is_refused_by_name(tmp_path: Path, change: dict, message: str) -> None:
+def test_invalid_values_are_refused_by_name(tmp_path: Path, change: dict, message: str) -> None:
     path = tmp_path / "noise.json"
     path.write_text(json.dumps({**NOISE["sr4000"].to_dict(), **change}))
     with pytest.raises(InputError, match=r"noise\.json") as caught:
@@ -232,13 +232,13 @@ def test_nonsense_is_refused_by_name(tmp_path: Path, change: dict, message: str)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "null", "[" * 100_000])
-def test_broken_files(tmp_path: Path, text: str) -> None:
+def test_invalid_files(tmp_path: Path, text: str) -> None:
     (tmp_path / "noise.json").write_text(text)
     with pytest.raises(InputError, match=r"noise\.json"):
         NoiseModel.load(tmp_path / "noise.json")
 
 
-def test_the_documented_file_is_one() -> None:
+def test_documented_file_is_valid() -> None:
     text = (DOCS / "noise.md").read_text()
     (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
     assert NoiseModel.from_dict(json.loads(block)).name == "mine"

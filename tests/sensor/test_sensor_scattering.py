@@ -45,7 +45,7 @@ STILL = ~(((V - 30) ** 2 < 300) & ((U - 44) ** 2 < 30**2))
 
 
 @pytest.mark.parametrize("width", [0.04, 0.1, 0.3])
-def test_the_coarse_blur_is_the_blur(width: float) -> None:
+def test_coarse_blur_matches_exact_blur(width: float) -> None:
     light = own_light()
     expected = slowly_blurred(light, width)
     off = np.abs(blur(light, width) - expected)
@@ -53,7 +53,7 @@ def test_the_coarse_blur_is_the_blur(width: float) -> None:
     assert off.mean() < 0.01 * np.abs(expected).mean()
 
 
-def test_scattered_light_is_taken_off() -> None:
+def test_scattered_light_is_removed() -> None:
     own = own_light()
     light = measured(own, (0.03, 0.04))
     before = np.abs(np.angle(light * own.conj()))
@@ -63,7 +63,7 @@ def test_scattered_light_is_taken_off() -> None:
     assert np.median(after[wall]) < 0.03 * np.median(before[wall])
 
 
-def test_shares_are_learnt_from_the_light_that_follows_what_moves() -> None:
+def test_fractions_are_estimated_from_moving_light() -> None:
     fractions = estimate_fractions(frames((0.012, 0.02), 0.5), SOURCE, STILL, WIDTHS)
     assert fractions == pytest.approx((0.012, 0.02), rel=0.1)
 
@@ -76,13 +76,13 @@ def test_exposure_and_temperature_are_not_scattering() -> None:
     assert fractions == pytest.approx((0.012, 0.02), rel=0.2)
 
 
-def test_nothing_is_learnt_where_nothing_is_scattered_or_seen() -> None:
+def test_fractions_are_zero_without_evidence() -> None:
     assert not estimate_fractions(frames((0.0, 0.0), 0.5), SOURCE, STILL, WIDTHS).any()
     light = frames((0.012, 0.02), 0.5)
     assert not estimate_fractions(light, SOURCE, STILL & (U < 3), WIDTHS).any()  # too few pixels
     assert not estimate_fractions(light[:2], SOURCE, STILL, WIDTHS).any()
     assert not estimate_fractions(light, np.zeros_like(SOURCE), STILL, WIDTHS).any()
-    # Noise that hides it.
+    # Scattering below the noise.
     assert not estimate_fractions(frames((0.0002, 0.0), 20.0), SOURCE, STILL, WIDTHS).any()
-    # Another effect: a third of the light is no scattering in a lens.
+    # Too large: a third of the light is not scattered in a lens.
     assert not estimate_fractions(frames((0.3, 0.1), 0.5), SOURCE, STILL, WIDTHS).any()

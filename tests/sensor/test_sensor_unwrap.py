@@ -44,15 +44,15 @@ def taken(scene: str, every: int) -> list[tuple[RangeFrame, np.ndarray]]:
 
 
 def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Periods that each pixel lacks, and which pixels measured one surface to half a metre."""
+    """Missing periods of each pixel, and which pixels measured one surface to half a metre."""
     lacks = np.rint((radial - frame.radial_range) / PERIOD)
     off = np.abs(radial - frame.radial_range - lacks * PERIOD)
     confident = frame.confidence_image is None or frame.confidence_image >= 1
     return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
 
 
-def test_a_hall_beyond_the_period_is_brought_back() -> None:
-    """8 x 8 m before a camera of 5 m: most of it is wrapped."""
+def test_hall_beyond_period_is_unwrapped() -> None:
+    """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
     part = Unwrap().fit([frame for frame, _ in frames])
     corrector = part.start()
@@ -70,8 +70,8 @@ def test_a_hall_beyond_the_period_is_brought_back() -> None:
     assert harmed <= 0.001 * good
 
 
-def test_a_room_within_the_period_is_left_alone() -> None:
-    """Its dark chairs and floor reflect as little as a white wall a period farther would."""
+def test_room_within_period_is_unchanged() -> None:
+    """Its dark chairs and floor reflect as little as a white wall one period farther."""
     frames = taken("room", 128)
     corrector = Unwrap().fit([frame for frame, _ in frames]).start()
     for frame, _ in frames:
@@ -79,8 +79,8 @@ def test_a_room_within_the_period_is_left_alone() -> None:
         assert moved.mean() < 0.001
 
 
-def test_amplitude_follows_the_range() -> None:
-    """Range-compensated amplitude of a wall is the same before and behind the period."""
+def test_amplitude_is_adapted_to_unwrapped_range() -> None:
+    """Range-compensated amplitude of a wall is equal in front of and beyond the period."""
     frame, _ = taken("hall", 180)[0]
     assert frame.amplitude_kind == "range_compensated"
     out = Unwrap().fit([frame]).start().apply(frame)
@@ -96,7 +96,7 @@ def test_amplitude_follows_the_range() -> None:
     np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
 
 
-def test_other_views_are_passed_on() -> None:
+def test_views_without_ambiguity_are_unchanged() -> None:
     camera = Pinhole(16, 12, 12.0, 12.0, 7.5, 5.5)
     frame = RangeFrame(0, 0.0, camera, np.full((12, 16), 2.0, np.float32))
     corrector = Unwrap().fit([frame]).start()
@@ -105,7 +105,7 @@ def test_other_views_are_passed_on() -> None:
     assert corrector.apply(empty) is empty
 
 
-def test_the_same_with_any_number_of_threads() -> None:
+def test_result_is_independent_of_threads() -> None:
     frame, _ = taken("hall", 180)[0]
     corrector = Unwrap(white=3000.0).start()
     with threads(1):
@@ -117,8 +117,8 @@ def test_the_same_with_any_number_of_threads() -> None:
     np.testing.assert_array_equal(one.depth, three.depth)
 
 
-def test_messages_find_the_minimum_of_a_chain() -> None:
-    """On a chain belief propagation is exact: every state of 1 x 7 pixels is tried."""
+def test_messages_find_minimum_of_a_chain() -> None:
+    """On a chain belief propagation is exact: all states of 1 x 7 pixels are compared."""
     rng = np.random.default_rng(7)
     for _ in range(20):
         n, labels = 7, 3
@@ -137,8 +137,8 @@ def test_messages_find_the_minimum_of_a_chain() -> None:
     assert len(STEPS) == 4
 
 
-def test_part_of_a_surface_that_is_a_period_off_is_moved_back() -> None:
-    """A floor that runs through the period, with a piece too far and a speck too near."""
+def test_surface_part_off_by_one_period_is_corrected() -> None:
+    """A floor that crosses the period, with a part too far and a speck too near."""
     along = np.linspace(3.0, 9.0, 60)[:, None] * np.ones((60, 40))
     range_m = np.mod(along, PERIOD).astype(np.float32)
     true = (along // PERIOD).astype(np.intp)
@@ -147,18 +147,18 @@ def test_part_of_a_surface_that_is_a_period_off_is_moved_back() -> None:
     wrong[5:45, 10:25] += 1
     wrong[50, 30] = 0
     unary = np.zeros((*range_m.shape, 3), np.float32)
-    unary[:] = 0.01 * np.arange(3)  # each period costs a little
+    unary[:] = 0.01 * np.arange(3)  # a small cost per period
     found = _with_surfaces_moved(blocks, unary, wrong, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(found, true)
-    # Where all is off nothing tells but what periods cost, or the light.
+    # If everything is off, only the cost of periods, or the amplitude, decides.
     nearer = _with_surfaces_moved(blocks, unary, true + 1, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(nearer, true)
     farther = _with_surfaces_moved(blocks, -unary, true, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(farther, true + 1)
 
 
-def test_dark_surfaces_alone_prove_nothing() -> None:
-    """A black board before a grey wall, both within the period, stays where it is."""
+def test_dark_surfaces_are_not_unwrapped() -> None:
+    """A black board before a grey wall, both within the period, is unchanged."""
     r = np.full((48, 64), 3.0, np.float32)
     light = np.full((48, 64), 0.5 * 3000 / 9, np.float32)
     r[15:30, 20:40], light[15:30, 20:40] = 2.0, 0.03 * 3000 / 4
@@ -167,7 +167,7 @@ def test_dark_surfaces_alone_prove_nothing() -> None:
 
 
 def with_weak_pixels(r: np.ndarray, weak: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges and light of a grey scene at r, and of pixels that measure nothing: anywhere, dark."""
+    """Ranges and amplitudes of a grey scene at r, with weak pixels at random ranges."""
     rng = np.random.default_rng(seed)
     light = 0.5 * 3000 / r**2
     measured = np.mod(r + rng.normal(0, 0.02, r.shape), PERIOD)
@@ -177,8 +177,8 @@ def with_weak_pixels(r: np.ndarray, weak: np.ndarray, seed: int) -> tuple[np.nda
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
-def test_weak_pixels_at_random_ranges_are_no_wraps(seed: int) -> None:
-    """Alone or side by side: a wrap is a surface."""
+def test_weak_pixels_at_random_ranges_are_not_unwrapped(seed: int) -> None:
+    """Whether scattered or contiguous: only surfaces wrap."""
     u = np.arange(176)
     r = np.where(u < 88, 2.5 + 0.005 * u, 3.2 + 0.002 * u) * np.ones((144, 1))
     patch = np.zeros(r.shape, bool)
@@ -191,7 +191,7 @@ def test_weak_pixels_at_random_ranges_are_no_wraps(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
-def test_surfaces_come_back_from_beyond_the_period_around_weak_pixels(seed: int) -> None:
+def test_surfaces_are_unwrapped_around_weak_pixels(seed: int) -> None:
     r = 2 + 0.05 * np.arange(144)[:, None] * np.ones((1, 176))
     weak = np.zeros(r.shape, bool)
     weak[30:90, 40:110] = True
@@ -204,7 +204,7 @@ def test_surfaces_come_back_from_beyond_the_period_around_weak_pixels(seed: int)
     assert (periods > 0)[weak].mean() < 0.05
 
 
-def test_a_surface_that_crosses_the_period_is_one() -> None:
+def test_surface_that_crosses_period_is_connected() -> None:
     r = np.mod(np.linspace(4.0, 6.0, 40)[:, None] * np.ones((1, 30)), PERIOD).astype(np.float32)
     assert on_surface(r, PERIOD).all()
     lonely = np.zeros((9, 9), np.float32)
@@ -212,7 +212,7 @@ def test_a_surface_that_crosses_the_period_is_one() -> None:
     assert not on_surface(lonely, PERIOD).any()
 
 
-def test_two_frequencies_agree_on_one_range() -> None:
+def test_two_frequencies_are_combined() -> None:
     rng = np.random.default_rng(8)
     periods = [SPEED_OF_LIGHT / 2 / f for f in (80e6, 60e6)]  # 1.87 and 2.50 m meet at 7.5 m
     true = rng.uniform(0.3, 7.0, (40, 50))
@@ -224,13 +224,13 @@ def test_two_frequencies_agree_on_one_range() -> None:
     assert known.sum() >= known.size - 20  # phases of nearly zero count as invalid
     assert np.abs(found - true)[known].max() < 0.05
     assert apart[known].max() < 0.05
-    # The finer frequency counts for more: better than either alone, and than the coarse one.
+    # The finer frequency has more weight: more accurate than the coarse one alone.
     assert np.std((found - true)[known]) < 0.01
 
 
 @pytest.fixture
 def two_frequencies(room_recording: Path, tmp_path: Path) -> Path:
-    """A recording whose depth is told only by two frequencies."""
+    """A recording whose depth is stored in two frequencies only."""
     folder = tmp_path / "two"
     shutil.copytree(room_recording, folder)
     recording = tofuse.open(room_recording)
@@ -251,7 +251,7 @@ def two_frequencies(room_recording: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_native_recordings_of_several_frequencies(
+def test_native_recordings_with_several_frequencies(
     room_recording: Path, two_frequencies: Path
 ) -> None:
     plain, combined_ = tofuse.open(room_recording), tofuse.open(two_frequencies)
@@ -263,10 +263,10 @@ def test_native_recordings_of_several_frequencies(
     assert np.quantile(np.abs(a.depth - b.depth)[both], 0.999) < 0.003
 
 
-def test_several_frequencies_end_as_one_depth_does(
+def test_several_frequencies_give_same_trajectory_as_depth(
     room_recording: Path, two_frequencies: Path
 ) -> None:
-    """From the folder to the trajectory; depth/ itself is not looked at."""
+    """From the folder to the trajectory; depth/ itself is not used."""
     for path in (two_frequencies / "depth").iterdir():
         write_png(path, np.zeros((144, 176), np.uint16))
     plain = tofuse.reconstruct(tofuse.open(room_recording).select(end=4))
@@ -276,7 +276,7 @@ def test_several_frequencies_end_as_one_depth_does(
     assert apart.max() < 0.004
 
 
-def test_frequencies_that_make_no_sense_are_refused(two_frequencies: Path) -> None:
+def test_invalid_frequencies_are_refused(two_frequencies: Path) -> None:
     folder = two_frequencies / "frequencies"
     (folder / "80000000" / "000000.png").unlink()
     with pytest.raises(InputError, match="frequencies/80000000"):

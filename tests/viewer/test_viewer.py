@@ -39,7 +39,7 @@ from viewer_scene import CANVAS, drawn, needs_viser
 
 
 def sheet():
-    """A bent sheet of triangles that faces the first camera."""
+    """A curved sheet of triangles that faces the first camera."""
     n = 40
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, n), np.linspace(-1, 1, n))
     vertices = np.stack([x, y, 2 + 0.2 * x**2], -1).reshape(-1, 3).astype(np.float32)
@@ -55,7 +55,7 @@ def sheet():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """The output folder of a made-up run: 24 frames, two of them lost, one loop."""
+    """The output folder of a synthetic run: 24 frames, two of them lost, one loop."""
     result, _ = make_room()
     cloud = result.cloud
     result = replace(
@@ -69,7 +69,7 @@ def folder(tmp_path_factory) -> Path:
     return out
 
 
-def test_result_is_what_the_run_wrote(folder):
+def test_content_matches_result(folder):
     made, _ = make_room()
     found = read_content(folder)
     posed = np.flatnonzero(made.has_pose)
@@ -85,7 +85,7 @@ def test_result_is_what_the_run_wrote(folder):
     assert found.up[1] < -0.9
 
 
-def test_without_what_only_the_viewer_needs_the_rest_is_shown(folder, tmp_path):
+def test_result_without_view_file_is_shown(folder, tmp_path):
     out = shutil.copytree(folder, tmp_path / "out")
     (out / NAME).unlink()
     found = read_content(out)
@@ -109,7 +109,7 @@ def damaged(out, how):
 
 
 @pytest.mark.parametrize("how", ["cut", "pickled", "short", "none", "missing"])
-def test_what_is_no_result_is_said_in_one_line(folder, tmp_path, how, capsys):
+def test_invalid_result_is_reported_in_one_line(folder, tmp_path, how, capsys):
     out = tmp_path / "out"
     if how != "missing":
         damaged(shutil.copytree(folder, out), how)
@@ -118,7 +118,7 @@ def test_what_is_no_result_is_said_in_one_line(folder, tmp_path, how, capsys):
     assert re.fullmatch(r"tofuse: .*out.*\n", said)
 
 
-def test_kept_file_has_the_same_bytes_for_the_same_result(tmp_path):
+def test_view_file_is_reproducible(tmp_path):
     made, _ = make_room()
     pictures = draw(made.diagnostics.samples)
     for name in "ab":
@@ -130,14 +130,14 @@ def test_kept_file_has_the_same_bytes_for_the_same_result(tmp_path):
     ]
 
 
-def test_a_missing_package_is_said_in_one_line(folder, monkeypatch, capsys):
+def test_missing_package_is_reported_in_one_line(folder, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(folder), "--no-open"]) == 2
     assert "pip install 'tofuse[viewer]'" in capsys.readouterr().err
 
 
 @needs_viser
-def test_a_taken_port_is_said_in_one_line(folder, capsys):
+def test_occupied_port_is_reported_in_one_line(folder, capsys):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -146,12 +146,12 @@ def test_a_taken_port_is_said_in_one_line(folder, capsys):
     assert f"--port {port}" in capsys.readouterr().err
 
 
-def test_options_of_the_page_need_the_page(tmp_path, capsys):
+def test_options_of_page_require_page(tmp_path, capsys):
     assert main(["run", "x", "--out", str(tmp_path / "o"), "--port", "9000"]) == 2
     assert "--view" in capsys.readouterr().err
 
 
-def test_colours_follow_what_they_stand_for(folder):
+def test_colours_follow_values(folder):
     found = read_content(folder)
     assert colorings([found.mesh, found.cloud]) == [
         "colour", "height", "accuracy", "view count"
@@ -170,7 +170,7 @@ def test_colours_follow_what_they_stand_for(folder):
     assert np.all(shaded <= found.mesh.color)
 
 
-def test_the_nearest_point_on_the_ray_is_picked():
+def test_nearest_point_on_ray_is_picked():
     points = np.array([[0, 0, 4], [0.001, 0, 2], [0, 0, -1], [0.5, 0, 2]], np.float32)
     cloud = Layer(points, None, None, None, np.array([0.001, 0.002, 0.003, 0.004]), None)
     found = pick([cloud], [0, 0, 0], [0, 0, 2])
@@ -178,7 +178,7 @@ def test_the_nearest_point_on_the_ray_is_picked():
     assert found.sigma == 0.002
     np.testing.assert_array_equal(pick([cloud], [0, 0, 3], [0, 0, 1]).point, points[0])
     assert pick([cloud], [0, 0, 0], [1, 1, 0]) is None
-    # From behind a surface shows nothing, so it can't be picked.
+    # Surfaces are invisible from behind, so they cannot be picked.
     faces, away = np.array([[0, 1, 3]], np.int32), np.tile(np.float32([0, 0, 1]), (4, 1))
     assert pick([Layer(points, away, faces, None, None, None)], [0, 0, 0], [0, 0, 1]) is None
 
@@ -190,7 +190,7 @@ def browser():
 
 
 def screen(client, point, box):
-    """Where a point is on the page."""
+    """Position of a point on the page."""
     T = np.eye(4)
     T[:3, :3] = to_matrix(np.roll(client.camera.wxyz, -1))
     T[:3, 3] = client.camera.position
@@ -203,7 +203,7 @@ def screen(client, point, box):
 
 
 @needs_viser
-def test_page_shows_switches_slides_and_measures(folder, browser):
+def test_page_toggles_selects_frames_and_measures(folder, browser):
     from playwright.sync_api import TimeoutError as NotYet
 
     from tofuse.viewer.app import ResultView
@@ -221,7 +221,7 @@ def test_page_shows_switches_slides_and_measures(folder, browser):
             first = drawn(seen)
             assert len(np.unique(first.reshape(-1, 3), axis=0)) > 100
 
-            # Cameras before are orange: none, then some.
+            # Cameras before optimisation are orange: none, then some.
             def orange(image):
                 return int((image[..., 2] - image[..., 0] > 110).sum())
 
@@ -237,7 +237,7 @@ def test_page_shows_switches_slides_and_measures(folder, browser):
             colored = drawn(seen)
             assert changed(first, colored) > 0.02
             assert page.get_by_text("Accuracy (95 %)").is_visible()
-            # Nothing is lit: what is drawn has a colour of the bar.
+            # There is no shading: drawn pixels have colours of the bar.
             ramp = viridis(np.linspace(0, 1, 256)).astype(int)
             for name in ("Cameras", "Loop closures"):
                 page.get_by_label(name, exact=True).click()
@@ -266,7 +266,7 @@ def test_page_shows_switches_slides_and_measures(folder, browser):
             ends = [result.mesh.points[40 * 20 + 8], result.mesh.points[40 * 20 + 30]]
             second = page.get_by_text("Click the second point.")
             for _ in range(3):  # viser drops clicks until its page has drawn the new mode
-                if not view.ends:  # a slow page has not yet said so
+                if not view.ends:  # a slow page has not yet confirmed it
                     page.mouse.click(*screen(client, ends[0], box))
                 with contextlib.suppress(NotYet):
                     second.wait_for(timeout=10_000)
@@ -286,7 +286,7 @@ def test_page_shows_switches_slides_and_measures(folder, browser):
 
 @needs_viser
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal of POSIX")
-def test_command_serves_until_it_is_interrupted(folder):
+def test_command_serves_until_interrupted(folder):
     command = [sys.executable, "-m", "tofuse", "view", str(folder), "--no-open"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
         lines = [p.stderr.readline(), p.stderr.readline()]
@@ -309,7 +309,7 @@ class Heard(Silent):
 
 
 @needs_viser
-def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, browser):
+def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
     from tofuse.pipeline.progress import Both
     from tofuse.viewer.live_view import LiveView
     from tofuse.viewer.server import address
@@ -347,7 +347,7 @@ def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, 
     assert json.loads((tmp_path / "a/run.json").read_text())["schema"] == 1
 
 
-def test_places_are_better_known_the_nearer_and_the_more_often_they_are_seen():
+def test_accuracy_improves_with_proximity_and_number_of_views():
     rng = np.random.default_rng(1)
     wall = np.float32(rng.uniform([-1, -1, 2], [1, 1, 2.001], (4000, 3)))
     left = wall[:, 0] < 0
@@ -363,7 +363,7 @@ def test_places_are_better_known_the_nearer_and_the_more_often_they_are_seen():
 
 
 @needs_viser
-def test_views_of_a_long_run_are_thinned():
+def test_views_of_long_run_are_thinned():
     from tofuse.viewer import live_view as live_module
 
     server = serve()

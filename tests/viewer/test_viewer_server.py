@@ -30,7 +30,7 @@ HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
 
 
 @pytest.mark.parametrize("name", HOSTS)
-def test_who_is_answered(name: str) -> None:
+def test_hosts_and_origins_that_are_answered(name: str) -> None:
     hosts, origins, ours = HOSTS[name]
     assert is_ours(hosts, origins) is ours
 
@@ -57,7 +57,7 @@ def ask(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
     return answer
 
 
-def test_the_server_answers_this_machine_alone(port: int) -> None:
+def test_server_answers_local_requests_only(port: int) -> None:
     import viser
 
     answer = ask(port, "/")
@@ -79,11 +79,11 @@ def test_the_server_answers_this_machine_alone(port: int) -> None:
     "path",
     ["/../../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc"],
 )
-def test_no_path_leads_out(port: int, path: str) -> None:
+def test_paths_outside_the_page_are_refused(port: int, path: str) -> None:
     assert ask(port, path).status in (400, 403, 404)
 
 
-def test_no_other_interface_is_listened_on(port: int) -> None:
+def test_server_does_not_listen_on_other_interfaces(port: int) -> None:
     name = socket.gethostbyname(socket.gethostname())
     if name.startswith("127."):
         pytest.skip("this machine has no other address")
@@ -96,7 +96,7 @@ PAGE = """<!doctype html><head><meta charset="utf-8"></head>
 <script type="module">import "x";</script><script src="b.js"></script>"""
 
 
-def test_a_page_names_its_own_scripts_and_no_others() -> None:
+def test_page_policy_lists_its_own_scripts_only() -> None:
     hashes = script_hashes(PAGE)
     assert len(hashes) == 2
     assert all(h.startswith("'sha256-") and h.endswith("='") for h in hashes)

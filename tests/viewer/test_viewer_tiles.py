@@ -52,7 +52,7 @@ def layer(folder) -> TiledLayer:
 
 
 def eye(layer, position, target, height=800):
-    """Somebody in the world, in the axes of the tiles."""
+    """A viewer at a position in the world, in the axes of the tiles."""
     at, to = (layer.R_up_world @ np.asarray(p, float) for p in (position, target))
     return Eye(at, (to - at) / np.linalg.norm(to - at), 1.0, 1.5, height)
 
@@ -62,7 +62,7 @@ def finest(tile):
 
 
 def covered(root, shown):
-    """Each leaf is shown once, itself or by one above it."""
+    """Check that each leaf is shown once, by itself or by an ancestor."""
     names = {tile.content for tile in shown}
     assert len(names) == len(shown)
 
@@ -76,7 +76,7 @@ def covered(root, shown):
 
 
 @pytest.mark.parametrize("budget", [1, 5_000, 20_000, 40_000, 10**9])
-def test_each_part_is_shown_once_within_the_budget(layer, budget) -> None:
+def test_each_part_is_shown_once_within_budget(layer, budget) -> None:
     whole = finest(layer.root)
     for at in (None, eye(layer, [0, 0, 1.9], [0.5, 0.4, 2.0]), eye(layer, [0, 0, -9], [0, 0, 2])):
         shown = select_tiles(layer.root, at, budget)
@@ -86,13 +86,13 @@ def test_each_part_is_shown_once_within_the_budget(layer, budget) -> None:
     assert sum(t.faces for t in select_tiles(layer.root, None, 10**9)) == whole
 
 
-def test_what_is_near_is_fine_and_what_is_far_or_behind_is_coarse(layer) -> None:
+def test_near_tiles_are_fine_and_distant_or_hidden_ones_coarse(layer) -> None:
     near = select_tiles(layer.root, eye(layer, [-0.7, -0.7, 1.8], [-0.8, -0.8, 2.0]), 10**9)
     at = layer.R_up_world @ [-0.8, -0.8, 2.0]
     here = [t for t in near if (t.low <= at + 0.1).all() and (t.high >= at - 0.1).all()]
     assert min(t.error_m for t in here) == 0
     away = select_tiles(layer.root, eye(layer, [0, 0, -0.5], [0, 0, -4.0]), 10**9)
-    assert [t.content for t in away] == [layer.root.content]  # it is all behind
+    assert [t.content for t in away] == [layer.root.content]  # everything is behind the viewer
     far = select_tiles(layer.root, eye(layer, [0, 0, -200.0], [0, 0, 2.0]), 10**9)
     assert [t.content for t in far] == [layer.root.content]
     steps = [
@@ -101,13 +101,13 @@ def test_what_is_near_is_fine_and_what_is_far_or_behind_is_coarse(layer) -> None
     ]
     assert steps == sorted(steps)
     assert steps[-1] > 4 * steps[0]
-    # No error is larger than 2 pixels where triangles are not short.
+    # No error exceeds 2 pixels if the budget is unlimited.
     here_eye = eye(layer, [0, 0, -3.0], [0, 0, 2])
     shown = select_tiles(layer.root, here_eye, 10**9)
     assert max((here_eye.pixels(t) for t in shown if t.children), default=0) <= 2
 
 
-def test_the_budget_goes_to_what_is_largest_on_the_screen(layer) -> None:
+def test_budget_is_spent_on_largest_screen_errors(layer) -> None:
     at = eye(layer, [-0.7, -0.7, 1.7], [0.2, 0.2, 2.0])
     shown = select_tiles(layer.root, at, 20_000)
     worst = max(at.pixels(t) for t in shown if t.children)
@@ -125,18 +125,18 @@ def _below(tile):
     return {t.content for t in tile.walk()}
 
 
-def test_empty_tiles_are_passed_through() -> None:
+def test_empty_tiles_are_skipped() -> None:
     low, high = np.zeros(3), np.ones(3)
     leaf = Tile(low, high, 0.0, "0-0-0-0.glb", 5)
     nothing = Tile(low, high, 0.0, None, 0)
     root = Tile(low, high, 2.0, None, 0, [Tile(low, high, 1.0, None, 0, [leaf, nothing])])
     assert select_tiles(root, None, 1) == [leaf]
     coarse = Tile(low, high, 1.0, "1-0-0-0.glb", 9, [nothing])
-    assert select_tiles(coarse, None, 100) == []  # finely, it is elsewhere
+    assert select_tiles(coarse, None, 100) == []  # the finer tile is empty
     assert select_tiles(coarse, Eye(np.full(3, 90.0), np.ones(3), 1.0, 1.0, 100), 100) == [coarse]
 
 
-def test_a_tiled_result_is_read_by_its_overview(folder, layer) -> None:
+def test_tiled_result_is_read_with_its_overview(folder, layer) -> None:
     result = read_content(folder)
     mesh = waves(origin=(-0.9, -0.9, 2.0))
     assert result.tiles is not None
@@ -153,7 +153,7 @@ def test_a_tiled_result_is_read_by_its_overview(folder, layer) -> None:
     part = layer.layer(tile)
     assert part.sigma is not None
     assert set(np.round(part.sigma, 7)) <= set(np.round(mesh.sigma.astype(float), 7))
-    # One scale for all tiles.
+    # One colour scale for all tiles.
     lone, _ = layer_colors(part, "accuracy", result.up)
     scaled, words = layer_colors(part, "accuracy", result.up, result.mesh)
     assert words == layer_colors(result.mesh, "accuracy", result.up)[1]
@@ -163,7 +163,7 @@ def test_a_tiled_result_is_read_by_its_overview(folder, layer) -> None:
 
 
 @pytest.mark.parametrize("how", ["missing", "cut", "turned"])
-def test_damaged_tiles_are_told_in_one_line(folder, tmp_path, how) -> None:
+def test_damaged_tiles_are_reported_in_one_line(folder, tmp_path, how) -> None:
     import shutil
 
     out = tmp_path / "out"
@@ -190,7 +190,7 @@ def browser():
 
 
 @needs_viser
-def test_page_loads_tiles_as_somebody_comes_near(folder, browser) -> None:
+def test_viewer_loads_tiles_on_approach(folder, browser) -> None:
     from tofuse.viewer.app import ResultView
     from tofuse.viewer.server import address
     from tofuse.viewer.tiled import TiledSurface
@@ -220,7 +220,7 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser) -> None:
             assert sum(t.error_m == 0 for t in tiles_near) > 0
             assert {t.content for t in tiles_near} != {t.content for t in result.tiles.root.walk()}
             assert far > 0
-            # What is picked is on the finest surface that is there.
+            # Points are picked on the finest surface shown.
             point = surface.layer_along([-0.5, -0.5, 1.5], [0.0, 0.0, 1.0])
             assert len(point.points) > 0
             page.get_by_label("Colour by").click()
@@ -240,7 +240,7 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser) -> None:
 
 
 def settled(surface) -> None:
-    """Wait until the tiles of the only page stay the same."""
+    """Wait until the tiles of the only page no longer change."""
     import time
 
     last: list[str | None] = []
