@@ -7,6 +7,10 @@ Perturbations of the poses themselves, ``T_k exp(d_k)``, perturb the relative po
     xi = d_j - Ad(T_j_i) d_i
 
 so H, g and T_i_j determine four blocks and two gradients of the whole system.
+
+The factor of a camera that visits the same places again and again grows with the square of time.
+Beyond a limit, pairs are left out. Few of them matter: with half as large a factor, the standard
+deviations of 20,000 poses in a kitchen are 2 % larger.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
 from tofuse.arrays import Bool, Float64, Intp
@@ -25,6 +29,8 @@ from tofuse.kernels import supernodes as kernels
 
 # Maximum size of a dense right-hand side, in numbers.
 _AT_ONCE = 4_000_000
+# Maximum size of a factor, in numbers (160 MB).
+MAX_FACTOR = 20_000_000
 _FLAT = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
 
 
@@ -56,6 +62,11 @@ class PairSystem:
         (n,) mask of fixed poses; by default the first of each connected part.
     size
         Unknowns of each pose; 6 wherever H and g are those of a relative pose.
+
+    Attributes
+    ----------
+    left_out
+        (l,) positions of pairs that are ignored, as the factor would be larger than `MAX_FACTOR`.
     """
 
     def __init__(self, n: int, pairs: Intp, fixed: Bool | None = None, *, size: int = 6) -> None:
@@ -67,7 +78,9 @@ class PairSystem:
         both = np.flatnonzero(~(self.fixed[i] | self.fixed[j]))
         number = np.full(n, -1)
         number[self.free] = np.arange(len(self.free))
-        order = _elimination_order(len(self.free), number[i[both]], number[j[both]])
+        links = number[i[both]], number[j[both]]
+        chosen, order = bounded_elimination(len(self.free), *links, MAX_FACTOR // size**2)
+        self.left_out, both = both[~chosen], both[chosen]
         # `free` in the order of elimination: block k of the system is pose free[k].
         self.free = self.free[order]
         number[self.free] = np.arange(len(self.free))
@@ -77,8 +90,10 @@ class PairSystem:
     def _sums(self, i: Intp, j: Intp, both: Intp) -> None:
         """Make the matrices that sum the contributions of pairs to each block."""
         n, m = len(self.free), len(self.pairs)
-        self._sum_i = _indicator(self.number[i], n, m)
-        self._sum_j = _indicator(self.number[j], n, m)
+        used = np.ones(m, bool)
+        used[self.left_out] = False
+        self._sum_i = _indicator(np.where(used, self.number[i], -1), n, m)
+        self._sum_j = _indicator(np.where(used, self.number[j], -1), n, m)
         a, b = self.number[i[both]], self.number[j[both]]
         self.both, self.swapped = both, a > b
         lower, upper = np.maximum(a, b), np.minimum(a, b)
@@ -285,6 +300,8 @@ class Factor:
         ji = np.where(system.swapped[:, None, None], np.swapaxes(cross, 1, 2), cross)
         AC = A[both] @ np.swapaxes(ji, 1, 2)
         C[both] -= AC + np.swapaxes(AC, 1, 2)
+        # Without the covariance of its poses, that of their difference is at most twice the sum.
+        C[system.left_out] *= 2
         return C
 
     def _inverse(self) -> tuple[Float64, Float64]:
@@ -323,6 +340,77 @@ def _indicator(rows: Intp, n: int, m: int) -> sparse.csr_matrix:
     used = np.flatnonzero(rows >= 0)
     ones = np.ones(len(used))
     return sparse.csr_matrix((ones, (rows[used], used)), shape=(n, m))
+
+
+def bounded_elimination(n: int, i: Intp, j: Intp, max_blocks: int) -> tuple[Bool, Intp]:
+    """Choose links of n vertices so that the factor is bounded, and an elimination order.
+
+    All links, if they fit. Otherwise those within a band of vertices, a tree that spans the graph,
+    and as many of the others as fit: those of the most linked vertices first. Without these, the
+    rest falls into parts that are eliminated one after the other.
+
+    Parameters
+    ----------
+    n
+        Number of vertices.
+    i, j
+        (m,) ends of links; several may have the same ends.
+    max_blocks
+        Maximum number of blocks of the factor.
+
+    Returns
+    -------
+    (m,) links that are chosen, and the (n,) order.
+    """
+    m = len(i)
+    if n * (n + 1) // 2 <= max_blocks:
+        return np.ones(m, bool), _elimination_order(n, i, j)
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    edges, of_link = np.unique(low * n + high, return_inverse=True)
+    low, high = np.divmod(edges, n)
+    # Vertices with a single link cost nothing.
+    degree = np.bincount(np.concatenate([low, high]), minlength=n)
+    core = degree > 1
+    rank = np.cumsum(core)
+    band = max_blocks // (2 * max(int(core.sum()), 1))
+    far = np.greater(rank[high] - rank[low], band) & core[low] & core[high]
+    # The tree prefers near links.
+    cost = sparse.coo_matrix((1.0 + far, (low, high)), shape=(n, n))
+    tree = minimum_spanning_tree(cost.tocsr()).tocoo()
+    chosen = ~far | np.isin(edges, tree.row.astype(np.int64) * n + tree.col)
+    others = np.flatnonzero(~chosen)
+    most = np.maximum(degree[low], degree[high])[others]
+    others = others[np.lexsort((low[others], -most))]
+    order = _elimination_order(n, low[chosen], high[chosen])
+    # All of them, if the factor of their ends would fit; otherwise more and more, until it is too
+    # large, and then the last step in smaller ones.
+    fit = len(others) ** 2 <= 2 * max_blocks
+    taken, step, growing = 0, len(others) if fit else max(len(others) // 16, 1), True
+    while step and taken < len(others):
+        more = min(taken + step, len(others))
+        kept = chosen.copy()
+        kept[others[:more]] = True
+        trial = _elimination_order(n, low[kept], high[kept])
+        if factor_blocks(low[kept], high[kept], trial) <= max_blocks:
+            taken, order = more, trial
+            step = 2 * step if growing else step // 2
+        else:
+            step, growing = step // 2 if step > len(others) // 64 else 0, False
+    chosen[others[:taken]] = True
+    return np.asarray(chosen[of_link], np.bool_), np.asarray(order, np.intp)
+
+
+def factor_blocks(i: Intp, j: Intp, order: Intp) -> int:
+    """Return the number of blocks of the factor of links i, j (m,) in an elimination order (n,)."""
+    n = len(order)
+    number = np.empty(n, np.intp)
+    number[order] = np.arange(n)
+    a, b = number[i], number[j]
+    rows = np.concatenate([np.arange(n), np.maximum(a, b)])
+    columns = np.concatenate([np.arange(n), np.minimum(a, b)])
+    by_column = np.lexsort((rows, columns))
+    start = np.searchsorted(columns[by_column], np.arange(n + 1))
+    return int(kernels.fill_in(start, rows[by_column])[0][-1])
 
 
 def _elimination_order(n: int, i: Intp, j: Intp) -> Intp:
