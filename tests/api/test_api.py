@@ -287,8 +287,9 @@ def test_missing_library_is_named(result, monkeypatch):
         result.mesh.to_open3d()
 
 
-def test_view_serves_page(result):
+def test_view_serves_page_until_stopped(result):
     pytest.importorskip("viser")
+    from urllib.error import URLError
     from urllib.request import urlopen
 
     from tofuse.viewer.server import address, stop
@@ -299,6 +300,8 @@ def test_view_serves_page(result):
             assert page.status == 200
     finally:
         stop(server)
+    with pytest.raises(URLError, match="refused"):
+        urlopen(address(server))
 
 
 def test_reconstruct_rejects_path() -> None:

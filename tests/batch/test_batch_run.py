@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
@@ -141,7 +142,11 @@ def test_failed_job_does_not_stop_others(folder: BatchFolder) -> None:
 
 def test_degraded_job_sets_exit_status(folder: BatchFolder) -> None:
     run(folder, Scripted({"c": [lambda task: done(task, "degraded", status=3)]}))
+    assert [row["state"] for row in table(folder)] == ["done"] * 3
+    assert [row["verdict"] for row in table(folder)] == ["good", "good", "degraded"]
     assert status_of(JOBS, folder) == 3
+    assert status_of(JOBS[:2], folder) == 0
+    assert status_of(JOBS[2:], folder) == 3  # not 2, as there is a result
 
 
 def test_batch_resumes_after_lost_workers(folder: BatchFolder, monkeypatch) -> None:
@@ -266,20 +271,36 @@ def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
 
 
 def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
+    go_on = threading.Event()
+
+    def wait(task: Task, _: object) -> Record:
+        go_on.wait(60)
+        return failed(task)
+
     monkeypatch.setattr("tofuse.batch.workers.machine_memory", lambda: 100)
+    monkeypatch.setattr("tofuse.batch.workers.work", wait)
+    half = Task(replace(JOBS[0], memory=50), "/out", 1)
+    unstated = Task(JOBS[0], "/out", 1)
     workers = LocalWorkers(4)
     try:
         with pytest.raises(InputError, match="needs 101 bytes, but this machine has 100"):
             workers.check(replace(JOBS[0], memory=101))
-        tasks = [Task(replace(job, memory=50), "/out", 1) for job in JOBS]
-        for held in (0, 50, 100):
-            assert workers.accepts(tasks[0]) == (held < 100)
-            workers._running[Future()] = 50
-        assert workers.accepts(replace(tasks[0], job=JOBS[0])) == (150 <= 100)
-        workers._running.clear()
-        workers._running.update({Future(): 0 for _ in range(4)})
-        assert not workers.accepts(tasks[0])
+        running = []
+        for _ in range(2):
+            assert workers.accepts(half)
+            running.append(workers.start(half))
+        assert not workers.accepts(half)
+        # Jobs that state no memory are limited by their number only.
+        for _ in range(2):
+            assert workers.accepts(unstated)
+            running.append(workers.start(unstated))
+        assert not workers.accepts(unstated)
+        go_on.set()
+        for future in running:
+            future.result(60)
+        assert workers.accepts(half)
     finally:
+        go_on.set()
         workers.close()
 
 

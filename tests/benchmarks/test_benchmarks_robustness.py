@@ -227,8 +227,8 @@ def test_unconnected_components_are_separate_parts(scoring, counted_from) -> Non
 # ---- Cases ---------------------------------------------------------------------------------------
 
 
-def flat_wall(k, x):
-    """A wall 2 m away, 0.1 s after the previous frame; looks the same from any x."""
+def flat_wall(k):
+    """A wall 2 m away, 0.1 s after the previous frame; looks the same from any place along it."""
     camera = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
     depth = np.full((30, 40), 2.0, np.float32)
     light = np.full((30, 40), 1000.0, np.float32)
@@ -236,7 +236,7 @@ def flat_wall(k, x):
 
 
 def made_take(stress, count=40, step=0.02):
-    frames = tuple(flat_wall(k, step * k) for k in range(count))
+    frames = tuple(flat_wall(k) for k in range(count))
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = step * np.arange(count)
     return stress.Take(frames, poses, {})
@@ -273,7 +273,7 @@ def test_covered_lens_hides_scene(stress, how) -> None:
 
 
 def test_brightness_and_range_offset_are_applied(stress) -> None:
-    frame = flat_wall(0, 0.0)
+    frame = flat_wall(0)
     bright = stress.brighter(frame, 4.0)
     np.testing.assert_array_equal(bright.amplitude_image, 4000.0)
     np.testing.assert_array_equal(bright.depth, frame.depth)
@@ -287,7 +287,7 @@ def test_brightness_and_range_offset_are_applied(stress) -> None:
 
 
 def test_falloff_is_corrected_in_raw_amplitude_only(stress) -> None:
-    frame = flat_wall(0, 0.0)
+    frame = flat_wall(0)
     frame.amplitude_image[0, 0] = 65535
     transmission = np.full((30, 40), 0.5)
     even = stress.evenly_lit(frame, transmission).amplitude_image

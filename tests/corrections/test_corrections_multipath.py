@@ -27,7 +27,7 @@ def corner() -> Seen:
     return Seen(LEFT, RIGHT, FLOOR)
 
 
-# No light from beyond the image: there is none in `Seen`.
+# `Seen` has no surfaces outside the image.
 REFLECTIONS = MultipathModel(columns=30, lamp=0.1)
 EVERY_PIXEL = MultipathModel(columns=60, lamp=0.1)
 
@@ -52,9 +52,9 @@ def angles_deg(seen: Seen, z: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(pairs))
 
 
-def test_the_bias_of_a_corner_is_found_with_its_sign_and_size(corner: Seen) -> None:
+def test_corner_bias_is_positive_and_removed(corner: Seen) -> None:
     before = corner.errors(corner.image.z)
-    # Light on detours comes late: corners look too far away.
+    # Indirect light travels farther: corners appear too far away.
     assert np.median(before) > 0.03
     assert (before > 0).mean() > 0.95
     exact = np.abs(corner.errors(solved(corner, EVERY_PIXEL).z))
@@ -65,20 +65,20 @@ def test_the_bias_of_a_corner_is_found_with_its_sign_and_size(corner: Seen) -> N
     assert np.percentile(coarse, 90) < np.percentile(before, 90) / 8
 
 
-def test_a_rounded_corner_becomes_square(corner: Seen) -> None:
+def test_right_angles_of_corner_are_restored(corner: Seen) -> None:
     assert np.abs(angles_deg(corner, corner.image.z) - 90).max() > 1.5
     found = solved(corner, EVERY_PIXEL)
     np.testing.assert_allclose(angles_deg(corner, found.z), 90, atol=0.3)
 
 
-def test_the_share_of_amplitude_is_found(corner: Seen) -> None:
+def test_increase_of_amplitude_is_estimated(corner: Seen) -> None:
     found = solved(corner)
     true = corner.raw / corner.own
     assert np.median(true) > 1.05
     assert np.median(np.abs(found.factor / true - 1)) < 0.02
 
 
-def test_more_iterations_come_closer(corner: Seen) -> None:
+def test_error_decreases_with_iterations(corner: Seen) -> None:
     errors = [
         np.abs(corner.errors(solved(corner, replace(REFLECTIONS, iterations=n)).z)).mean()
         for n in (1, 2, 3)
@@ -86,24 +86,24 @@ def test_more_iterations_come_closer(corner: Seen) -> None:
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_all_bounces_take_out_more_than_one(corner: Seen) -> None:
+def test_all_bounces_correct_more_than_one(corner: Seen) -> None:
     one = solved(corner).z
     every = solved(corner, replace(REFLECTIONS, bounces="all")).z
     assert np.median(every - one) < -0.002
 
 
-def test_light_from_beyond_the_image_takes_out_more(corner: Seen) -> None:
+def test_illumination_beyond_image_increases_correction(corner: Seen) -> None:
     assert np.median(solved(corner, replace(REFLECTIONS, lamp=1.3)).z - solved(corner).z) < -0.002
 
 
-def test_only_the_ratio_of_amplitude_and_gain_counts(corner: Seen) -> None:
+def test_correction_depends_on_ratio_of_amplitude_and_gain_only(corner: Seen) -> None:
     brighter = replace(corner.image, amplitude=corner.image.amplitude * np.float32(8))
     found = REFLECTIONS.solve(brighter, 8 * GAIN)
     assert found is not None
     np.testing.assert_allclose(found.z, solved(corner).z, atol=1e-5)
 
 
-def test_a_flat_wall_stays_where_it_is() -> None:
+def test_flat_wall_is_unchanged() -> None:
     rng = np.random.default_rng(0)
     wall = Seen(WALL)
     image = wall.image
@@ -114,9 +114,9 @@ def test_a_flat_wall_stays_where_it_is() -> None:
         assert np.abs(found.z - z).max() < 0.0005
 
 
-def test_a_convex_edge_stays_where_it_is() -> None:
+def test_convex_edge_is_unchanged() -> None:
     rays = CAMERA.rays().astype(float)
-    # Two faces that fall back from the edge at x = 0.
+    # Two faces that recede from the edge at x = 0.
     z = (2 / (1 - 0.7 * np.abs(rays[..., 0]))).astype(np.float32)
     found = REFLECTIONS.solve(ToFImage(z, CAMERA.rays(), np.full_like(z, 100), PERIOD_M), GAIN)
     assert found is not None
@@ -124,7 +124,7 @@ def test_a_convex_edge_stays_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("albedo", [0.25, 0.6, 0.9])
-def test_the_gain_is_found_from_how_surfaces_bend(albedo: float) -> None:
+def test_gain_is_estimated_from_flatness_of_surfaces(albedo: float) -> None:
     seen = Seen(LEFT, RIGHT, FLOOR, albedo=albedo)
     estimator = GainEstimator(EVERY_PIXEL)
     for _ in range(4):
@@ -136,7 +136,7 @@ def test_the_gain_is_found_from_how_surfaces_bend(albedo: float) -> None:
     assert np.median(np.abs(after)) < 0.6 * np.median(np.abs(before))
 
 
-def test_without_bends_the_brightest_tenth_is_taken_for_white_paint() -> None:
+def test_gain_of_flat_wall_follows_from_prior_albedo() -> None:
     wall = Seen(WALL, albedo=0.35)
     estimator = GainEstimator(REFLECTIONS)
     assert estimator.gain is None
@@ -144,17 +144,17 @@ def test_without_bends_the_brightest_tenth_is_taken_for_white_paint() -> None:
     assert estimator.gain == pytest.approx(GAIN * 0.35 / GainEstimator.ALBEDO, rel=0.15)
 
 
-def test_the_gain_settles(corner: Seen) -> None:
+def test_gain_is_estimated_from_limited_number_of_images(corner: Seen) -> None:
     estimator = GainEstimator(replace(REFLECTIONS, columns=16, iterations=1))
-    looked = 0
+    used = 0
     for _ in range(GainEstimator.EVERY * GainEstimator.MOST + 40):
         before = len(estimator._bright)
         estimator.add(corner.image)
-        looked += len(estimator._bright) - before
-    assert looked == GainEstimator.MOST
+        used += len(estimator._bright) - before
+    assert used == GainEstimator.MOST
 
 
-def test_nothing_to_compute_from_gives_nothing() -> None:
+def test_images_without_depth_or_amplitude_have_no_estimate() -> None:
     dark = replace(Seen(WALL).image, amplitude=np.zeros((48, 60), np.float32))
     empty = replace(dark, z=np.zeros((48, 60), np.float32))
     for image in (dark, empty):
@@ -164,7 +164,7 @@ def test_nothing_to_compute_from_gives_nothing() -> None:
         assert estimator.gain is None
 
 
-def test_the_part_corrects_depth_of_both_kinds_and_amplitude_of_both_kinds(corner: Seen) -> None:
+def test_depth_and_amplitude_of_any_kind_are_corrected(corner: Seen) -> None:
     found = solved(corner, MultipathModel(columns=30, lamp=1.0))
     part, reflections = Multipath(gain=GAIN), MultipathModel(columns=30, lamp=1.0)
     frame = corner.frame()
@@ -195,28 +195,28 @@ def test_the_part_corrects_depth_of_both_kinds_and_amplitude_of_both_kinds(corne
     np.testing.assert_allclose(even.amplitude_image, wanted, rtol=1e-3)
 
 
-def test_the_doubt_is_a_share_of_the_correction_on_top_of_what_was_known(corner: Seen) -> None:
+def test_sigma_of_correction_is_added_in_quadrature(corner: Seen) -> None:
     frame = corner.frame()
     own = np.full(frame.depth.shape, 0.003, np.float32)
 
-    def doubted(given: RangeFrame, relative_sigma: float) -> RangeFrame:
+    def corrected(given: RangeFrame, relative_sigma: float) -> RangeFrame:
         part = Multipath(gain=GAIN, relative_sigma=relative_sigma)
         fixed = part.start(MultipathModel(columns=30)).apply(given)
         assert isinstance(fixed, RangeFrame)
         return fixed
 
-    assert doubted(frame, 0).shared_sigma_image is None
-    fixed = doubted(frame, 0.25)
+    assert corrected(frame, 0).shared_sigma_image is None
+    fixed = corrected(frame, 0.25)
     moved = np.abs(frame.radial_range - fixed.radial_range)
     assert np.median(moved) > 0.01
     assert fixed.shared_sigma_image is not None
     np.testing.assert_allclose(fixed.shared_sigma_image, moved / 4, atol=1e-6)
-    both = doubted(replace(frame, shared_sigma_image=own), 0.25).shared_sigma_image
+    both = corrected(replace(frame, shared_sigma_image=own), 0.25).shared_sigma_image
     assert both is not None
     np.testing.assert_allclose(both, np.hypot(moved / 4, 0.003), atol=1e-6)
 
 
-def test_what_is_not_known_is_left_alone(corner: Seen) -> None:
+def test_unsuitable_frames_are_unchanged(corner: Seen) -> None:
     frame = corner.frame()
     cloud = CloudFrame.of(frame.points)
     for given in (
@@ -232,7 +232,7 @@ def test_what_is_not_known_is_left_alone(corner: Seen) -> None:
     assert Multipath(period_m=5.0).start().apply(replace(frame, ambiguity_m=None)) is not frame
 
 
-def test_holes_stay_holes_and_bad_numbers_do_no_harm(corner: Seen) -> None:
+def test_invalid_pixels_are_kept_and_others_corrected(corner: Seen) -> None:
     rng = np.random.default_rng(4)
     frame = corner.frame()
     assert frame.amplitude_image is not None
@@ -260,7 +260,7 @@ def test_holes_stay_holes_and_bad_numbers_do_no_harm(corner: Seen) -> None:
     assert (fixed.valid == noise.valid).all()
 
 
-def test_threads_change_nothing(corner: Seen) -> None:
+def test_result_is_independent_of_threads(corner: Seen) -> None:
     results = []
     for count in (1, 2, 3):
         with threads(count):
@@ -273,7 +273,7 @@ def test_threads_change_nothing(corner: Seen) -> None:
     assert len(set(results)) == 1
 
 
-def test_a_configuration_names_it_and_the_mapper_applies_it_to_every_frame(corner: Seen) -> None:
+def test_configured_correction_is_applied_to_every_frame(corner: Seen) -> None:
     base = replace(from_method("thesis"), filters=())
     wanted = Multipath(gain=GAIN, lamp=1.0)
     corrections = [{"part": "multipath", "gain": GAIN, "lamp": 1}]
@@ -292,7 +292,7 @@ def test_a_configuration_names_it_and_the_mapper_applies_it_to_every_frame(corne
     assert result.config["corrections"][0]["part"] == "multipath"
 
 
-def test_options_that_make_no_sense_are_refused() -> None:
+def test_invalid_options_are_refused() -> None:
     for options in (
         {"gain": 0.0},
         {"period_m": -1.0},
@@ -304,7 +304,7 @@ def test_options_that_make_no_sense_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("texture", "share"), [(True, 2.5), (False, 2.5)])
-def test_the_simulated_corner_comes_closer_to_the_truth(texture: bool, share: float) -> None:
+def test_multipath_of_simulated_corner_is_reduced(texture: bool, share: float) -> None:
     plan = record.plan("corner", effects=Effects.none(multipath=True), texture=texture)
     corrector = Multipath().start()
     before, after = [], []

@@ -1,4 +1,4 @@
-"""The default method attaches the camera's noise model to the frames."""
+"""The camera's noise model assigns a sigma to each pixel."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ def model_of(config):
     return noise.model
 
 
-def test_frames_are_told_the_noise_of_the_model():
+def test_noise_model_assigns_sigma():
     (frame, _) = frames(amplitude=True)
-    told = Noise(MINE).start().apply(frame)
-    np.testing.assert_allclose(told.sigma_image, 1.5 / 500, rtol=1e-5)
-    np.testing.assert_array_equal(told.depth, frame.depth)
+    found = Noise(MINE).start().apply(frame)
+    np.testing.assert_allclose(found.sigma_image, 1.5 / 500, rtol=1e-5)
+    np.testing.assert_array_equal(found.depth, frame.depth)
     assert Noise().start().apply(frame) is frame
 
 
-def test_what_a_frame_brings_of_its_own_is_kept():
+def test_stated_sigma_and_clouds_are_unchanged():
     (frame, _) = frames()
     own = replace(frame, sigma_image=np.full(frame.depth.shape, 0.02, np.float32))
     assert Noise(MINE).start().apply(own) is own
@@ -58,33 +58,33 @@ def test_what_a_frame_brings_of_its_own_is_kept():
     assert Noise(MINE).start().apply(cloud) is cloud
 
 
-def test_the_default_method_takes_the_model_beside_the_recording(tmp_path):
+def test_default_method_uses_noise_model_of_recording(tmp_path):
     MINE.save(tmp_path / "noise.json")
     config = with_recording_defaults(from_method("default"), recording(tmp_path))
     assert model_of(config) == MINE
-    # It survives run.json.
+    # It is preserved by run.json.
     assert model_of(changed(config, {}, where="test")) == MINE
     result = tofuse.reconstruct(recording(tmp_path))
     assert result.config["corrections"][0]["model"]["range"] == {"a": 0.004, "b": 0.003}
 
 
-def test_a_family_that_is_known_tells_and_one_that_is_not_does_not(tmp_path):
+def test_only_known_camera_families_have_noise_model(tmp_path):
     lidar = Pinhole(256, 192, 200.0, 200.0, 127.5, 95.5)
     known = recording(tmp_path, lidar, confidence=True)
     assert model_of(with_recording_defaults(from_method("default"), known)) == NOISE["iphone"]
-    # Of that size, but with light: not an iPhone.
+    # Of that size, but with amplitude: not an iPhone.
     lit = recording(tmp_path, lidar, confidence=True, amplitude=True)
     assert model_of(with_recording_defaults(from_method("default"), lit)) is None
     assert model_of(with_recording_defaults(from_method("default"), recording(tmp_path))) is None
 
 
-def test_a_model_that_is_configured_wins(tmp_path):
+def test_configured_noise_model_takes_precedence(tmp_path):
     NOISE["kinect1"].save(tmp_path / "noise.json")
     config = replace(from_method("default"), corrections=(Noise(MINE),))
     assert model_of(with_recording_defaults(config, recording(tmp_path))) == MINE
 
 
-def test_a_broken_model_is_refused_before_work_starts(tmp_path):
+def test_invalid_noise_model_is_refused(tmp_path):
     (tmp_path / "noise.json").write_text('{"schema": 1, "name": "x", "range": {"a": -1, "b": 0}}')
     with pytest.raises(InputError, match=r"noise\.json"):
         tofuse.reconstruct(recording(tmp_path))

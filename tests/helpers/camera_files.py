@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import made_phones
 import made_sens
 import made_tof
 from tofuse.errors import TofuseError
+from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 
 # Function that writes a recording, name of its file (None: a folder), and its format.
@@ -42,21 +44,40 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
 }
 
 
+@dataclass
+class Read:
+    """The readable frames of a recording, the number of others, and whether it was refused."""
+
+    frames: list[Frame] = field(default_factory=list)
+    unread: int = 0
+    refused: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_frames(path: Path, format_: str | None, camera: Path | None = None) -> Read:
+    """Read every frame; errors must have one line and a place."""
+    read = Read()
+    errors: list[TofuseError] = []
+    try:
+        recording = open_recording(path, format=format_, camera=camera)
+        for item in recording.read_all():
+            if isinstance(item, TofuseError):
+                read.unread += 1
+                errors.append(item)
+            else:
+                assert np.isfinite(item.points).all()
+                read.frames.append(item)
+        read.warnings = list(recording.warnings)
+    except TofuseError as error:
+        read.refused = True
+        errors.append(error)
+    assert all(len(str(error).splitlines()) == 1 and error.where for error in errors)
+    return read
+
+
 def read_through(
     path: Path, format_: str | None, camera: Path | None = None
 ) -> tuple[int, int, int]:
     """Read every frame; return the numbers of readable and unreadable ones, and of rejections."""
-    whole = unread = 0
-    errors: list[TofuseError] = []
-    try:
-        for item in open_recording(path, format=format_, camera=camera).read_all():
-            if isinstance(item, TofuseError):
-                unread += 1
-                errors.append(item)
-            else:
-                assert np.isfinite(item.points).all()
-                whole += 1
-    except TofuseError as error:
-        errors.append(error)
-    assert all(len(str(error).splitlines()) == 1 and error.where for error in errors)
-    return whole, unread, len(errors) - unread
+    read = read_frames(path, format_, camera)
+    return len(read.frames), read.unread, int(read.refused)

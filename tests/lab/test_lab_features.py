@@ -251,9 +251,15 @@ def test_blank_images_are_rejected(detector):
 def test_contradicted_pose_is_rejected(images):
     """The amplitude matches the other view, but the surfaces do not."""
     source, target = images
-    deeper = replace(target, depth=target.depth[:, ::-1] * np.float32(1.0))
+    mirrored = replace(target, depth=target.depth[:, ::-1].copy())
     with pytest.raises(RegistrationError, match="agree"):
-        tofuse.register(source, deeper, method=Features())
+        tofuse.register(source, mirrored, method=Features())
+
+
+def test_images_without_amplitude_and_colour_are_rejected(images):
+    dark = [replace(image, amplitude_image=None) for image in images]
+    with pytest.raises(RegistrationError, match="has no amplitude nor colour"):
+        tofuse.register(*dark, method=Features())
 
 
 def test_clouds_are_rejected(images):

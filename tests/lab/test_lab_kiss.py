@@ -69,6 +69,20 @@ def test_threshold_follows_prediction_errors():
     assert threshold.sigma == pytest.approx(np.sqrt((delta**2 + 0.3**2) / 2))
 
 
+def test_correspondences_are_within_three_sigma():
+    inner = np.stack(np.meshgrid([-1.0, 0, 1], [-1.0, 0, 1], [2.0, 3]), -1).reshape(-1, 3)
+    points = np.vstack([inner, [0, 0, 5.0]])  # the last one is out of range
+    sigma = 0.02 * np.percentile(np.linalg.norm(points, axis=1), 95)
+    for factor, pairs in ((2.9, len(inner)), (3.1, len(inner) - 1)):
+        moved = points.copy()
+        moved[0, 2] -= factor * sigma
+        tracker = Kiss().start(0)
+        steps = [tracker.push(CloudFrame.of(p.astype(np.float32))) for p in (points, moved)]
+        found = steps[1].registration
+        assert found is not None
+        assert found.correspondences == pairs
+
+
 def test_empty_and_unrelated_frames_are_lost():
     poses = path(4)
     given = frames(poses)

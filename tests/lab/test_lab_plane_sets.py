@@ -9,7 +9,6 @@ import tofuse
 from searched_pair import TRUE, A, B, error, seen
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.plane_sets import PlaneSets
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.plane_detection import detect_planes
@@ -64,7 +63,7 @@ def test_single_floor_is_degenerate_in_three_directions():
     assert abs(offset - in_view(A)[0, 3]) < 0.01
     assert found.unobservable.shape == (3, 6)
     # Translation along the floor, and rotation about its normal.
-    basis = np.vstack([np.zeros((3, 6))])
+    basis = np.zeros((3, 6))
     basis[0, 3:] = floor[:3]
     basis[1:, :3] = np.linalg.svd(floor[None, :3])[2][1:]
     np.testing.assert_allclose(np.abs(np.linalg.det(found.unobservable @ basis.T)), 1, atol=0.02)
@@ -88,12 +87,6 @@ def test_views_without_planes_are_rejected():
     cloud = CloudFrame(0, 0.0, rough.points)
     with pytest.raises(RegistrationError, match="is not an image"):
         tofuse.register(cloud, cloud, method=PlaneSets())
-
-
-def test_features_reject_frames_without_amplitude():
-    views = seen(B, seed=1), seen(A, seed=2)
-    with pytest.raises(RegistrationError, match="has no amplitude nor colour"):
-        tofuse.register(*views, method=Features())
 
 
 @pytest.mark.parametrize("options", [{"planes": 0}, {"angle": 0.0}, {"min_fraction": -1}])

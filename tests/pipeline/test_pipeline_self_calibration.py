@@ -43,10 +43,11 @@ def test_corrected_points_are_correct(camera, kind) -> None:
     slopes = [f.points[:, :2] / f.points[:, 2:] for f in (before, after)]
     np.testing.assert_allclose(slopes[1], 1.1 * slopes[0], rtol=1e-5, atol=1e-6)
     rays = np.concatenate([1.1 * slopes[0], np.ones((len(slopes[0]), 1))], axis=1)
-    ranges = before.radial_range[before.valid] if kind == "range" else None
-    if ranges is not None:
-        expected = (ranges + 0.05)[:, None] * rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        np.testing.assert_allclose(after.points, expected, rtol=1e-5, atol=1e-6)
+    lengths = np.linalg.norm(rays, axis=1)
+    # The camera measures 2 m: the range, or z along the corrected ray.
+    ranges = (2.0 if kind == "range" else 2.0 * lengths) + 0.05
+    expected = (ranges / lengths)[:, None] * rays
+    np.testing.assert_allclose(after.points, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_lens_distortion_is_kept() -> None:

@@ -65,11 +65,14 @@ class HoloLens2Source(FileSource):
     concurrent = True
 
     def __init__(self, folder: Path, stream: str) -> None:
-        self.images = _images(folder, stream)
+        self.images, whole = _images(folder, stream)
         self.ticks = sorted(tick for tick, bright in self.images if not bright)
         if not self.ticks:
             raise InputError("contains no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
         super().__init__(np.array(self.ticks, float) / _TICKS)
+        if not whole:
+            archive = folder / f"{stream}.tar"
+            self.warnings.append(f"{archive} is cut off or damaged: its end is left out")
         self.ambiguity_m = _STREAMS[stream]
         self.metadata |= {
             "sensor": f"HoloLens 2, {stream} (ToF)",
@@ -188,8 +191,11 @@ def _streams(path: Path) -> list[str]:
 _Images = dict[tuple[int, bool], tuple[Path, int, int]]
 
 
-def _images(folder: Path, stream: str) -> _Images:
-    """All images of a stream: from its folder if extracted, else from its archive."""
+def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
+    """All images of a stream: from its folder if extracted, else from its archive.
+
+    Also whether they are all of the archive, which ends with blocks of zeros.
+    """
     found: _Images = {}
     if is_folder(folder / stream):
         for path in list_folder(folder / stream):
@@ -198,7 +204,7 @@ def _images(folder: Path, stream: str) -> _Images:
                 found[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
     path = folder / f"{stream}.tar"
     if found or not is_file(path):
-        return found
+        return found, True
     try:
         with tarfile.open(path, "r:") as archive:
             for member in archive:
@@ -206,12 +212,17 @@ def _images(folder: Path, stream: str) -> _Images:
                 if match and member.isfile():
                     place = (path, member.offset_data, member.size)
                     found[int(match[1]), match[2] is not None] = place
+            end = archive.offset
+        with path.open("rb") as file:
+            file.seek(end)
+            whole = file.read(tarfile.BLOCKSIZE) == bytes(tarfile.BLOCKSIZE)
     except OSError as error:
         raise input_error(error, path) from error
     except (tarfile.TarError, ValueError, EOFError) as error:
         if not found:
             raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error
-    return found
+        whole = False
+    return found, whole
 
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
