@@ -4,8 +4,7 @@
 
 1. For each g2o file: half the squared error as computed by GTSAM, and the time on one thread, of
    GTSAM's Levenberg-Marquardt and ours from the same initial values (needs gtsam). `--simulated`
-   adds a sphere with much noise, a torus, and a walk on a grid in space, of the sizes of the public
-   ones.
+   adds a sphere with much noise and a torus, of the sizes of the public ones.
 2. A camera that rotates in a room and one that walks in a circle, with noise according to the
    information matrices. Loops connect nearby views; 30 % of them are false, with gross errors. Mean
    ATE in mm over the seeds, with and without false loops, and the largest ratio of the two.
@@ -131,39 +130,22 @@ def compare_with_gtsam(files: list[Path], repeats: int = 3) -> None:
 def simulated(kind: str) -> PoseGraph:
     """A graph like those of Carlone et al., "Initialization techniques for 3D SLAM" (2015)."""
     rng = np.random.default_rng(7)
-    if kind == "grid":
-        steps = rng.integers(0, 3, 3000), rng.choice([-1, 1], 3000)
-        at = np.zeros((3000, 3), int)
-        for k in range(1, 3000):
-            at[k] = at[k - 1]
-            at[k, steps[0][k]] += steps[1][k]
-            # Reflected at the walls.
-            at[k] = np.where(at[k] < 0, 1, np.where(at[k] > 11, 10, at[k]))
-        position, radius = at.astype(float), 1.0
-        visits: dict[tuple[int, ...], int] = {}
-        loops = []
-        for k, node in enumerate(map(tuple, at)):
-            if node in visits and visits[node] < k - 3:
-                loops.append((visits[node], k))
-            visits[node] = k
-        sigma_m, sigma_rad = 0.05, 0.03
+    turns, each = (100, 50) if kind == "torus" else (50, 44)
+    k = np.arange(turns * each)
+    around, along = 2 * np.pi * k / each, (k / each) / turns
+    if kind == "torus":
+        out, radius = 2 * np.pi * along, 10.0
+        ring = radius + 3 * np.cos(around)
+        position = np.stack([ring * np.cos(out), ring * np.sin(out), 3 * np.sin(around)], 1)
     else:
-        turns, each = (100, 50) if kind == "torus" else (50, 44)
-        k = np.arange(turns * each)
-        around, along = 2 * np.pi * k / each, (k / each) / turns
-        if kind == "torus":
-            out, radius = 2 * np.pi * along, 10.0
-            ring = radius + 3 * np.cos(around)
-            position = np.stack([ring * np.cos(out), ring * np.sin(out), 3 * np.sin(around)], 1)
-        else:
-            polar, radius = np.pi * (0.02 + 0.96 * along), 50.0
-            position = radius * np.stack(
-                [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], 1
-            )
-        loops = [(m - each, m) for m in range(each, len(k))]
-        if kind == "sphere":
-            loops += [(m - each - 1, m) for m in range(each + 1, len(k))]
-        sigma_m, sigma_rad = (0.05, 0.03) if kind == "torus" else (0.5, 0.1)
+        polar, radius = np.pi * (0.02 + 0.96 * along), 50.0
+        position = radius * np.stack(
+            [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], 1
+        )
+    loops = [(m - each, m) for m in range(each, len(k))]
+    if kind == "sphere":
+        loops += [(m - each - 1, m) for m in range(each + 1, len(k))]
+    sigma_m, sigma_rad = (0.05, 0.03) if kind == "torus" else (0.5, 0.1)
     n = len(position)
     truth = np.asarray(se3.exp(np.concatenate([np.zeros((n, 3)), rng.normal(size=(n, 3))], 1)))
     truth[:, :3, 3] = position
@@ -309,7 +291,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
         graphs = list(options.graphs)
-        for kind in ("sphere", "torus", "grid") if options.simulated else ():
+        for kind in ("sphere", "torus") if options.simulated else ():
             graphs.append(Path(folder) / f"{kind}, simulated.g2o")
             write_g2o(graphs[-1], simulated(kind))
         if graphs:
