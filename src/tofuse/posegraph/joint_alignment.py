@@ -506,8 +506,9 @@ def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
     `pairs` are (M, 2) positions i < j.
     """
     keep = [np.zeros(0, np.intp)]
-    for j in np.unique(pairs[:, 1]):
-        rows = np.flatnonzero(pairs[:, 1] == j)
+    order = np.argsort(pairs[:, 1], kind="stable")
+    _, begin = np.unique(pairs[order, 1], return_index=True)
+    for rows in np.split(order, begin[1:]):
         if len(rows) > neighbours:
             rows = rows[np.unique(np.linspace(0, len(rows) - 1, neighbours).round().astype(int))]
         keep.append(rows)
