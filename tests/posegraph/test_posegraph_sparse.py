@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import ThreadpoolController
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
@@ -92,3 +93,15 @@ def test_poses_and_covariances_are_nearly_as_good(monkeypatch: pytest.MonkeyPatc
     assert np.median(errors[1]) < 1.4 * np.median(errors[0])
     e = se3.log(se3.inverse(part.poses[1:]) @ truth[1:])
     assert 4 < np.median(np.einsum("ni,nij,nj->n", e, np.linalg.inv(stated[1:]), e)) < 8
+
+
+def test_result_is_independent_of_blas_threads() -> None:
+    """Products of large panels would differ."""
+    edges = rounds(3000, 5)
+    controller = ThreadpoolController()
+    found = []
+    for threads in (1, 2):
+        with controller.limit(limits=threads, user_api="blas"):
+            graph, _ = graph_of(edges, 5)
+            found.append(GraphCovariances(LevenbergMarquardt().optimise(graph).graph).of_poses)
+    np.testing.assert_array_equal(*found)

@@ -26,6 +26,7 @@ from scipy.sparse.linalg import splu
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import supernodes as kernels
+from tofuse.kernels.blas import one_blas_thread
 
 # Maximum size of a dense right-hand side, in numbers.
 _AT_ONCE = 4_000_000
@@ -224,8 +225,9 @@ class Factor:
         panels, at, stride = self.system.panels
         values = np.zeros(panels.values[-1])
         kernels.scatter(values, at, stride, np.concatenate(self._matrix))
-        if not kernels.factorise(panels, values, self._signs):
-            raise RuntimeError("the system is singular")
+        with one_blas_thread():
+            if not kernels.factorise(panels, values, self._signs):
+                raise RuntimeError("the system is singular")
         return values
 
     def step(self) -> Float64 | None:
@@ -247,7 +249,8 @@ class Factor:
         if self._values is None:
             self._values = self._factorised()
         x = np.array(right, order="C")
-        kernels.solve(self.system.panels[0], self._values, self._signs, x)
+        with one_blas_thread():
+            kernels.solve(self.system.panels[0], self._values, self._signs, x)
         return x
 
     def joint_covariance(self, vertices: Intp) -> Float64:
@@ -311,7 +314,8 @@ class Factor:
         panels, at, stride = self.system.panels
         values = self._factorised() if self._values is None else self._values
         self._values = None
-        kernels.invert(panels, values)
+        with one_blas_thread():
+            kernels.invert(panels, values)
         blocks = np.empty((len(at), self.system.size, self.system.size))
         kernels.gather(values, at, stride, blocks)
         n = len(self.system.free)
