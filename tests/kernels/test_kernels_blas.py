@@ -32,3 +32,14 @@ def test_thread_count_is_restored_after_error() -> None:
         with pytest.raises(tofuse.RegistrationError):
             tofuse.register(np.ones((20, 3)), np.ones((20, 3)))
         assert counts() == before
+
+
+def test_limit_lasts_until_last_overlapping_block_ends() -> None:
+    with threadpool_limits(2):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert counts() == {1}
+        second.__exit__(None, None, None)
+        assert counts() == {2}

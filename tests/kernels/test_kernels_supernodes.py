@@ -35,7 +35,7 @@ class Sparse:
         return np.array([dense[k * i : k * i + k, k * j : k * j + k] for i, j in places])
 
     def factor(self) -> tuple[Float64, Float64] | None:
-        values = np.zeros(self.panels.values[-1])
+        values = np.zeros(self.panels.value_start[-1])
         kernels.scatter(values, *self.places, self.blocks(self.dense))
         signs = np.empty(len(self.dense))
         return (values, signs) if kernels.factorise(self.panels, values, signs) else None
@@ -61,12 +61,12 @@ def test_panels_contain_the_pattern_and_few_zeros() -> None:
     panels: kernels.Panels = A.panels
     assert len(panels.first) - 1 < 60  # columns were joined
     for s in range(len(panels.first) - 1):
-        own: Int64 = panels.rows[panels.start[s] : panels.start[s + 1]]
+        own: Int64 = panels.rows[panels.row_start[s] : panels.row_start[s + 1]]
         first, end = panels.first[s : s + 2]
         np.testing.assert_array_equal(own[: end - first], np.arange(first, end))
         for c in range(first, end):
             assert np.isin(rows[start[c] : start[c + 1]], own).all()
-    blocks = panels.values[-1] / 36
+    blocks = panels.value_start[-1] / 36
     assert blocks < 2 * len(rows)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController
@@ -9,13 +11,13 @@ from threadpoolctl import ThreadpoolController
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph import sparse
-from tofuse.posegraph.covariances import GraphCovariances
+from tofuse.posegraph.covariances import GraphCovariances, loop_errors
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.sparse import PairSystem, bounded_elimination, factor_blocks, parts_of
+from tofuse.posegraph.sparse import bounded, factor_size, parts_of
 
 PLACES, ROUNDS = 30, 20
-LIMIT = 6000  # blocks; the factor of all links has about three times as many
+LIMIT = 400_000  # the factor of all pairs has about twice as many values
 
 
 def rounds(links: int, seed: int) -> Intp:
@@ -48,40 +50,74 @@ def graph_of(edges: Intp, seed: int) -> tuple[PoseGraph, Float64]:
     return PoseGraph(np.arange(len(truth)), start, edges, measured, information, loop), truth
 
 
-def test_all_links_are_used_if_they_fit() -> None:
-    i, j = rounds(600, 1).T
-    n = PLACES * ROUNDS
-    for limit in (n * n, 60_000):  # without and with analysis
-        chosen, order = bounded_elimination(n, i, j, limit)
-        assert chosen.all()
-        assert sorted(order) == list(range(n))
+def accumulated(graph: PoseGraph) -> Float64:
+    """Poses (N, 4, 4) by the measurements between neighbours alone."""
+    poses = [np.eye(4)]
+    for T in graph.measurements[~graph.loop]:
+        poses.append(poses[-1] @ T)
+    return np.array(poses)
+
+
+def test_all_pairs_are_used_if_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    for limit in (36 * 600 * 600, 36 * 60_000):  # without and with analysis
+        monkeypatch.setattr(sparse, "MAX_FACTOR", limit)
+        assert bounded(PLACES * ROUNDS, rounds(600, 1)).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_factor_is_bounded_and_everything_remains_connected(seed: int) -> None:
+def test_factor_is_bounded_and_everything_remains_connected(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     edges = rounds(3000, seed)
     n = PLACES * ROUNDS
+    assert factor_size(n, edges) > 1.5 * LIMIT
+    monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
+    chosen = bounded(n, edges)
+    assert LIMIT / 2 < factor_size(n, edges[chosen]) <= LIMIT
     i, j = edges.T
-    _, order = bounded_elimination(n, i, j, n * n)
-    assert factor_blocks(i, j, order) > 2 * LIMIT
-    chosen, order = bounded_elimination(n, i, j, LIMIT)
-    assert LIMIT / 2 < factor_blocks(i[chosen], j[chosen], order) <= LIMIT
     assert chosen[j - i == 1].all()
-    # Two chains that only a single far link joins.
-    apart = (i < n // 2) == (j < n // 2)
-    apart |= (i == 3) & (j == n - 5)
-    i, j = np.append(i[apart], 3), np.append(j[apart], n - 5)
-    chosen, _ = bounded_elimination(n, i, j, LIMIT // 2)
+    # Two chains that only a single far pair joins; in both directions, and twice.
+    apart = edges[(i < n // 2) == (j < n // 2)]
+    edges = np.concatenate([apart, [[3, n - 5], [n - 5, 3]], apart[:50]])
+    monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT // 2)
+    chosen = bounded(n, edges)
     assert not chosen.all()
-    assert (parts_of(n, np.stack([i[chosen], j[chosen]], 1)) == 0).all()
+    np.testing.assert_array_equal(chosen[:50], chosen[-50:])
+    assert (parts_of(n, edges[chosen]) == 0).all()
+
+
+def test_false_loops_are_rejected_even_if_they_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph, _ = graph_of(rounds(3000, 6), 6)
+    monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
+    chosen = bounded(len(graph.ids), graph.edges)
+    assert (~chosen).sum() > 500
+    false = np.flatnonzero(~chosen)[::20]
+    measured = graph.measurements.copy()
+    measured[false] = measured[false] @ se3.exp(np.array([0.5, 0, 0, 0, 0.5, 0]))
+    done = LevenbergMarquardt().optimise(replace(graph, measurements=measured))
+    assert done.weights is not None
+    np.testing.assert_array_equal(np.flatnonzero(done.weights < 0.5), false)
+
+
+def test_errors_of_loops_that_are_left_out_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, _ = graph_of(rounds(3000, 7), 7)
+    odometry = accumulated(graph)
+    known = loop_errors(graph, odometry)
+    monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
+    chosen = bounded(len(graph.ids), graph.edges)[graph.loop]
+    found = loop_errors(graph, odometry)
+    np.testing.assert_array_equal(np.isfinite(found), chosen)
+    np.testing.assert_allclose(found[chosen], known[chosen], rtol=1e-6)
 
 
 def test_poses_and_covariances_are_nearly_as_good(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, truth = graph_of(rounds(3000, 4), 4)
     whole = LevenbergMarquardt().optimise(graph).graph
     known = GraphCovariances(whole).of_poses
-    monkeypatch.setattr(sparse, "MAX_FACTOR", 36 * LIMIT)
-    assert len(PairSystem(len(truth), graph.edges).left_out) > 500
+    monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
+    assert (~bounded(len(truth), graph.edges)).sum() > 500
     part = LevenbergMarquardt().optimise(graph).graph
     stated = GraphCovariances(part).of_poses
     # Fewer measurements: larger in every direction, but little.

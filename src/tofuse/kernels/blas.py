@@ -6,20 +6,38 @@ one, as they wait for each other without sleeping.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
+from threading import Lock
+from typing import Any
 
 import scipy.linalg  # noqa: F401, brings its own BLAS, which the controller must find
 from threadpoolctl import ThreadpoolController
 
+_lock = Lock()
+_blocks = 0
+_limit: Any = None
 
-def one_blas_thread() -> AbstractContextManager[object]:
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """Limit BLAS to one thread inside the block.
 
-    The limit is global to the process.
+    The limit is global to the process, and ends with the last of several overlapping blocks.
     """
-    limit: AbstractContextManager[object] = _controller().limit(limits=1, user_api="blas")
-    return limit
+    global _blocks, _limit
+    with _lock:
+        if not _blocks:
+            _limit = _controller().limit(limits=1, user_api="blas")
+        _blocks += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _blocks -= 1
+            if not _blocks:
+                _limit.restore_original_limits()
 
 
 @cache

@@ -1,7 +1,7 @@
 """Supernodal factorisation of sparse symmetric matrices of k x k blocks, and selected inversion.
 
-Neighbouring columns with equal patterns form a supernode, a dense panel of rows, so that nearly all
-arithmetic is products of dense matrices (Ng and Peyton, "Block sparse Cholesky algorithms on
+Neighbouring columns with similar patterns form a supernode, a dense panel of rows, so that nearly
+all arithmetic is products of dense matrices (Ng and Peyton, "Block sparse Cholesky algorithms on
 advanced uniprocessor computers", 1993). The factorisation A = L S L^T with signs S is not pivoted;
 all signs are positive if A is positive definite. Entries of the inverse follow on the pattern of
 the factor by the recursion of Takahashi et al. (1973), panel by panel.
@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
 
-# Panels have at most so many blocks of columns: the triangle on the diagonal is not a product.
+# Maximum width of a panel, in blocks: its triangle on the diagonal is factorised without BLAS.
 _WIDEST = 32
 # Columns join a supernode while at most this fraction of its blocks is zero.
 _ZEROS = 0.25
@@ -31,19 +31,19 @@ class Panels(NamedTuple):
         k, of the blocks.
     first
         (S + 1,) first column of each supernode.
-    start
+    row_start
         (S + 1,) where its rows begin in `rows`.
     rows
         Block rows of each panel, ascending; its own columns first.
-    values
+    value_start
         (S + 1,) where its values begin: rows * k times columns * k of them.
     """
 
     size: int
     first: Int64
-    start: Int64
+    row_start: Int64
     rows: Int64
-    values: Int64
+    value_start: Int64
 
 
 @kernel
@@ -150,10 +150,10 @@ def places(panels: Panels, rows: Int64, columns: Int64) -> tuple[Int64, Int64]:
     stride = np.empty(len(rows), np.int64)
     for m in range(len(rows)):
         s = owner[columns[m]]
-        low, high = panels.start[s], panels.start[s + 1]
+        low, high = panels.row_start[s], panels.row_start[s + 1]
         row = low + np.searchsorted(panels.rows[low:high], rows[m]) - low
         stride[m] = k * (panels.first[s + 1] - panels.first[s])
-        at[m] = panels.values[s] + row * k * stride[m] + k * (columns[m] - panels.first[s])
+        at[m] = panels.value_start[s] + row * k * stride[m] + k * (columns[m] - panels.first[s])
     return at, stride
 
 
@@ -213,10 +213,10 @@ def _inverse_triangle(L: Float64, out: Float64) -> None:
 
 @kernel
 def _largest(panels: Panels) -> tuple[int, int]:
-    """Largest number of rows of a panel, and of its columns, scalars."""
+    """Largest number of rows of a panel, and of its columns: numbers, not blocks."""
     high = wide = 1
     for s in range(len(panels.first) - 1):
-        high = max(high, panels.start[s + 1] - panels.start[s])
+        high = max(high, panels.row_start[s + 1] - panels.row_start[s])
         wide = max(wide, panels.first[s + 1] - panels.first[s])
     return high * panels.size, wide * panels.size
 
@@ -238,13 +238,13 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
     -------
     Whether the matrix is regular.
     """
-    k, first, start, rows = panels.size, panels.first, panels.start, panels.rows
+    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
     count, n = len(first) - 1, first[-1]
     high, wide = _largest(panels)
     product, scaled = np.empty(high * wide), np.empty(wide * wide)
     inverse = np.empty(wide * wide)
     where, owner = np.empty(n, np.int64), np.empty(n, np.int64)
-    # Lists of the supernodes whose next row to be eliminated is in this one.
+    # For each supernode, a list of those whose next row, at `place`, is among its columns.
     waiting, after = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
     place = np.zeros(count, np.int64)
     for s in range(count):
@@ -252,7 +252,7 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
     for s in range(count):
         m, w = start[s + 1] - start[s], first[s + 1] - first[s]
         own = rows[start[s] : start[s + 1]]
-        P = values[panels.values[s] : panels.values[s + 1]].reshape(m * k, w * k)
+        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
         for a in range(m):
             where[own[a]] = a
         d = waiting[s]
@@ -263,7 +263,7 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
             b = a
             while b < m_d and of_d[b] < first[s + 1]:
                 b += 1
-            D = values[panels.values[d] : panels.values[d + 1]].reshape(m_d * k, w_d * k)
+            D = values[panels.value_start[d] : panels.value_start[d + 1]].reshape(m_d * k, w_d * k)
             low, columns = (m_d - a) * k, (b - a) * k
             right = scaled[: columns * w_d * k].reshape(columns, w_d * k)
             for r in range(columns):
@@ -307,14 +307,14 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
 @kernel
 def solve(panels: Panels, values: Float64, signs: Float64, x: Float64) -> None:
     """Replace right-hand sides x (n k, q) by the solutions of A x = b."""
-    k, first, start, rows = panels.size, panels.first, panels.start, panels.rows
+    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
     count, q = len(first) - 1, x.shape[1]
     high, _ = _largest(panels)
     part = np.empty(high * q)
     for s in range(count):
         m, w = start[s + 1] - start[s], first[s + 1] - first[s]
         own = rows[start[s] : start[s + 1]]
-        P = values[panels.values[s] : panels.values[s + 1]].reshape(m * k, w * k)
+        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
         y = x[first[s] * k : first[s + 1] * k]
         for i in range(w * k):
             for j in range(i):
@@ -335,7 +335,7 @@ def solve(panels: Panels, values: Float64, signs: Float64, x: Float64) -> None:
     for s in range(count - 1, -1, -1):
         m, w = start[s + 1] - start[s], first[s + 1] - first[s]
         own = rows[start[s] : start[s + 1]]
-        P = values[panels.values[s] : panels.values[s + 1]].reshape(m * k, w * k)
+        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
         y = x[first[s] * k : first[s + 1] * k]
         if m > w:
             below = part[: (m - w) * k * q].reshape((m - w) * k, q)
@@ -359,7 +359,7 @@ def invert(panels: Panels, values: Float64) -> None:
     Z_RJ = -Z_RR M and Z_JJ = (L_JJ L_JJ^T)^-1 - M^T Z_RJ with M = L_RJ L_JJ^-1, for the columns J
     and the rows R below them, from the last supernode to the first.
     """
-    k, first, start, rows = panels.size, panels.first, panels.start, panels.rows
+    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
     count, n = len(first) - 1, first[-1]
     high, wide = _largest(panels)
     moved, found = np.empty(high * wide), np.empty(high * wide)
@@ -372,7 +372,7 @@ def invert(panels: Panels, values: Float64) -> None:
         m, w = start[s + 1] - start[s], first[s + 1] - first[s]
         wk, low = w * k, (m - w) * k
         own = rows[start[s] + w : start[s + 1]]
-        P = values[panels.values[s] : panels.values[s + 1]].reshape(m * k, wk)
+        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, wk)
         Li = inverse[: wk * wk].reshape(wk, wk)
         _inverse_triangle(P[:wk], Li)
         M, Z = moved[: low * wk].reshape(low, wk), found[: low * wk].reshape(low, wk)
@@ -385,7 +385,9 @@ def invert(panels: Panels, values: Float64) -> None:
             while b < m - w and own[b] < first[t + 1]:
                 b += 1
             of_t, w_t = rows[start[t] : start[t + 1]], first[t + 1] - first[t]
-            T = values[panels.values[t] : panels.values[t + 1]].reshape(len(of_t) * k, w_t * k)
+            T = values[panels.value_start[t] : panels.value_start[t + 1]].reshape(
+                len(of_t) * k, w_t * k
+            )
             at = 0
             left, columns = (m - w - a) * k, (b - a) * k
             G = part[: left * columns].reshape(left, columns)

@@ -461,6 +461,8 @@ class BackEnd:
         excess = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = self._by_calibration(refinement.calibration_check)
         shown = Shown(*moved, excess, *calibration, refinement.split_m, refinement.split_rad)
+        covariances = covariances_of(known, shown)
+        del known  # only one large factor is in memory
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
         if accuracy.unbounded and closed.sensors.verified:
             free = set(accuracy.unbounded)
@@ -468,7 +470,7 @@ class BackEnd:
             accuracy = accuracy_of(GraphCovariances(bounded), shown, model.cloud.diagonal_m)
             by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
             accuracy = replace(accuracy, by_odometry=by_odometry)
-        return accuracy, covariances_of(known, shown)
+        return accuracy, covariances
 
     def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
         """Return how far (m, rad) the poses may be off by the calibration (95 %).

@@ -11,7 +11,7 @@ from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
-from tofuse.posegraph.sparse import Factor, first_of_parts, parts_of
+from tofuse.posegraph.sparse import Factor, bounded, first_of_parts, parts_of
 
 # A loop with a smaller weight is rejected.
 MIN_WEIGHT = 0.05
@@ -22,18 +22,24 @@ def accepted_only(optimisation: Optimisation) -> Optimisation:
     if optimisation.weights is None:
         return optimisation
     kept = optimisation.weights >= MIN_WEIGHT
-    graph = optimisation.graph
+    graph = _only(optimisation.graph, kept)
+    return replace(optimisation, graph=graph, weights=optimisation.weights[kept])
+
+
+def _only(graph: PoseGraph, chosen: Bool) -> PoseGraph:
+    """Return the graph with only some of its edges (m,)."""
     return replace(
-        optimisation,
-        graph=replace(
-            graph,
-            edges=graph.edges[kept],
-            measurements=graph.measurements[kept],
-            information=graph.information[kept],
-            loop=graph.loop[kept],
-        ),
-        weights=optimisation.weights[kept],
+        graph,
+        edges=graph.edges[chosen],
+        measurements=graph.measurements[chosen],
+        information=graph.information[chosen],
+        loop=graph.loop[chosen],
     )
+
+
+def _bounded(graph: PoseGraph) -> PoseGraph:
+    chosen = bounded(len(graph.ids), graph.edges)
+    return graph if chosen.all() else _only(graph, chosen)
 
 
 def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
@@ -50,6 +56,7 @@ def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
     """
     if not len(graph.ids):
         return np.empty((0, 6, 6))
+    graph = _bounded(graph)
     part = parts_of(len(graph.ids), graph.edges)
     fixed = first_of_parts(len(graph.ids), graph.edges) & (part != part[origin])
     fixed[origin] = True
@@ -96,11 +103,12 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
 class GraphCovariances:
     """Covariances of the poses of an optimised graph relative to its first pose.
 
-    The system is factorised once for all of them.
+    Those of poses and joint ones come from the same factor. They are by the edges that `bounded`
+    chooses: without the others they are slightly larger.
     """
 
     def __init__(self, graph: PoseGraph) -> None:
-        self.graph = graph
+        self.graph = _bounded(graph)
 
     @cached_property
     def _factor(self) -> Factor | None:
@@ -128,7 +136,7 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     """(L,) squared Mahalanobis distances of the loops from odometry alone.
 
     Chi-square with six degrees of freedom if both covariances are right; NaN for loops between
-    poses that odometry does not connect.
+    poses that odometry does not connect, and for those that `bounded` leaves out.
 
     Parameters
     ----------
@@ -137,6 +145,13 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     sequential
         (N, 4, 4) poses of odometry alone.
     """
+    chosen = bounded(len(graph.ids), graph.edges)
+    out = np.full(int(graph.loop.sum()), np.nan)
+    out[chosen[graph.loop]] = _loop_errors(_only(graph, chosen), sequential)
+    return out
+
+
+def _loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     loops = np.flatnonzero(graph.loop)
     out = np.full(len(loops), np.nan)
     odometry = graph.edges[~graph.loop]

@@ -33,7 +33,7 @@ class Problem:
         gravity: Gravity | None,
         rotation: Rotation,
     ) -> None:
-        self.fixed, self.gravity = fixed, gravity
+        self.fixed, self.information, self.gravity = fixed, information, gravity
         self.pairs = pairs
         self.chart: Chart = CHARTS[rotation]()
         self._Z_inverse = se3.inverse(measurements)
@@ -49,11 +49,6 @@ class Problem:
             self._single = block, np.zeros((n + 1, 6))
         self.joined = joined
         self.system = PairSystem(len(all_fixed), joined, all_fixed, size=self.chart.size)
-        self.information = information
-        left_out = self.system.left_out[self.system.left_out < len(pairs)]
-        if len(left_out):
-            self.information = information.copy()
-            self.information[left_out] = 0
 
     def start(self, poses: Float64) -> Float64:
         """Return the initial poses, followed by that of the vertical if there is gravity."""

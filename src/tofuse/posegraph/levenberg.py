@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.arrays import Intp
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
@@ -15,7 +15,7 @@ from tofuse.parts import part
 from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
-from tofuse.posegraph.sparse import parts_of
+from tofuse.posegraph.sparse import bounded, parts_of
 
 _RIGID = 1e-3  # largest deviation of a rotation from orthonormal
 _MAX_POSITION_M = 1e9  # larger coordinates are corrupt
@@ -63,14 +63,16 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     weights = np.ones(len(graph.edges))
     parts, histories = [], []
     for vertices, edges in pieces(graph):
-        solution = _solve(graph, vertices, edges, settings)
+        used = bounded(len(vertices), np.searchsorted(vertices, graph.edges[edges]))
+        solution = _solve(graph, vertices, edges[used], settings)
         before, after = solution.history[0], solution.history[-1]
         history = solution.history if after < before else (before,)
         if after < before:
             poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
             # Exactly as before, without rounding errors.
             poses[vertices[0]] = graph.poses[vertices[0]]
-        weights[edges] = solution.weights[: len(edges)]
+        weights[edges[used]] = solution.weights[: used.sum()]
+        weights[edges[~used]] = _weights_of(graph.with_poses(poses), edges, used, weights, settings)
         histories.append(history)
         parts.append(
             GraphPart(
@@ -111,6 +113,23 @@ def _solve(graph: PoseGraph, vertices: Intp, edges: Intp, settings: Settings) ->
         loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
         settings=settings,
     )  # fmt: skip
+
+
+def _weights_of(
+    graph: PoseGraph, edges: Intp, used: Bool, weights: Float64, settings: Settings
+) -> Float64:
+    """Return the weights of the edges that were not used, see `bounded`, at the solution.
+
+    Loops that contradict the others more than those that were accepted have weight 0.
+    """
+    left_out = edges[~used]
+    if not len(left_out):
+        return np.ones(0)
+    e = graph.residuals()
+    chi2 = np.einsum("mi,mij,mj->m", e, graph.information, e)
+    accepted = edges[used & graph.loop[edges] & (weights[edges] > 0)]
+    limit = max(settings.gate, float(chi2[accepted].max(initial=0.0)))
+    return np.where(graph.loop[left_out] & (chi2[left_out] > limit), 0.0, 1.0)
 
 
 def _gravity_of(graph: PoseGraph, number: Intp) -> Gravity | None:

@@ -271,7 +271,7 @@ def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float
     # Degrees of freedom: independent errors minus unknowns.
     independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
     left = max(independent - H.shape[0], 6.0)
-    # With few degrees of freedom the 95 % ellipsoid is that of Hotelling's T^2.
+    # With few degrees of freedom the 95 % ellipsoid of six unknowns is that of the F distribution.
     more = independent / left * 6 * float(stats.f.ppf(0.95, 6, left) / stats.chi2.ppf(0.95, 6))
     weighed = J * (w * sigma)[..., None]
     spread = np.tensordot(alike, weighed, 1)
