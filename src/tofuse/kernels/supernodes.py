@@ -139,42 +139,41 @@ def layout(start: Int64, rows: Int64, size: int) -> Panels:
 
 
 @kernel
-def places(panels: Panels, rows: Int64, columns: Int64) -> tuple[Int64, Int64]:
-    """Return where blocks (N,) on or below the diagonal begin in the values, and their stride."""
-    n = panels.first[-1]
-    owner = np.empty(n, np.int64)
+def _owners(panels: Panels) -> Int64:
+    """Return the (n,) supernode of each column."""
+    owner = np.empty(panels.first[-1], np.int64)
     for s in range(len(panels.first) - 1):
         owner[panels.first[s] : panels.first[s + 1]] = s
-    k = panels.size
-    at = np.empty(len(rows), np.int64)
-    stride = np.empty(len(rows), np.int64)
+    return owner
+
+
+@kernel
+def _panel(panels: Panels, values: Float64, s: int) -> tuple[Int64, Float64]:
+    """Return the m rows of supernode s, and the (m k, w k) values of its w columns."""
+    rows = panels.rows[panels.row_start[s] : panels.row_start[s + 1]]
+    width = (panels.first[s + 1] - panels.first[s]) * panels.size
+    own = values[panels.value_start[s] : panels.value_start[s + 1]]
+    return rows, own.reshape(len(rows) * panels.size, width)
+
+
+@kernel
+def places(panels: Panels, rows: Int64, columns: Int64) -> Int64:
+    """Return where in the values the entries of blocks (N,) on or below the diagonal are.
+
+    (N, k, k) indices.
+    """
+    k, owner = panels.size, _owners(panels)
+    out = np.empty((len(rows), k, k), np.int64)
     for m in range(len(rows)):
         s = owner[columns[m]]
-        low, high = panels.row_start[s], panels.row_start[s + 1]
-        row = low + np.searchsorted(panels.rows[low:high], rows[m]) - low
-        stride[m] = k * (panels.first[s + 1] - panels.first[s])
-        at[m] = panels.value_start[s] + row * k * stride[m] + k * (columns[m] - panels.first[s])
-    return at, stride
-
-
-@kernel
-def scatter(values: Float64, at: Int64, stride: Int64, blocks: Float64) -> None:
-    """Write blocks (N, k, k) to the values, see `places`."""
-    k = blocks.shape[1]
-    for m in range(len(at)):
+        own = panels.rows[panels.row_start[s] : panels.row_start[s + 1]]
+        row = k * np.searchsorted(own, rows[m])
+        column = k * (columns[m] - panels.first[s])
+        width = k * (panels.first[s + 1] - panels.first[s])
         for r in range(k):
             for c in range(k):
-                values[at[m] + r * stride[m] + c] = blocks[m, r, c]
-
-
-@kernel
-def gather(values: Float64, at: Int64, stride: Int64, blocks: Float64) -> None:
-    """Read blocks (N, k, k) from the values, see `places`."""
-    k = blocks.shape[1]
-    for m in range(len(at)):
-        for r in range(k):
-            for c in range(k):
-                blocks[m, r, c] = values[at[m] + r * stride[m] + c]
+                out[m, r, c] = panels.value_start[s] + (row + r) * width + column + c
+    return out
 
 
 @kernel
@@ -238,32 +237,28 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
     -------
     Whether the matrix is regular.
     """
-    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
-    count, n = len(first) - 1, first[-1]
+    k, first = panels.size, panels.first
+    count, owner = len(first) - 1, _owners(panels)
     high, wide = _largest(panels)
     product, scaled = np.empty(high * wide), np.empty(wide * wide)
     inverse = np.empty(wide * wide)
-    where, owner = np.empty(n, np.int64), np.empty(n, np.int64)
+    where = np.empty(first[-1], np.int64)
     # For each supernode, a list of those whose next row, at `place`, is among its columns.
     waiting, after = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
     place = np.zeros(count, np.int64)
     for s in range(count):
-        owner[first[s] : first[s + 1]] = s
-    for s in range(count):
-        m, w = start[s + 1] - start[s], first[s + 1] - first[s]
-        own = rows[start[s] : start[s + 1]]
-        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
+        own, P = _panel(panels, values, s)
+        m, w = len(own), first[s + 1] - first[s]
         for a in range(m):
             where[own[a]] = a
         d = waiting[s]
         while d >= 0:
             following = after[d]
-            of_d = rows[start[d] : start[d + 1]]
+            of_d, D = _panel(panels, values, d)
             a, m_d, w_d = place[d], len(of_d), first[d + 1] - first[d]
             b = a
             while b < m_d and of_d[b] < first[s + 1]:
                 b += 1
-            D = values[panels.value_start[d] : panels.value_start[d + 1]].reshape(m_d * k, w_d * k)
             low, columns = (m_d - a) * k, (b - a) * k
             right = scaled[: columns * w_d * k].reshape(columns, w_d * k)
             for r in range(columns):
@@ -307,14 +302,13 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
 @kernel
 def solve(panels: Panels, values: Float64, signs: Float64, x: Float64) -> None:
     """Replace right-hand sides x (n k, q) by the solutions of A x = b."""
-    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
+    k, first = panels.size, panels.first
     count, q = len(first) - 1, x.shape[1]
     high, _ = _largest(panels)
     part = np.empty(high * q)
     for s in range(count):
-        m, w = start[s + 1] - start[s], first[s + 1] - first[s]
-        own = rows[start[s] : start[s + 1]]
-        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
+        own, P = _panel(panels, values, s)
+        m, w = len(own), first[s + 1] - first[s]
         y = x[first[s] * k : first[s + 1] * k]
         for i in range(w * k):
             for j in range(i):
@@ -333,9 +327,8 @@ def solve(panels: Panels, values: Float64, signs: Float64, x: Float64) -> None:
         for c in range(q):
             x[i, c] *= signs[i]
     for s in range(count - 1, -1, -1):
-        m, w = start[s + 1] - start[s], first[s + 1] - first[s]
-        own = rows[start[s] : start[s + 1]]
-        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, w * k)
+        own, P = _panel(panels, values, s)
+        m, w = len(own), first[s + 1] - first[s]
         y = x[first[s] * k : first[s + 1] * k]
         if m > w:
             below = part[: (m - w) * k * q].reshape((m - w) * k, q)
@@ -359,20 +352,17 @@ def invert(panels: Panels, values: Float64) -> None:
     Z_RJ = -Z_RR M and Z_JJ = (L_JJ L_JJ^T)^-1 - M^T Z_RJ with M = L_RJ L_JJ^-1, for the columns J
     and the rows R below them, from the last supernode to the first.
     """
-    k, first, start, rows = panels.size, panels.first, panels.row_start, panels.rows
-    count, n = len(first) - 1, first[-1]
+    k, first = panels.size, panels.first
+    count, owner = len(first) - 1, _owners(panels)
     high, wide = _largest(panels)
     moved, found = np.empty(high * wide), np.empty(high * wide)
     part, product = np.empty(high * wide), np.empty(high * wide)
     inverse, square = np.empty(wide * wide), np.empty(wide * wide)
-    owner = np.empty(n, np.int64)
-    for s in range(count):
-        owner[first[s] : first[s + 1]] = s
     for s in range(count - 1, -1, -1):
-        m, w = start[s + 1] - start[s], first[s + 1] - first[s]
+        all_rows, P = _panel(panels, values, s)
+        m, w = len(all_rows), first[s + 1] - first[s]
         wk, low = w * k, (m - w) * k
-        own = rows[start[s] + w : start[s + 1]]
-        P = values[panels.value_start[s] : panels.value_start[s + 1]].reshape(m * k, wk)
+        own = all_rows[w:]
         Li = inverse[: wk * wk].reshape(wk, wk)
         _inverse_triangle(P[:wk], Li)
         M, Z = moved[: low * wk].reshape(low, wk), found[: low * wk].reshape(low, wk)
@@ -384,10 +374,7 @@ def invert(panels: Panels, values: Float64) -> None:
             b = a
             while b < m - w and own[b] < first[t + 1]:
                 b += 1
-            of_t, w_t = rows[start[t] : start[t + 1]], first[t + 1] - first[t]
-            T = values[panels.value_start[t] : panels.value_start[t + 1]].reshape(
-                len(of_t) * k, w_t * k
-            )
+            of_t, T = _panel(panels, values, t)
             at = 0
             left, columns = (m - w - a) * k, (b - a) * k
             G = part[: left * columns].reshape(left, columns)

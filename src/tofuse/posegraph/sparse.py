@@ -92,13 +92,13 @@ class PairSystem:
         self._sum_off = _indicator(where, len(keys), len(both))
 
     @cached_property
-    def panels(self) -> tuple[kernels.Panels, Intp, Intp]:
-        """Layout of the factor, and where the blocks of the matrix are in it, with strides."""
+    def panels(self) -> tuple[kernels.Panels, Intp]:
+        """Layout of the factor, and where the entries of the matrix's blocks are in it."""
         n = len(self.free)
         rows = np.concatenate([np.arange(n), self.rows])
         columns = np.concatenate([np.arange(n), self.columns])
         panels = _panels(n, rows, columns, self.size)
-        return panels, *kernels.places(panels, rows, columns)
+        return panels, kernels.places(panels, rows, columns)
 
     def assemble(
         self,
@@ -208,9 +208,9 @@ class Factor:
         self._values: Float64 | None = self._factorised()
 
     def _factorised(self) -> Float64:
-        panels, at, stride = self.system.panels
+        panels, places = self.system.panels
         values = np.zeros(panels.value_start[-1])
-        kernels.scatter(values, at, stride, np.concatenate(self._matrix))
+        values[places] = np.concatenate(self._matrix)
         with one_blas_thread():
             if not kernels.factorise(panels, values, self._signs):
                 raise RuntimeError("the system is singular")
@@ -295,13 +295,12 @@ class Factor:
         """Return the blocks of the inverse: diagonal (free, 6, 6), and those of the pairs."""
         if (self._signs < 0).any():
             raise RuntimeError("the system is not positive definite")
-        panels, at, stride = self.system.panels
+        panels, places = self.system.panels
         values = self._factorised() if self._values is None else self._values
         self._values = None
         with one_blas_thread():
             kernels.invert(panels, values)
-        blocks = np.empty((len(at), self.system.size, self.system.size))
-        kernels.gather(values, at, stride, blocks)
+        blocks = values[places]
         n = len(self.system.free)
         return blocks[:n], blocks[n:]
 
@@ -377,6 +376,8 @@ def bounded(n: int, pairs: Intp) -> Bool:
     tree = minimum_spanning_tree(cost.tocsr()).tocoo()
     chosen = ~far | np.isin(edges, tree.row.astype(np.int64) * n + tree.col)
     others = np.flatnonzero(~chosen)
+    if not len(others):
+        return np.ones(len(pairs), np.bool_)
     most = np.maximum(degree[low], degree[high])[others]
     others = others[np.lexsort((low[others], -most))]
 
