@@ -5,9 +5,10 @@ from tofuse.rigs.run import _of_calibration
 
 
 def test_uncertain_poses_of_static_cameras_are_attributed_to_rig() -> None:
-    found = _of_calibration(Reason("uncertain_poses", ((0, 3),), "Poses may be off by 45 mm."))
+    text = "Poses may be off by 45 mm. Frame 2 is the least certain: 60 mm."
+    found = _of_calibration(Reason("uncertain_poses", ((0, 3),), text), 2, "left")
     assert (found.code, found.ranges) == ("uncertain_rig", ((0, 3),))
-    assert "45 mm" in found.text
+    assert "45 mm. Camera 'left' is the least certain: 60 mm." in found.text
     assert "rig.json" in found.text
     other = Reason("faulty_recording", ((0, 3),), "It has a fault.")
-    assert _of_calibration(other) is other
+    assert _of_calibration(other, 2, "left") is other

@@ -176,7 +176,7 @@ def reconstruct_rig(
     names = [camera.name for camera in rig.cameras]
     of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
     result = replace(
-        _as_rig(result, moves=moved),
+        _as_rig(result, names, source.camera, moves=moved),
         config=given.to_dict(),
         recording={**result.recording, "rig": of_rig},
     )
@@ -223,23 +223,34 @@ def _fixed(
     return found
 
 
-def _as_rig(result: Reconstruction, *, moves: bool) -> Reconstruction:
-    """Return the result without diagnostics that concern only single-camera tracking."""
+def _as_rig(
+    result: Reconstruction, names: Sequence[str], cameras: Intp, *, moves: bool
+) -> Reconstruction:
+    """Return the result without diagnostics that concern only single-camera tracking.
+
+    `cameras` are those of all frames, as positions in `names`.
+    """
     d = result.diagnostics
     reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
-    if not moves:
-        reasons = ranked([_of_calibration(r) for r in reasons])
+    worst = d.accuracy.worst
+    if not moves and worst is not None:
+        name = names[cameras[worst.frame]]
+        reasons = ranked([_of_calibration(r, worst.frame, name) for r in reasons])
     d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
     return replace(result, diagnostics=d)
 
 
-def _of_calibration(reason: Reason) -> Reason:
-    """Return the reason; if poses of static cameras are uncertain, the calibration is."""
+def _of_calibration(reason: Reason, worst: int, name: str) -> Reason:
+    """Return the reason; if poses of static cameras are uncertain, the calibration is.
+
+    `worst` is the least certain frame, and `name` its camera.
+    """
     if reason.code != "uncertain_poses":
         return reason
-    text = (
-        f"{reason.text} The bound follows from the covariances in rig.json, which include "
-        "systematic errors such as multipath."
+    text = reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
+    text += (
+        " The bound follows from the covariances in rig.json, which include systematic errors such "
+        "as multipath."
     )
     return replace(reason, code="uncertain_rig", text=text)
 
