@@ -184,6 +184,8 @@ class Spill(Generic[T]):
         self._next = 0
         self._evicted_bytes = 0  # since free memory was returned to the system
         self._last: dict[str, NDArray[Any]] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}  # of the last item
+        self._empty: dict[tuple[tuple[int, ...], str], NDArray[Any]] = {}
         self._file = SpillFile(folder)
         self._lock = RLock()
 
@@ -208,13 +210,13 @@ class Spill(Generic[T]):
                 item = type(item)(**(fields | own))
             self._last = arrays
             number, self._next = self._next, self._next + 1
-            # Only the first dimension is emptied: items may check the others in `__post_init__`.
-            empty = {n: np.empty((0, *a.shape[1:])[: a.ndim], a.dtype) for n, a in own.items()}
-            self._entries[number] = _Entry(
-                type(item)(**(fields | empty)),
-                {name: a.shape for name, a in own.items()},
-                sum(a.nbytes for a in own.values()),
-            )
+            empty = {name: self._empty_like(a) for name, a in own.items()}
+            shapes = {name: a.shape for name, a in own.items()}
+            if shapes == self._shapes:
+                shapes = self._shapes  # of which there may be many
+            self._shapes = shapes
+            nbytes = sum(a.nbytes for a in own.values())
+            self._entries[number] = _Entry(type(item)(**(fields | empty)), shapes, nbytes)
             self._keep(number, item)
         return number
 
@@ -262,6 +264,12 @@ class Spill(Generic[T]):
         """Bytes written to disk so far."""
         return self._file.size
 
+    def _empty_like(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return the same empty array for all arrays of this type and shape beyond the first."""
+        # Items may check the other dimensions in `__post_init__`.
+        empty = np.empty((0, *array.shape[1:])[: array.ndim], array.dtype)
+        return self._empty.setdefault((empty.shape, empty.dtype.str), empty)
+
     def _keep(self, number: int, item: T) -> None:
         self._resident[number] = item
         self._resident_bytes += self._entries[number].nbytes
@@ -306,6 +314,7 @@ class Spill(Generic[T]):
                 "_resident": resident,
                 "_resident_bytes": self._resident_bytes if resident else 0,
                 "_last": {},
+                "_empty": {},
                 "_lock": None,
             }
 

@@ -93,11 +93,13 @@ class FrameLog:
         T_odometry: Float64 | None = None,
         gravity: Float64 | None = None,
     ) -> None:
-        """Add the next frame, without its prepared view."""
+        """Add the next frame, without its images."""
         moving = 0.0
         if step is not None:
             moving = 0.0 if step.moving is None else float(step.moving.mean())
-            step = replace(step, surface=None, moving=None)
+            r = step.registration
+            r = None if r is None else replace(r, errors=())
+            step = replace(step, registration=r, surface=None, moving=None)
         number = len(self.interruptions)
         self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
 

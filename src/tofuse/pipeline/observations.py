@@ -12,6 +12,7 @@ from tofuse.files.spill import Scratch
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
+from tofuse.geometry.places import PlaceCounts
 from tofuse.odometry.base import Step
 from tofuse.pipeline.backend import BackEndInput
 from tofuse.pipeline.budget import views_bytes
@@ -27,6 +28,9 @@ _MAX_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the me
 _CHECKED_IMAGES = 60  # images that are compared with each other at the final poses
 # Width of stored views: more pixels do not improve loops and refinement.
 _COLUMNS = 200
+# Of the images of a place, all of this many are in the model, and ever fewer of the others: their
+# noise is averaged by then. Size of a place: rad, and fraction of the depth.
+_ENOUGH, _SAME_RAD, _SAME_PLACE = 64, 0.12, 0.06
 
 
 class Observations:
@@ -50,6 +54,7 @@ class Observations:
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
+        self._places = PlaceCounts(_SAME_RAD, _SAME_PLACE, _ENOUGH)
         self._checks = _EvenSample(_CHECKED_IMAGES)
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None
@@ -64,8 +69,7 @@ class Observations:
         if surface is not None:
             # Covariances of trackers with prepared views are realistic; those of ICP are too small.
             self._knows_errors = True
-            if self.views.wants(surface.index, surface.depth, T, step.component):
-                self.views.push(surface.subsampled(_COLUMNS).without_caches(), T, step.component)
+            self.views.push(surface, T, step.component, _reduced)
         view: Frame = ready.clean
         # Methods on prepared views need no points, which take long to compute.
         if surface is None or self.loops.points or self._refiner.points:
@@ -75,11 +79,14 @@ class Observations:
 
     def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
         """Store what the model and the verdict need of a frame with a pose."""
+        depth = _typical_range(frame)
         if isinstance(frame, RangeFrame):
-            self._depths[frame.index] = _typical_range(frame)
+            self._depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
                 self._checks.add(lambda: restore_thinned(frame, clean))
-        self._model.add(clean, step.surface, _MAX_POINTS)
+        assert step.T_component_camera is not None
+        if self._places.keeps(depth, step.T_component_camera, step.component):
+            self._model.add(clean, step.surface, _MAX_POINTS)
 
     def sample(self, ready: Ready, *, lost: bool) -> None:
         """Store a small picture of some frames, for the report."""
@@ -105,11 +112,18 @@ class Observations:
         )
 
 
-def _typical_range(frame: RangeFrame) -> float:
+def _reduced(view: PreparedView) -> PreparedView:
+    return view.subsampled(_COLUMNS).without_caches()
+
+
+def _typical_range(frame: Frame) -> float:
     """Return the median radial range of a subset of the pixels, m; 0 without valid ones."""
-    ranges = frame.depth[::4, ::4]
-    if frame.depth_kind == "z":
-        ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
+    if isinstance(frame, RangeFrame):
+        ranges = frame.depth[::4, ::4]
+        if frame.depth_kind == "z":
+            ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
+    else:
+        ranges = np.linalg.norm(frame.points[::16], axis=1)
     known = ranges[ranges > 0]
     return float(np.median(known)) if len(known) else 0.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from tofuse.arrays import Float32, Float64, Int64, Intp
 from tofuse.files.spill import Scratch, Spill
 from tofuse.geometry import se3
+from tofuse.geometry.places import PlaceCounts
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA, TargetImage
 from tofuse.kernels.threads import run_chunks
@@ -125,13 +126,17 @@ class Spacing:
         When there are more, every other one is dropped, and the required motion is doubled.
     loosest
         Largest factor on the required motion, so that the views of a place suffice however long the
-        path is. Beyond it, the number of views grows with the path.
+        path is.
+    enough
+        Once the factor is the largest, the views of a place that is visited again and again are
+        thinned after this many, see `PlaceCounts`.
     """
 
     angle: float = 0.03
     distance: float = 0.015
     most: int = 300
     loosest: float = 4.0
+    enough: int = 16
 
 
 class Storable(Protocol):
@@ -236,33 +241,42 @@ class ViewStore(Generic[V]):
         self._spacing, self._always = spacing, frozenset(always)
         self._spill: Spill[V] = scratch.part(1 - _FOR_OUTLINES)
         self._stretch = 1.0
+        s = spacing
+        self._places = PlaceCounts(s.loosest * s.angle, s.loosest * s.distance, s.enough)
+        # Where the last view would be if places were not thinned.
+        self._last: tuple[Float64, int] | None = None
 
-    def wants(
-        self, index: int, depth: float, T_component_camera: Float64, component: int = 0
-    ) -> bool:
-        """Whether the next view is to be stored: the camera has moved enough, or it is required."""
-        if not self.views or self.views[-1].component != component or index in self._always:
+    def push(
+        self,
+        view: V,
+        T_component_camera: Float64,
+        component: int = 0,
+        reduced: Callable[[V], V] = lambda view: view,
+    ) -> None:
+        """Add the next view, or what `reduced` makes of it, if it is wanted."""
+        if self._wants(view, T_component_camera, component):
+            self._add(PosedView(reduced(view), T_component_camera, component, self._spill))
+
+    def push_posed(self, posed: PosedView[V]) -> None:
+        """Add the next view of another store, if it is wanted."""
+        if self._wants(posed, posed.T_component_camera, posed.component):
+            self._add(posed)
+
+    def _wants(self, view: Storable, T_component_camera: Float64, component: int) -> bool:
+        """Whether the camera has moved enough to a place with few views, or a view is required."""
+        s, last = self._spacing, self._last
+        if view.index in self._always or last is None or last[1] != component:
+            self._last = T_component_camera, component
             return True
-        motion = se3.inverse(self.views[-1].T_component_camera) @ T_component_camera
-        s = self._spacing
-        return bool(
-            se3.angle(motion) >= s.angle * self._stretch
-            or np.linalg.norm(motion[:3, 3]) >= s.distance * self._stretch * depth
-        )
-
-    def push(self, view: V, T_component_camera: Float64, component: int = 0) -> bool:
-        """Add the next view if it is wanted; returns whether it is."""
-        if not self.wants(view.index, view.depth, T_component_camera, component):
+        motion = se3.inverse(last[0]) @ T_component_camera
+        if (
+            se3.angle(motion) < s.angle * self._stretch
+            and np.linalg.norm(motion[:3, 3]) < s.distance * self._stretch * view.depth
+        ):
             return False
-        self._add(PosedView(view, T_component_camera, component, self._spill))
-        return True
-
-    def push_posed(self, posed: PosedView[V]) -> bool:
-        """Add the next view of another store, if it is wanted; returns whether it is."""
-        if not self.wants(posed.index, posed.depth, posed.T_component_camera, posed.component):
-            return False
-        self._add(posed)
-        return True
+        self._last = T_component_camera, component
+        loosest = 2 * self._stretch > s.loosest
+        return not loosest or self._places.keeps(view.depth, T_component_camera, component)
 
     def of(self, frames: Collection[int]) -> list[PosedView[V]]:
         """Views of some frames."""
@@ -273,6 +287,7 @@ class ViewStore(Generic[V]):
         s = self._spacing
         if len(self.views) > s.most and 2 * self._stretch <= s.loosest:
             self._drop_every_other()
+            self._last = self.views[-1].T_component_camera, self.views[-1].component
             self._stretch *= 2
 
     def _drop_every_other(self) -> None:
