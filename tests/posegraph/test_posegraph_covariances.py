@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
+from tofuse.posegraph import branches
+from tofuse.posegraph.branches import Branches
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.covariances import (
     MIN_WEIGHT,
+    GraphCovariances,
     accepted_only,
     loop_errors,
-    pose_covariances,
     relative_covariance,
 )
 from tofuse.posegraph.graph import Optimisation, PoseGraph
@@ -41,7 +43,7 @@ def solved(drawn) -> list[PoseGraph]:
 
 
 def test_covariances_match_repeated_solutions(solved) -> None:
-    C = pose_covariances(walk())
+    C = GraphCovariances(walk()).of_poses
     np.testing.assert_array_equal(C[0], 0)
     errors = np.stack([se3.log(se3.inverse(TRUE) @ g.poses) for g in solved])
     seen = np.einsum("tna,tnb->nab", errors, errors) / len(errors)
@@ -77,19 +79,19 @@ def test_loops_between_parts_without_odometry_have_no_error() -> None:
         loop=graph.loop[keep],
     )
     assert np.isnan(loop_errors(torn, torn.poses)).all()
-    assert np.isfinite(pose_covariances(torn)).all()  # the loops connect them
+    assert np.isfinite(GraphCovariances(torn).of_poses).all()  # the loops connect them
     alone = replace(torn, information=torn.information * ~torn.loop[:, None, None])
-    assert np.isnan(pose_covariances(alone)[1:]).all()
+    assert np.isnan(GraphCovariances(alone).of_poses[1:]).all()
 
 
 def test_disconnected_parts_have_no_covariance() -> None:
     steps = [Measured(k, k + 1, STEP, np.eye(6)) for k in (0, 1, 3, 4)]
     graph = build_graph(range(6), TRUE[:6], steps)
-    C = pose_covariances(graph)
+    C = GraphCovariances(graph).of_poses
     assert np.isfinite(C[:3]).all()
     assert np.isnan(C[3:]).all()
     one = build_graph([7], TRUE[:1], [])
-    np.testing.assert_array_equal(pose_covariances(one), np.zeros((1, 6, 6)))
+    np.testing.assert_array_equal(GraphCovariances(one).of_poses, np.zeros((1, 6, 6)))
 
 
 def test_left_out_edges_are_removed() -> None:
@@ -112,7 +114,7 @@ def test_relative_covariance_of_chain_is_that_of_edges_between() -> None:
         poses.append(poses[-1] @ motion)
     sigmas = rng.uniform(0.5, 2, (6, 6)) * [0.01, 0.01, 0.01, 0.005, 0.005, 0.005]
     edges = [Measured(k, k + 1, motions[k], np.diag(1 / sigmas[k] ** 2)) for k in range(6)]
-    C = pose_covariances(build_graph(range(7), np.stack(poses), edges, ()))
+    C = GraphCovariances(build_graph(range(7), np.stack(poses), edges, ())).of_poses
     between = relative_covariance(se3.inverse(poses[2]) @ poses[3], C[2], C[3])
     np.testing.assert_allclose(between, np.diag(sigmas[2] ** 2), atol=1e-12)
     far = relative_covariance(se3.inverse(poses[2]) @ poses[6], C[2], C[6])
@@ -121,3 +123,69 @@ def test_relative_covariance_of_chain_is_that_of_edges_between() -> None:
     # An uncertain branch does not give an indefinite covariance.
     branch = relative_covariance(np.eye(4), C[6], C[1])
     assert np.linalg.eigvalsh(branch).min() > -1e-15
+
+
+def with_branches(graph: PoseGraph) -> PoseGraph:
+    """Add a branch of two poses to the fourth pose, and another edge's reverse to the sixth."""
+    n = len(graph.ids)
+    rng = np.random.default_rng(3)
+    ends = [(3, n), (n, n + 1), (n + 2, 5)]
+    Z = se3.exp(0.1 * rng.normal(size=(3, 6)))
+    J = rng.normal(size=(3, 6, 6)) * 20
+    T = graph.poses
+    poses = [T[3] @ Z[0], T[3] @ Z[0] @ Z[1], T[5] @ se3.inverse(Z[2])]
+    return PoseGraph(
+        np.arange(n + 3),
+        np.concatenate([T, poses]),
+        np.concatenate([graph.edges, ends]),
+        np.concatenate([graph.measurements, Z]),
+        np.concatenate([graph.information, J @ np.swapaxes(J, 1, 2)]),
+        np.append(graph.loop, np.zeros(3, bool)),
+    )
+
+
+@pytest.fixture
+def without_removal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(branches, "_LEVELS", 0)
+
+
+def test_covariances_of_branches_are_those_of_the_whole_system(request) -> None:
+    graph = with_branches(LevenbergMarquardt().optimise(walk()).graph)
+    some = np.array([2, 3, N, N + 1, N + 2])
+    known = GraphCovariances(graph)
+    found = known.of_poses, known.joint(some), loop_errors(graph, graph.poses)
+    request.getfixturevalue("without_removal")
+    whole = GraphCovariances(graph)
+    np.testing.assert_allclose(found[0], whole.of_poses, atol=1e-12)
+    np.testing.assert_allclose(found[1], whole.joint(some), atol=1e-12)
+    np.testing.assert_allclose(found[2], loop_errors(graph, graph.poses), rtol=1e-9)
+
+
+def test_branches_follow_the_optimised_poses(request) -> None:
+    graph = with_branches(walk(np.random.default_rng(5)))
+    found = LevenbergMarquardt().optimise(graph)
+    request.getfixturevalue("without_removal")
+    whole = LevenbergMarquardt().optimise(graph)
+    assert whole.improved
+    np.testing.assert_allclose(found.graph.poses, whole.graph.poses, atol=1e-6)
+    np.testing.assert_allclose(found.objective[-1], whole.objective[-1], rtol=1e-6)
+    residuals = found.graph.residuals()[-3:]
+    np.testing.assert_allclose(residuals, 0, atol=1e-12)
+
+
+def test_branches_with_error_are_corrected() -> None:
+    graph = with_branches(LevenbergMarquardt().optimise(walk()).graph)
+    poses = graph.poses.copy()
+    poses[-1, 0, 3] += 0.1
+    found = LevenbergMarquardt().optimise(graph.with_poses(poses))
+    assert found.improved
+    assert (np.diff(found.objective) <= 0).all()
+    np.testing.assert_allclose(found.graph.poses, graph.poses, atol=1e-6)
+
+
+def test_degenerate_edges_are_in_no_branch() -> None:
+    graph = with_branches(walk())
+    information = graph.information.copy()
+    information[-1, 2], information[-1, :, 2] = 0, 0
+    found = Branches(replace(graph, information=information), np.zeros(N + 3, bool))
+    np.testing.assert_array_equal(np.flatnonzero(found.vertices), [N, N + 1])

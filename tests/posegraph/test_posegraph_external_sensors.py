@@ -12,7 +12,7 @@ from corner_views import SHARP, corner
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.covariances import pose_covariances
+from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.external_sensors import (
     GravityEdges,
     OdometryEdges,
@@ -106,7 +106,7 @@ def test_gravity_removes_roll_and_pitch_drift():
     assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
     assert SensorPriors().up(graph) is None
     # Gravity does not constrain heading or position.
-    C, free = pose_covariances(with_sensors(graph, told)), pose_covariances(graph)
+    C, free = GraphCovariances(with_sensors(graph, told)).of_poses, GraphCovariances(graph).of_poses
     assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])
     assert C[-1, 4, 4] > 0.5 * free[-1, 4, 4]
 

@@ -38,7 +38,6 @@ from tofuse.posegraph.covariances import (
     MIN_WEIGHT,
     GraphCovariances,
     accepted_only,
-    pose_covariances,
 )
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
@@ -200,7 +199,9 @@ class BackEnd:
             tracked = self.graph(())
             # For the search, motion in degenerate directions may differ from that elsewhere.
             cautious = self.graph((), cautious=True) if self._unobservable else tracked
-            covariances = dict(zip(cautious.ids.tolist(), pose_covariances(cautious), strict=True))
+            covariances = dict(
+                zip(cautious.ids.tolist(), GraphCovariances(cautious).of_poses, strict=True)
+            )
             loops = with_joins(self._kept.loops.finish(self._poses, covariances), self._joins)
             loops = self._search_loops_again(loops)
             graph = self.graph(loops)
@@ -268,7 +269,9 @@ class BackEnd:
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
             if not self._kept.loops.look_again(poses):
                 break
-            covariances = dict(zip(graph.ids.tolist(), pose_covariances(graph), strict=True))
+            covariances = dict(
+                zip(graph.ids.tolist(), GraphCovariances(graph).of_poses, strict=True)
+            )
             loops = with_joins(self._kept.loops.finish(poses, covariances), self._joins)
         return loops
 
@@ -447,7 +450,7 @@ class BackEnd:
         Not assessed if covariances of registrations are unrealistic.
         """
         if not self._kept.knows_errors:
-            return Accuracy(), pose_covariances(closed.optimisation.graph)
+            return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
         refinement = refined.refinement
         known = images_only = GraphCovariances(self._measured(refined.graph, refinement.stated))
         if closed.sensors:  # the accuracy rests on the images alone where they suffice

@@ -20,7 +20,7 @@ from scipy.special import gammaincinv
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
-from tofuse.posegraph.covariances import GraphCovariances, pose_covariances
+from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.prepared_view import PreparedView
@@ -335,7 +335,7 @@ def _single(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bo
     unbounded = _is_unbounded(first, limits)
     if 2 * unbounded.any(1).sum() > len(unbounded):
         many = np.flatnonzero(unbounded.any(1))
-        other = pose_covariances(covariances.graph, int(many[len(many) // 2]))
+        other = GraphCovariances(covariances.graph, int(many[len(many) // 2])).of_poses
         others = _is_unbounded(other, limits)
         if others.any(1).sum() < unbounded.any(1).sum():
             return other, others

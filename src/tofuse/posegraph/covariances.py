@@ -9,6 +9,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
+from tofuse.posegraph.branches import Branches
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.sparse import Factor, bounded, first_of_parts, parts_of
@@ -22,60 +23,9 @@ def accepted_only(optimisation: Optimisation) -> Optimisation:
     if optimisation.weights is None:
         return optimisation
     kept = optimisation.weights >= MIN_WEIGHT
-    graph = _only(optimisation.graph, kept)
+    graph = optimisation.graph
+    graph = graph.subgraph(np.arange(len(graph.ids)), np.flatnonzero(kept))
     return replace(optimisation, graph=graph, weights=optimisation.weights[kept])
-
-
-def _only(graph: PoseGraph, chosen: Bool) -> PoseGraph:
-    """Return the graph with only some of its edges (m,)."""
-    return replace(
-        graph,
-        edges=graph.edges[chosen],
-        measurements=graph.measurements[chosen],
-        information=graph.information[chosen],
-        loop=graph.loop[chosen],
-    )
-
-
-def _bounded(graph: PoseGraph) -> PoseGraph:
-    chosen = bounded(len(graph.ids), graph.edges)
-    return graph if chosen.all() else _only(graph, chosen)
-
-
-def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
-    """(N, 6, 6) covariances of the poses relative to one of them, as right perturbations.
-
-    NaN where a pose is not connected to it, or not constrained.
-
-    Parameters
-    ----------
-    graph
-        The optimised graph of N poses.
-    origin
-        Position of the pose that is fixed.
-    """
-    if not len(graph.ids):
-        return np.empty((0, 6, 6))
-    graph = _bounded(graph)
-    part = parts_of(len(graph.ids), graph.edges)
-    fixed = first_of_parts(len(graph.ids), graph.edges) & (part != part[origin])
-    fixed[origin] = True
-    factor = _problem(graph, fixed).factor(graph.poses, np.ones(len(graph.edges)))
-    return _connected(graph, origin, factor)
-
-
-def _connected(graph: PoseGraph, origin: int, factor: Factor | None) -> Float64:
-    """Return the (N, 6, 6) covariances by a factor; NaN where not connected to the origin."""
-    out = np.full((len(graph.ids), 6, 6), np.nan)
-    if factor is None or not len(out):
-        return out
-    part = parts_of(len(out), graph.edges)
-    joined = part == part[origin]
-    try:
-        out[joined] = factor.covariances()[: len(out)][joined]
-    except RuntimeError:
-        return out
-    return out
 
 
 def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
@@ -101,35 +51,68 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
 
 
 class GraphCovariances:
-    """Covariances of the poses of an optimised graph relative to its first pose.
+    """Covariances of the poses of an optimised graph relative to one of them.
 
-    Those of poses and joint ones come from the same factor. They are by the edges that `bounded`
-    chooses: without the others they are slightly larger.
+    They are by the edges that `bounded` chooses: without the others they are slightly larger.
+
+    Parameters
+    ----------
+    graph
+        The optimised graph of N poses.
+    origin
+        Position of the pose that is fixed.
     """
 
-    def __init__(self, graph: PoseGraph) -> None:
-        self.graph = _bounded(graph)
-
-    @cached_property
-    def _factor(self) -> Factor | None:
-        graph = self.graph
-        problem = _problem(graph, first_of_parts(len(graph.ids), graph.edges))
-        return problem.factor(graph.poses, np.ones(len(graph.edges)))
+    def __init__(self, graph: PoseGraph, origin: int = 0) -> None:
+        self.graph, self.origin = graph, origin
+        n = len(graph.ids)
+        self._part = parts_of(n, graph.edges)
+        self._fixed = np.zeros(n, np.bool_)
+        if n:
+            other = self._part != self._part[origin]
+            self._fixed = first_of_parts(n, graph.edges) & other
+            self._fixed[origin] = True
 
     @cached_property
     def of_poses(self) -> Float64:
-        """(N, 6, 6) as right perturbations, see `pose_covariances`."""
-        return _connected(self.graph, 0, self._factor)
+        """(N, 6, 6) covariances of the poses, as right perturbations.
+
+        NaN where a pose is not connected to the fixed one, or not constrained.
+        """
+        out = np.full((len(self.graph.ids), 6, 6), np.nan)
+        if not len(out):
+            return out
+        branches = Branches(self.graph, self._fixed)
+        core, factor = self._factor(branches)
+        if factor is None:
+            return out
+        try:
+            out[core] = factor.covariances()[: len(core)]
+        except RuntimeError:
+            return out
+        branches.covariances(out)
+        out[self._part != self._part[self.origin]] = np.nan
+        return out
 
     def joint(self, some: Intp) -> Float64 | None:
         """Return the (6v, 6v) joint covariance of v poses, given their positions.
 
         None where the measurements do not constrain all poses of the graph.
         """
-        n, edges = len(self.graph.ids), self.graph.edges
-        if self._factor is None or first_of_parts(n, edges).sum() > 1:
+        if self._part.any():
             return None
-        return self._factor.joint_covariance(some)
+        kept = self._fixed.copy()
+        kept[some] = True
+        core, factor = self._factor(Branches(self.graph, kept))
+        return None if factor is None else factor.joint_covariance(np.searchsorted(core, some))
+
+    def _factor(self, branches: Branches) -> tuple[Intp, Factor | None]:
+        """Return the vertices in no branch, and the factor of their normal equations."""
+        core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
+        chosen = bounded(len(core), np.searchsorted(core, self.graph.edges[edges]))
+        graph = self.graph.subgraph(core, edges[chosen])
+        problem = _problem(graph, self._fixed[core])
+        return core, problem.factor(graph.poses, np.ones(len(graph.edges)))
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
@@ -145,34 +128,33 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     sequential
         (N, 4, 4) poses of odometry alone.
     """
-    chosen = bounded(len(graph.ids), graph.edges)
-    out = np.full(int(graph.loop.sum()), np.nan)
-    out[chosen[graph.loop]] = _loop_errors(_only(graph, chosen), sequential)
-    return out
-
-
-def _loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
-    loops = np.flatnonzero(graph.loop)
-    out = np.full(len(loops), np.nan)
+    n = len(graph.ids)
     odometry = graph.edges[~graph.loop]
-    problem = _problem(graph, first_of_parts(len(graph.ids), odometry))
-    factor = problem.factor(sequential, np.where(graph.loop, 0.0, 1.0))
-    part = parts_of(len(graph.ids), odometry)
+    fixed, part = first_of_parts(n, odometry), parts_of(n, odometry)
+    branches = Branches(graph, fixed)
+    core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
+    edges = edges[bounded(len(core), np.searchsorted(core, graph.edges[edges]))]
+    out = np.full(len(graph.edges), np.nan)
+    loops = edges[graph.loop[edges]]
     i, j = graph.edges[loops].T
     same = part[i] == part[j]
+    reduced = graph.subgraph(core, edges)
+    factor = _problem(reduced, fixed[core]).factor(
+        sequential[core], np.where(reduced.loop, 0.0, 1.0)
+    )
     if factor is None or not same.any():
-        return out
-    a, b = graph.edges.T
+        return out[graph.loop]
+    a, b = graph.edges[edges].T
     T_i_j = se3.inverse(sequential[a]) @ sequential[b]
     try:
-        C = factor.relative_covariances(T_i_j)[loops]
+        C = factor.relative_covariances(T_i_j)[reduced.loop]
     except RuntimeError:
-        return out
-    e = se3.log(se3.inverse(graph.measurements[loops]) @ T_i_j[loops])
+        return out[graph.loop]
+    e = se3.log(se3.inverse(graph.measurements[loops]) @ T_i_j[reduced.loop])
     C = C + np.linalg.pinv(graph.information[loops], hermitian=True)
     d = (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(1)
-    out[same] = d[same]
-    return out
+    out[loops[same]] = d[same]
+    return out[graph.loop]
 
 
 def _problem(graph: PoseGraph, fixed: Bool) -> Problem:

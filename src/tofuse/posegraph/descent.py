@@ -11,10 +11,8 @@ from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
 from tofuse.posegraph.charts import CHARTS, Chart, Rotation
-from tofuse.posegraph.graph import Gravity
+from tofuse.posegraph.graph import ROUNDING, Gravity
 from tofuse.posegraph.sparse import Factor, PairSystem
-
-_ROUNDING = 1e-12  # mean squared error of an edge, in units of its information
 
 
 class Problem:
@@ -196,7 +194,7 @@ class Descent:
             return True
         value = self._value(total)
         for _ in range(iterations):
-            if value <= _ROUNDING * len(problem.pairs):
+            if value <= ROUNDING * len(problem.pairs):
                 return True
             matrix, gradient = problem.linearised(self.poses, self.e, self.down, weights(self.chi2))
             before = value

@@ -11,6 +11,9 @@ from tofuse.arrays import Bool, Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 
+# Squared error of an edge, in units of its information, up to which it may be rounding.
+ROUNDING = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
@@ -127,6 +130,41 @@ class PoseGraph:
     def with_poses(self, poses: Float64) -> PoseGraph:
         """Return the graph with other poses."""
         return replace(self, poses=poses)
+
+    def subgraph(self, vertices: Intp, edges: Intp) -> PoseGraph:
+        """Return the graph of some vertices, and of some edges between them.
+
+        Parameters
+        ----------
+        vertices, edges
+            Their positions, ascending.
+        """
+        number = np.full(len(self.ids), -1)
+        number[vertices] = np.arange(len(vertices))
+        gravity, anchors = self.gravity, self.anchors
+        if gravity is not None:
+            here = number[gravity.vertices] >= 0
+            gravity = replace(
+                gravity,
+                vertices=number[gravity.vertices[here]],
+                directions=gravity.directions[here],
+                sigma=gravity.sigma[here],
+            )
+        if anchors is not None:
+            here = number[anchors.vertices] >= 0
+            anchors = Anchors(
+                number[anchors.vertices[here]], anchors.poses[here], anchors.information[here]
+            )
+        return PoseGraph(
+            self.ids[vertices],
+            self.poses[vertices],
+            number[self.edges[edges]],
+            self.measurements[edges],
+            self.information[edges],
+            self.loop[edges],
+            gravity if gravity is not None and len(gravity.vertices) else None,
+            anchors if anchors is not None and len(anchors.vertices) else None,
+        )
 
     def residuals(self) -> Float64:
         """Return the (M, 6) errors ``log(Z^-1 T_i^-1 T_j)`` of the edges."""

@@ -12,7 +12,8 @@ from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.parts import part
-from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.branches import Branches
+from tofuse.posegraph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
 from tofuse.posegraph.sparse import bounded, parts_of
@@ -58,21 +59,32 @@ class LevenbergMarquardt(Bounded, Optimiser):
 
 def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     """Optimise a graph with given settings, see `LevenbergMarquardt`."""
-    check_graph(graph)
+    eigenvalues = check_graph(graph)
     poses = graph.poses.copy()
     weights = np.ones(len(graph.edges))
     parts, histories = [], []
-    for vertices, edges in pieces(graph):
-        used = bounded(len(vertices), np.searchsorted(vertices, graph.edges[edges]))
-        solution = _solve(graph, vertices, edges[used], settings)
-        before, after = solution.history[0], solution.history[-1]
-        history = solution.history if after < before else (before,)
+    found = pieces(graph)
+    first = np.zeros(len(graph.ids), np.bool_)
+    first[[vertices[0] for vertices, _ in found]] = True
+    branches = Branches(graph, first, eigenvalues)
+    moved = np.zeros(len(graph.ids), np.bool_)
+    for vertices, edges in found:
+        core, kept = vertices[~branches.vertices[vertices]], edges[~branches.edges[edges]]
+        used = bounded(len(core), np.searchsorted(core, graph.edges[kept]))
+        solution = _solve(graph.subgraph(core, kept[used]), settings)
+        history = solution.history
+        of_branches = float(branches.errors[edges].sum())
+        if of_branches:  # without which the solution begins
+            history = (history[0] + of_branches, *history)
+        before, after = history[0], history[-1]
+        history = history if after < before else (before,)
         if after < before:
-            poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
+            moved[vertices] = True
+            poses[core] = se3.orthonormalise(solution.poses[: len(core)])
             # Exactly as before, without rounding errors.
             poses[vertices[0]] = graph.poses[vertices[0]]
-        weights[edges[used]] = solution.weights[: used.sum()]
-        weights[edges[~used]] = _weights_of(graph.with_poses(poses), edges, used, weights, settings)
+        weights[kept[used]] = solution.weights[: used.sum()]
+        weights[kept[~used]] = _weights_of(graph.with_poses(poses), kept, used, weights, settings)
         histories.append(history)
         parts.append(
             GraphPart(
@@ -80,6 +92,7 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
                 before, history[-1], solution.converged,
             )
         )  # fmt: skip
+    branches.attach(poses, moved)
     return Optimisation(
         graph.with_poses(poses),
         added_up(histories),
@@ -89,29 +102,24 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     )
 
 
-def _solve(graph: PoseGraph, vertices: Intp, edges: Intp, settings: Settings) -> Solution:
-    """Solve one part; anchors are edges to one additional vertex, the last."""
-    number = np.full(len(graph.ids), -1)
-    number[vertices] = np.arange(len(vertices))
-    poses, pairs = graph.poses[vertices], number[graph.edges[edges]]
-    measured, information = graph.measurements[edges], graph.information[edges]
-    loop = graph.loop[edges]
-    if graph.anchors is not None and (number[graph.anchors.vertices] >= 0).any():
-        here = number[graph.anchors.vertices] >= 0
-        ends, Z = number[graph.anchors.vertices[here]], graph.anchors.poses[here]
+def _solve(graph: PoseGraph, settings: Settings) -> Solution:
+    """Solve a connected graph; anchors are edges to one additional vertex, the last."""
+    poses, pairs, loop = graph.poses, graph.edges, graph.loop
+    measured, information = graph.measurements, graph.information
+    if graph.anchors is not None:
+        ends, Z = graph.anchors.vertices, graph.anchors.poses
         frame = poses[ends[0]] @ se3.inverse(Z[0])
         poses = np.concatenate([poses, frame[None]])
-        more = np.stack([np.full(len(ends), len(vertices)), ends], axis=1)
+        more = np.stack([np.full(len(ends), len(graph.ids)), ends], axis=1)
         pairs = np.concatenate([pairs, more])
         measured = np.concatenate([measured, Z])
-        information = np.concatenate([information, graph.anchors.information[here]])
+        information = np.concatenate([information, graph.anchors.information])
         loop = np.append(loop, np.zeros(len(ends), bool))
     fixed = np.zeros(len(poses), bool)
     fixed[0] = True
     return solve(
         poses, pairs, measured, information,
-        loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
-        settings=settings,
+        loop=loop, fixed=fixed, gravity=graph.gravity, settings=settings,
     )  # fmt: skip
 
 
@@ -130,22 +138,6 @@ def _weights_of(
     accepted = edges[used & graph.loop[edges] & (weights[edges] > 0)]
     limit = max(settings.gate, float(chi2[accepted].max(initial=0.0)))
     return np.where(graph.loop[left_out] & (chi2[left_out] > limit), 0.0, 1.0)
-
-
-def _gravity_of(graph: PoseGraph, number: Intp) -> Gravity | None:
-    gravity = graph.gravity
-    if gravity is None:
-        return None
-    here = number[gravity.vertices] >= 0
-    if not here.any():
-        return None
-    return Gravity(
-        number[gravity.vertices[here]],
-        gravity.directions[here],
-        gravity.sigma[here],
-        gravity.world,
-        gravity.gate,
-    )
 
 
 def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
@@ -171,8 +163,11 @@ def added_up(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
     return tuple(float(sum(column)) for column in zip(*padded, strict=True)) if padded else (0.0,)
 
 
-def check_graph(graph: PoseGraph) -> None:
-    """Raise InputError for invalid poses, measurements or information."""
+def check_graph(graph: PoseGraph) -> Float64:
+    """Raise InputError for invalid poses, measurements or information.
+
+    Returns the (M, 6) eigenvalues of the information, ascending.
+    """
     check_motions(graph)
     bad = np.flatnonzero(~np.isfinite(graph.information).all((1, 2)))
     if len(bad):
@@ -185,6 +180,7 @@ def check_graph(graph: PoseGraph) -> None:
             raise InputError(
                 "the information matrix is not positive", where=f"pose graph, edge {i} {j}"
             )
+    return np.asarray(eigenvalues, np.float64)
 
 
 def check_motions(graph: PoseGraph) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.parts import part
-from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.graph import ROUNDING, Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
 from tofuse.posegraph.sparse import PairSystem
 
@@ -54,7 +54,8 @@ class LuMilios(Optimiser):
         """See `Optimiser.optimise`. Raises InputError for non-finite or non-positive input."""
         check_graph(graph)
         system = PairSystem(len(graph.ids), graph.edges)
-        best, history, converged = graph, [graph.chi2()], bool(system.fixed.all())
+        best, history = graph, [graph.chi2()]
+        converged = bool(system.fixed.all()) or history[0] <= ROUNDING * len(graph.edges)
         here = graph
         for _ in range(0 if converged else self.max_iterations):
             motion = solve_linear(here, system)
