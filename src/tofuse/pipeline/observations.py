@@ -30,7 +30,7 @@ _CHECKED_IMAGES = 60  # images that are compared with each other at the final po
 _COLUMNS = 200
 # Of the images of a place, all of this many are in the model, and ever fewer of the others: their
 # noise is averaged by then. Size of a place: rad, and fraction of the depth.
-_ENOUGH, _SAME_RAD, _SAME_PLACE = 64, 0.12, 0.06
+_ENOUGH, _SAME_RAD, _SAME_PLACE = 32, 0.12, 0.06
 
 
 class Observations:

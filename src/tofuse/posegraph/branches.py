@@ -90,7 +90,7 @@ class Branches:
         self.errors = np.zeros(len(graph.edges))
         self.errors[self.edges] = np.where(chi2 > ROUNDING, chi2, 0.0)
 
-    def covariances(self, covariances: Float64) -> None:
+    def fill_covariances(self, covariances: Float64) -> None:
         """Replace the covariances (N, 6, 6) of poses in branches by those that follow from others.
 
         Those of right perturbations: C_child = A C_parent A^T + C_edge, with the adjoint A of

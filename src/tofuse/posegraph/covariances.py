@@ -90,7 +90,7 @@ class GraphCovariances:
             out[core] = factor.covariances()[: len(core)]
         except RuntimeError:
             return out
-        branches.covariances(out)
+        branches.fill_covariances(out)
         out[self._part != self._part[self.origin]] = np.nan
         return out
 
