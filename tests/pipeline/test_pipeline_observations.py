@@ -1,0 +1,30 @@
+"""What is stored of the frames of a long recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from made_rooms import at, seen
+from tofuse.odometry.base import Step
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.observations import Observations
+
+
+def test_images_of_a_camera_that_stays_are_thinned_in_the_model() -> None:
+    observations = Observations(from_method("default"), 0, ())
+    frame = seen(at(0, 0, 0), 0)
+    for index in range(100):
+        here = replace(frame, index=index)
+        observations.add_to_model(here, here, Step("tracked", "", at(0, 0, 0)))
+    # The first 32, every second one of the next 64, and every fourth one of the other 4.
+    assert observations.for_back_end().model.views == 65
+
+
+def test_images_of_a_camera_that_moves_on_are_all_in_the_model() -> None:
+    observations = Observations(from_method("default"), 0, ())
+    frame = seen(at(0, 0, 0), 0)
+    for index in range(100):
+        T = at(0, 0, 0.06 * index)
+        here = replace(frame, index=index)
+        observations.add_to_model(here, here, Step("tracked", "", T))
+    assert observations.for_back_end().model.views == 100
