@@ -49,13 +49,13 @@ class ModelBuilder:
     options
         How views are fused.
     spill
-        The store of views; by default half of the memory for voxels, the rest on disk.
+        The store of views; by default a sixth of the memory for voxels, the rest on disk.
     """
 
     def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
         self._options = options
         if spill is None:
-            spill = Spill(options.memory_mb * 500_000)
+            spill = Spill(options.memory_mb * 1_000_000 // 6)
         self._ranges = StoredViews(spill)
         self._clouds = StoredClouds(spill)
         self._bytes = 0

@@ -12,6 +12,7 @@ from tofuse.arrays import Float64, Intp
 from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.evaluation.cross_view import CrossViewConsistency, cross_view_consistency
 from tofuse.evaluation.trajectory import displacement
+from tofuse.files.memory import give_back
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.fusion.pose_errors import with_pose_errors
@@ -191,6 +192,7 @@ class BackEnd:
         result = work()
         with self._watch.timing("keeping"):
             stages.save(name, (result, dict(self._watch.seconds)))
+        give_back()
         return result
 
     def _close_loops(self) -> Optimised:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 # Fractions of the total. The rest is the program itself (some 400 MB), frames being processed, what
 # stages compute from stored views, and the result.
-_VOXELS, _VIEWS = 0.3, 0.15
+_VOXELS, _VIEWS = 0.3, 0.05
 
 
 def voxels_mb(memory_mb: int) -> int:
-    """Return the memory of fusion for voxels, MB, see `Fusion.memory_mb`: images get half of it."""
+    """Return the memory of fusion for voxels, MB, see `Fusion.memory_mb`: images get a sixth of it."""
     return max(1, int(_VOXELS * memory_mb))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.corrections.raw_amplitude import range_and_amplitude
 from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.memory import give_back
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
@@ -133,6 +135,9 @@ def run(
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
+            # What was stored of the frames is in cycles.
+            gc.collect()
+            give_back()
             # BLAS sums differ with its number of threads, and its threads wait by spinning.
             with threadpool_limits(1):
                 write_result(
