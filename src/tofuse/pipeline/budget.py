@@ -8,7 +8,7 @@ _VOXELS, _VIEWS = 0.3, 0.05
 
 
 def voxels_mb(memory_mb: int) -> int:
-    """Return the memory of fusion for voxels, MB, see `Fusion.memory_mb`: images get a sixth of it."""
+    """Return the memory of fusion for voxels, MB; see `Fusion.memory_mb`."""
     return max(1, int(_VOXELS * memory_mb))
 
 
