@@ -35,6 +35,13 @@ def test_images_are_thinned_evenly() -> None:
     assert (np.diff(steps) >= 0).all()
 
 
+def test_noise_of_a_still_camera_does_not_divide_its_place() -> None:
+    rng = np.random.default_rng(0)
+    places = PlaceCounts(0.12, 0.06, 8)
+    noise = 0.002 * rng.standard_normal((248, 6))
+    assert sum(places.keeps(2.0, se3.exp(x)) for x in noise) == 8 * 5
+
+
 def test_places_are_apart_by_position_direction_depth_and_component() -> None:
     places = PlaceCounts(0.1, 0.1, 4)
     here = turned(0.05)

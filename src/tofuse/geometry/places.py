@@ -46,7 +46,8 @@ class PlaceCounts:
         # Not the depth itself, which changes with every image.
         octave = round(math.log2(max(depth, 1e-3)))
         T, size = T_component_camera, self.distance * 2.0**octave
-        cell = np.floor(np.concatenate([T[:3, 3] / size, T[:3, 2] / self.angle]))
+        # A component begins in the middle of a cell: a camera that stays there is in one place.
+        cell = np.rint(np.concatenate([T[:3, 3] / size, T[:3, 2] / self.angle]))
         place = np.append(cell, [octave, component]).astype(np.int64).tobytes()
         count = self._count.get(place, 0)
         self._count[place] = count + 1

@@ -12,7 +12,6 @@ from tofuse.files.spill import Scratch
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.geometry.places import PlaceCounts
 from tofuse.odometry.base import Step
 from tofuse.pipeline.backend import BackEndInput
 from tofuse.pipeline.budget import views_bytes
@@ -29,8 +28,8 @@ _CHECKED_IMAGES = 60  # images that are compared with each other at the final po
 # Width of stored views: more pixels do not improve loops and refinement.
 _COLUMNS = 200
 # Of the images of a place, all of this many are in the model, and ever fewer of the others: their
-# noise is averaged by then. Size of a place: rad, and fraction of the depth.
-_ENOUGH, _SAME_RAD, _SAME_PLACE = 32, 0.12, 0.06
+# noise is averaged by then.
+_ENOUGH = 32
 
 
 class Observations:
@@ -54,7 +53,7 @@ class Observations:
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
-        self._places = PlaceCounts(_SAME_RAD, _SAME_PLACE, _ENOUGH)
+        self._places = Spacing(enough=_ENOUGH).places()
         self._checks = _EvenSample(_CHECKED_IMAGES)
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None

@@ -108,11 +108,16 @@ class GraphCovariances:
 
     def _factor(self, branches: Branches) -> tuple[Intp, Factor | None]:
         """Return the vertices in no branch, and the factor of their normal equations."""
-        core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
-        chosen = bounded(len(core), np.searchsorted(core, self.graph.edges[edges]))
-        graph = self.graph.subgraph(core, edges[chosen])
+        core, edges = _core(self.graph, branches)
+        graph = self.graph.subgraph(core, edges)
         problem = _problem(graph, self._fixed[core])
         return core, problem.factor(graph.poses, np.ones(len(graph.edges)))
+
+
+def _core(graph: PoseGraph, branches: Branches) -> tuple[Intp, Intp]:
+    """Return the vertices in no branch, and those of their edges that `bounded` chooses."""
+    core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
+    return core, edges[bounded(len(core), np.searchsorted(core, graph.edges[edges]))]
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
@@ -132,8 +137,7 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     odometry = graph.edges[~graph.loop]
     fixed, part = first_of_parts(n, odometry), parts_of(n, odometry)
     branches = Branches(graph, fixed)
-    core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
-    edges = edges[bounded(len(core), np.searchsorted(core, graph.edges[edges]))]
+    core, edges = _core(graph, branches)
     out = np.full(len(graph.edges), np.nan)
     loops = edges[graph.loop[edges]]
     i, j = graph.edges[loops].T

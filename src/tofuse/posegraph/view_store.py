@@ -138,6 +138,10 @@ class Spacing:
     loosest: float = 4.0
     enough: int = 16
 
+    def places(self) -> PlaceCounts:
+        """Return counts of the places that are as wide as the largest required motion."""
+        return PlaceCounts(self.loosest * self.angle, self.loosest * self.distance, self.enough)
+
 
 class Storable(Protocol):
     """What is kept of a view."""
@@ -241,8 +245,7 @@ class ViewStore(Generic[V]):
         self._spacing, self._always = spacing, frozenset(always)
         self._spill: Spill[V] = scratch.part(1 - _FOR_OUTLINES)
         self._stretch = 1.0
-        s = spacing
-        self._places = PlaceCounts(s.loosest * s.angle, s.loosest * s.distance, s.enough)
+        self._places = spacing.places()
         # Where the last view would be if places were not thinned.
         self._last: tuple[Float64, int] | None = None
 
