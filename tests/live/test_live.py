@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -28,7 +29,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
 from tofuse.live.device import DeviceError, Stream, device, devices, is_installed
 from tofuse.live.player import Player
-from tofuse.live.recorder import record
+from tofuse.live.recorder import QUEUE_FRAMES, record
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -233,14 +234,15 @@ def test_record_rejects_non_empty_folder(install: Install, tmp_path: Path) -> No
 
 
 class Endless(Stream):
-    """Sends every requested frame immediately."""
+    """Sends every requested frame immediately, and says when it has sent many."""
 
-    def __init__(self, settings: Any, frames: int) -> None:
-        self.settings, self.left = settings, frames
+    def __init__(self, settings: Any, many: int) -> None:
+        self.settings, self.many = settings, many
+        self.sent_many = threading.Event()
 
     def read(self, index: int) -> RangeFrame:
-        if index >= self.left:
-            raise DeviceError("was pulled out")
+        if index >= self.many:
+            self.sent_many.set()
         return RangeFrame(
             index, index / 30, self.settings.camera, depth_counts(0) * np.float32(0.001)
         )
@@ -252,10 +254,14 @@ class Endless(Stream):
 def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense())
     with device("realsense", {}).open() as camera:
-        stream = Endless(camera.settings, 5000)
-    done = record(stream, tmp_path / "a", frames=100)
+        stream = Endless(camera.settings, many=3 * QUEUE_FRAMES)
+
+    def wait_for_disk(frames: int) -> None:
+        assert stream.sent_many.wait(60)
+
+    done = record(stream, tmp_path / "a", frames=100, progress=wait_for_disk)
     assert done.frames == 100
-    assert done.dropped > 0
+    assert done.dropped >= 2 * QUEUE_FRAMES - 1  # one is written, and the queue is full
     indices = np.rint(tofuse.open(tmp_path / "a").timestamps * 30)
     assert (np.diff(indices) >= 1).all()
     assert indices[-1] > 99  # dropped frames leave a gap in the timestamps
