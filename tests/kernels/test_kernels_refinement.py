@@ -8,34 +8,18 @@ import numpy as np
 import pytest
 
 from corner_views import SHARP, corner, unpack
+from pair_equations import KNOWN, pair_equations
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels.alignment import Residuals
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import points_of
 
-KNOWN = np.ones(kernels.ERRORS, np.int64)
 SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
 
 
 def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
-    out = np.empty(kernels.SIZE)
-    surface = prepare_view(target, SHARP)
-    seen = prepare_view(source, SHARP)
-    kernels.pair_equations(
-        points_of(seen, 1),
-        surface.target_image,
-        np.ascontiguousarray(T),
-        Residuals(*settings),
-        kernels.CameraErrors(
-            np.zeros(kernels.ERRORS) if errors is None else errors,
-            known,
-            seen.measures_range,
-            surface.measures_range,
-        ),
-        out,
-    )
-    return out
+    points = points_of(prepare_view(source, SHARP), 1)
+    return pair_equations(points, prepare_view(target, SHARP), T, settings, errors, known)[0]
 
 
 @pytest.fixture
@@ -164,3 +148,37 @@ def test_overlap_counts_points_seen_from_same_side(pair):
     assert share(aside, least=share(aside) + 0.01) == 0
     # Entirely behind the target's surface, so there is no overlap.
     assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05
+
+
+@pytest.mark.parametrize("known", [KNOWN, np.array([0, 1, 0])])
+def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
+    source, target, T = pair
+    errors = np.where(known, 0.0, 0.01)
+    poses = np.stack([T, T @ se3.exp(np.full(6, 0.01))])
+    views = [prepare_view(view, SHARP) for view in (source, target)]
+    points = [points_of(view, 1) for view in views]
+    ends = np.cumsum([0, *map(len, points)])
+    scales = np.array([0.05, 0.0]), np.array([1.0, 2.0]), np.array([0.1, 0.2])
+    found = np.empty((2, kernels.SIZE))
+    kernels.target_equations(
+        kernels.SourcePoints(
+            np.concatenate(points),
+            np.zeros(ends[-1], np.int64),
+            ends[:-1],
+            ends[1:],
+            np.zeros(2, bool),
+        ),
+        np.array([1, 0]),
+        views[1].target_image,
+        poses,
+        kernels.PairResiduals(*scales, *SETTINGS[3:]),
+        errors,
+        known,
+        views[1].measures_range,
+        found,
+        np.empty((2, 0, kernels.PATCH_SIZE)),
+    )
+    for k, of in enumerate((target, source)):
+        settings = (*(scale[k] for scale in scales), *SETTINGS[3:])
+        alone = evaluate(of, target, poses[k], errors, known, settings)
+        np.testing.assert_array_equal(found[k], alone)

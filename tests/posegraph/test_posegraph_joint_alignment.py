@@ -56,6 +56,15 @@ def test_only_given_pairs_are_compared(swing):
     np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
 
 
+def test_result_keeps_no_equations_in_memory(swing):
+    views, truth = swing
+    found = refine(views, drifted(truth), OPTIONS)
+    assert found.before.terms.sum() > 0
+    for support in (found.before, found.after):
+        for array in (support.target, support.source, support.good, support.terms):
+            assert array.base is None
+
+
 def test_result_is_independent_of_threads(swing):
     views, truth = swing
     results = []

@@ -9,10 +9,10 @@ import pytest
 
 from aligned_surfaces import path
 from corner_views import SHARP, corner, unpack
+from pair_equations import pair_equations
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels import shared_error as patch_kernels
-from tofuse.kernels.alignment import Residuals
+from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import RefineOptions, refine
 from tofuse.posegraph.view_store import KeptView
@@ -43,14 +43,15 @@ def pair():
 
 
 def sums_of(source, target, T):
-    sums = np.empty((shared_error.PATCHES, patch_kernels.PATCH_SIZE))
-    surface = target.surface
-    patch_kernels.patch_sums(source.points, source.patches, surface.target_image, T, *WIDE, sums)
-    row = np.empty(kernels.SIZE)
-    residuals = Residuals(0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
-    none, known = np.zeros(kernels.ERRORS), np.ones(kernels.ERRORS, np.int64)
-    camera = kernels.CameraErrors(none, known, False, False)
-    kernels.pair_equations(source.points, surface.target_image, T, residuals, camera, row)
+    residuals = (0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
+    row, sums = pair_equations(
+        source.points,
+        target.surface,
+        T,
+        residuals,
+        patches=source.patches,
+        count=shared_error.PATCHES,
+    )
     return sums, row
 
 
@@ -74,7 +75,7 @@ def test_sums_of_patches_match_normal_equations(pair):
     source, target, T = pair
     sums, row = sums_of(source, target, T)
     H, g = unpack(row)
-    response = sums[:, patch_kernels.RESPONSE :]
+    response = sums[:, kernels.PATCH_RESPONSE :]
     # One patch for each point would give all of H; here only the mean of each patch counts.
     R = response / np.sqrt(np.maximum(sums[:, :1], 1e-12))
     assert np.linalg.eigvalsh(H[:6, :6] - R.T @ R).min() > -1e-6 * np.trace(H)
@@ -82,11 +83,16 @@ def test_sums_of_patches_match_normal_equations(pair):
     single = KeptView(source.surface, source.points[middle : middle + 1])
     one, row = sums_of(single, target, T)
     H, g = unpack(row)
-    (k,) = np.flatnonzero(one[:, patch_kernels.WEIGHT])
+    (k,) = np.flatnonzero(one[:, kernels.PATCH_WEIGHT])
     weight, r, J = one[k, 0], one[k, 1] / one[k, 0], one[k, 2:] / one[k, 0]
     expected = weight * np.outer(J, J)
     np.testing.assert_allclose(H[:6, :6], expected, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_allclose(g[:6], weight * r * J, atol=1e-5 * np.abs(weight * r * J).max())
+
+
+def discount(sums, alike, variance, row):
+    which = np.array([0])
+    discount_shared_errors(sums[None], alike, np.array([variance]), which, row[None])
 
 
 def test_kernel_eliminates_one_unknown_per_patch(pair):
@@ -100,14 +106,14 @@ def test_kernel_eliminates_one_unknown_per_patch(pair):
     H[:6, :6] -= M.T @ np.linalg.solve(big, M)
     g[:6] -= M.T @ np.linalg.solve(big, h)
     allowed = row.copy()
-    patch_kernels.discount_shared_errors(sums, alike, variance, allowed)
+    discount(sums, alike, variance, allowed)
     found_H, found_g = unpack(allowed)
     np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
     np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
     # Counts are unchanged, and without errors everything is.
     np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
     same = row.copy()
-    patch_kernels.discount_shared_errors(sums, alike, 0.0, same)
+    discount(sums, alike, 0.0, same)
     np.testing.assert_allclose(same, row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
 
 

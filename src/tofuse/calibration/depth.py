@@ -227,7 +227,6 @@ def _solve(
     believed = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
     size = many + 3 * len(views)
     n = len(measured)
-    covariance = np.zeros((many, many))
     scale = 1.0
     for _ in range(_ROUNDS):
         true = 1 / np.einsum("nc,nc->n", planes[which], rays)
@@ -276,8 +275,10 @@ def _solve(
         if fixed is None:
             alone = (by_pixel @ (target - A @ step)) / total
             offsets = alone - mean_weight * alone.sum() / total
-            inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
-            covariance = (inverse * unit[:, None] * unit)[:many, :many]
+    covariance = np.zeros((many, many))
+    if fixed is None:
+        inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
+        covariance = (inverse * unit[:, None] * unit)[:many, :many]
     weights = (np.bincount(left, minlength=many) + 1e-9).astype(np.float64)
     rest = np.eye(many) - _mean_and_slope_basis(knots) @ _mean_and_slope_projector(
         knots, np.ones(many)

@@ -18,7 +18,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import project_ray
+from tofuse.kernels.projection import project_ray, project_rays
 
 # Columns of a source point: position in m, unit normal, sigma of z relative to z, log albedo
 # (NaN where unknown) and its gradient with respect to the position, 1/m.
@@ -217,18 +217,19 @@ def project_block(
 ) -> int:
     """Fetch the target pixels that the points of a block project to; returns how many have one."""
     rows, columns = target.shape[0], target.shape[1]
+    u, v = np.empty(LANES), np.empty(LANES)
+    xn, yn = block[_XN * LANES : (_XN + 1) * LANES], block[_YN * LANES : (_YN + 1) * LANES]
+    project_rays(xn, yn, lookup, lookup_frame, u, v)
     landed = 0
     for k in range(LANES):
         block[SEEN * LANES + k] = 0
-        if k >= count or not block[_Z * LANES + k] > _MIN_DEPTH:
+    for k in range(count):
+        if not block[_Z * LANES + k] > _MIN_DEPTH:
             continue
-        u, v, iu, _ = project_ray(
-            block[_XN * LANES + k], block[_YN * LANES + k], lookup, lookup_frame
-        )
-        if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+        if not (u[k] > -0.5 and v[k] > -0.5 and u[k] < columns - 0.5 and v[k] < rows - 0.5):
             continue
         landed += 1
-        pixel = target[int(v + 0.5), int(u + 0.5)]
+        pixel = target[np.uint32(v[k] + 0.5), np.uint32(u[k] + 0.5)]
         if pixel[DISTANCE] > 0:
             block[SEEN * LANES + k] = 1
             for c in range(PIXEL_SIZE):

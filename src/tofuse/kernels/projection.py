@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
 
@@ -40,6 +42,48 @@ def project_ray(
         (1 - au) * lookup[j + 1, i, 1] + au * lookup[j + 1, i + 1, 1]
     )
     return u, v, i, j
+
+
+@kernel
+def project_rays(
+    x: Float32, y: Float32, lookup: Float32, lookup_frame: Float64, u: Float64, v: Float64
+) -> None:
+    """Project N rays as `project_ray` does, in loops without branches, which can use SIMD.
+
+    Parameters
+    ----------
+    x, y
+        (N,) ray coordinates.
+    lookup, lookup_frame
+        As for `project_ray`.
+    u, v
+        (N,) are overwritten by the pixels, NaN for rays outside the grid.
+    """
+    table = lookup.reshape(-1)
+    cell = np.empty(len(x), np.int32)
+    last_u, last_v = np.float64(lookup.shape[1] - 1), np.float64(lookup.shape[0] - 1)
+    row = np.int32(2 * lookup.shape[1])
+    for k in range(len(x)):
+        fu = (np.float64(x[k]) - lookup_frame[0]) * lookup_frame[2]
+        fv = (np.float64(y[k]) - lookup_frame[1]) * lookup_frame[3]
+        inside = (fu >= 0) & (fv >= 0) & (fu < last_u) & (fv < last_v)
+        fu = fu if inside else 0.0
+        fv = fv if inside else 0.0
+        i, j = np.int32(fu), np.int32(fv)
+        cell[k] = j * row + 2 * i
+        u[k] = fu - i if inside else np.nan
+        v[k] = fv - j
+    for k in range(len(x)):
+        a = np.uint64(cell[k])
+        b = a + np.uint64(row)
+        au, av = u[k], v[k]
+        u[k] = (1 - av) * ((1 - au) * table[a] + au * table[a + np.uint64(2)]) + av * (
+            (1 - au) * table[b] + au * table[b + np.uint64(2)]
+        )
+        a, b = a + np.uint64(1), b + np.uint64(1)
+        v[k] = (1 - av) * ((1 - au) * table[a] + au * table[a + np.uint64(2)]) + av * (
+            (1 - au) * table[b] + au * table[b + np.uint64(2)]
+        )
 
 
 @kernel

@@ -12,21 +12,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64, Int64
+from tofuse.arrays import Bool, Float32, Float64, Int64
 from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
     BINS,
     COUNT_P,
     DISTANCE,
+    FITS,
     INLIERS,
+    JACOBIAN,
     LANES,
+    MISFIT,
     NORMAL,
     PLANE,
     POINT,
     POINT_ALBEDO,
     POINT_ALBEDO_SLOPE,
     RATIO,
+    ROOT,
     ROWS,
     SEEN,
     SIGMA,
@@ -71,6 +75,12 @@ SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweig
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
+# Layout of the sums of a patch: of w, w r and w J.
+PATCH_WEIGHT = 0
+PATCH_RESIDUAL = 1
+PATCH_RESPONSE = 2
+PATCH_SIZE = 8
+
 
 class CameraErrors(NamedTuple):
     """Systematic errors of the cameras of a pair.
@@ -89,6 +99,48 @@ class CameraErrors(NamedTuple):
     known: Int64
     radial_source: bool
     radial_target: bool
+
+
+class SourcePoints(NamedTuple):
+    """Points of N views, which are compared with those of others.
+
+    Attributes
+    ----------
+    points
+        (M, POINT_SIZE), see `alignment`.
+    patches
+        (M,) patch of the image that each point belongs to, see `shared_error`; (0,) if no sums over
+        patches are computed.
+    begin, end
+        (N,) first row of the points of each view, and the row after its last.
+    measures_range
+        (N,) whether the camera of each view measures radial range, and not z.
+    """
+
+    points: Float32
+    patches: Int64
+    begin: Int64
+    end: Int64
+    measures_range: Bool
+
+
+class PairResiduals(NamedTuple):
+    """`Residuals` of K pairs, of which each has its exposure and its scales.
+
+    Attributes
+    ----------
+    exposure, scale_g, scale_p
+        (K,) each.
+    inflation, robust, min_cosine
+        Of all pairs.
+    """
+
+    exposure: Float64
+    scale_g: Float64
+    scale_p: Float64
+    inflation: float
+    robust: float
+    min_cosine: float
 
 
 @kernel
@@ -121,23 +173,17 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool, known: 
 
 
 @kernel
-def pair_equations(
+def _pair_equations(
     points: Float32,
+    patches: Int64,
     target: TargetImage,
     T: Float64,
     residuals: Residuals,
     camera: CameraErrors,
     out: Float64,
+    sums: Float64,
 ) -> None:
-    """Sum the normal equations of one pair into `out` (SIZE,), which is overwritten.
-
-    Parameters
-    ----------
-    points, T
-        As in `alignment.accumulate`.
-    target, residuals, camera
-        Of the pair.
-    """
+    """Sum the normal equations of one pair, see `target_equations`."""
     errors, known, radial_source, radial_target = camera
     out[:] = 0.0
     unknowns = UNKNOWNS
@@ -145,7 +191,7 @@ def pair_equations(
         unknowns -= 1
     asked = unknowns - 7
     if asked == 0:
-        _pose_equations(points, target, T, residuals, out)
+        _pose_equations(points, patches, target, T, residuals, out, sums)
         return
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
@@ -279,8 +325,64 @@ def pair_equations(
 
 
 @kernel
+def target_equations(
+    sources: SourcePoints,
+    which: Int64,
+    target: TargetImage,
+    T: Float64,
+    residuals: PairResiduals,
+    errors: Float64,
+    known: Int64,
+    radial_target: bool,
+    out: Float64,
+    sums: Float64,
+) -> None:
+    """Sum the normal equations of the K pairs of one target.
+
+    Parameters
+    ----------
+    sources, which
+        Points of all views, and the (K,) views that are compared with the target.
+    target
+        The target.
+    T
+        (K, 4, 4) T_target_source.
+    residuals
+        Of these pairs.
+    errors, known, radial_target
+        As in `CameraErrors`.
+    out
+        (K, SIZE), is overwritten.
+    sums
+        (K, patches, PATCH_SIZE) is overwritten by the sums of the distances' equations over each
+        patch. With 0 patches, and with errors of the camera, they are not computed.
+    """
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    sums[:] = 0.0
+    for k in range(len(which)):
+        view = which[k]
+        begin, end = sources.begin[view], sources.end[view]
+        _pair_equations(
+            sources.points[begin:end],
+            sources.patches[begin:end],
+            target,
+            T[k],
+            Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine),
+            CameraErrors(errors, known, sources.measures_range[view], radial_target),
+            out[k],
+            sums[k],
+        )
+
+
+@kernel
 def _pose_equations(
-    points: Float32, target: TargetImage, T: Float64, residuals: Residuals, out: Float64
+    points: Float32,
+    patches: Int64,
+    target: TargetImage,
+    T: Float64,
+    residuals: Residuals,
+    out: Float64,
+    sums: Float64,
 ) -> None:
     """Do the same without camera errors, vectorised in blocks as in `alignment`."""
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
@@ -288,7 +390,7 @@ def _pose_equations(
     block = np.zeros(ROWS * LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
     products, support = 36, 36 + SQUARES_G - INLIERS
-    sums = np.zeros((36 + COUNT_P + 1 - INLIERS, LANES))
+    total = np.zeros((36 + COUNT_P + 1 - INLIERS, LANES))
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
@@ -299,40 +401,55 @@ def _pose_equations(
             if block[SEEN * LANES + k] > 0:
                 out[COMPARED] += 1
                 out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
-        add_products(sums, block, 8)
-        _add_cubes(sums[support], block, WEIGHT_G)
+        if len(sums) > 0:
+            _add_patches(sums, block, patches[first : first + count])
+        add_products(total, block, 8)
+        _add_cubes(total[support], block, WEIGHT_G)
         if scale_p > 0:
             compare_albedos(block, T, exposure, scale_p, robust)
-            add_products(sums, block, 8)
-            _add_cubes(sums[support], block, ALBEDO_WEIGHT)
+            add_products(total, block, 8)
+            _add_cubes(total[support], block, ALBEDO_WEIGHT)
         for which in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
             place = which - INLIERS
-            total = sums[products + place]
+            column = total[products + place]
             row = block[(STAT + place) * LANES : (STAT + place + 1) * LANES]
             for k in range(LANES):
-                total[k] += row[k]
+                column[k] += row[k]
     width = LANES
     while width > 1:
         width //= 2
-        for q in range(len(sums)):
-            low, high = sums[q, :width], sums[q, width:]
+        for q in range(len(total)):
+            low, high = total[q, :width], total[q, width:]
             for k in range(width):
                 low[k] += high[k]
     q, place = 0, H
     for p in range(8):
         for o in range(p, 8):
             if p < 7 and o < 7:
-                out[place] = sums[q, 0]
+                out[place] = total[q, 0]
                 place += 1
             elif p < 7:
-                out[G + p] = sums[q, 0]
+                out[G + p] = total[q, 0]
             q += 1
         place += ERRORS  # products with the camera errors, which stay 0
-    out[IN_FRONT] = sums[products + FRONT - INLIERS, 0]
-    out[WEIGHT_P] = sums[products + ALBEDO_WEIGHT - INLIERS, 0]
-    out[SQUARES_P] = sums[products + ALBEDO_SQUARES - INLIERS, 0]
-    out[TERMS] = out[COMPARED] + sums[products + COUNT_P - INLIERS, 0]
-    out[SUPPORT] = sums[support, 0]
+    out[IN_FRONT] = total[products + FRONT - INLIERS, 0]
+    out[WEIGHT_P] = total[products + ALBEDO_WEIGHT - INLIERS, 0]
+    out[SQUARES_P] = total[products + ALBEDO_SQUARES - INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[products + COUNT_P - INLIERS, 0]
+    out[SUPPORT] = total[support, 0]
+
+
+@kernel
+def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
+    """Add the weighted residuals and Jacobians of the distances of a block to their patches."""
+    for k in range(len(patches)):
+        if block[FITS * LANES + k] > 0:
+            root = np.float64(block[ROOT * LANES + k])
+            patch = sums[patches[k]]
+            patch[PATCH_WEIGHT] += root * root
+            patch[PATCH_RESIDUAL] += root * block[MISFIT * LANES + k]
+            for p in range(6):
+                patch[PATCH_RESPONSE + p] += root * block[(JACOBIAN + p) * LANES + k]
 
 
 @kernel

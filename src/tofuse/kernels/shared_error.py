@@ -10,92 +10,44 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64, Int64
-from tofuse.kernels.alignment import (
-    FITS,
-    JACOBIAN,
-    LANES,
-    MISFIT,
-    ROOT,
-    ROWS,
-    TargetImage,
-    compare_planes,
-    load_block,
-    project_block,
-    transform_block,
-)
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.refinement import UNKNOWNS, G, H
-
-# Of each patch: sums of w, w r and w J.
-WEIGHT = 0
-RESIDUAL = 1
-RESPONSE = 2
-PATCH_SIZE = 8
+from tofuse.kernels.refinement import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS, G, H
 
 
 @kernel
-def patch_sums(
-    points: Float32,
-    patch: Int64,
-    target: TargetImage,
-    T: Float64,
-    scale_g: float,
-    robust: float,
-    min_cosine: float,
-    out: Float64,
+def discount_shared_errors(
+    sums: Float64, alike: Float64, variance: Float64, which: Int64, rows: Float64
 ) -> None:
-    """Sum the weighted residuals and Jacobians of each patch into `out` (patches, PATCH_SIZE).
-
-    Parameters
-    ----------
-    points, target, T, scale_g, robust, min_cosine
-        As in `alignment.accumulate` and its `Residuals`.
-    patch
-        (N,) index of the patch of each point.
-    """
-    image, lookup, lookup_frame = target
-    out[:] = 0.0
-    block = np.zeros(ROWS * LANES, np.float32)
-    for first in range(0, len(points), LANES):
-        count = min(LANES, len(points) - first)
-        load_block(block, points[first : first + count])
-        transform_block(block, T)
-        project_block(block, count, image, lookup, lookup_frame)
-        compare_planes(block, T, scale_g, 0.0, robust, min_cosine)
-        for k in range(count):
-            if not block[FITS * LANES + k] > 0:
-                continue
-            root = np.float64(block[ROOT * LANES + k])
-            total = out[patch[first + k]]
-            total[WEIGHT] += root * root
-            total[RESIDUAL] += root * block[MISFIT * LANES + k]
-            for p in range(6):
-                total[RESPONSE + p] += root * block[(JACOBIAN + p) * LANES + k]
-
-
-@kernel
-def discount_shared_errors(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
-    """Marginalise the patches' shared errors in the normal equations of a pair, in place.
+    """Marginalise the patches' shared errors in the normal equations of pairs, in place.
 
     Parameters
     ----------
     sums
-        (K, PATCH_SIZE), see `patch_sums`.
+        (N, patches, PATCH_SIZE), see `refinement.target_equations`.
     alike
-        (K, K) correlation of the errors of patches.
+        (patches, patches) correlation of the errors of patches.
     variance
-        Variance of these errors, m^2.
-    row
-        (SIZE,) equations of the pair, see `refinement`; updated.
+        (K,) variances of these errors, m^2.
+    which
+        (K,) pairs.
+    rows
+        (N, SIZE) equations of the pairs, see `refinement`; updated.
     """
+    for k in range(len(which)):
+        _discount(sums[which[k]], alike, variance[k], rows[which[k]])
+
+
+@kernel
+def _discount(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
+    """Do so for one pair."""
     count = len(sums)
     R = np.zeros((count, 7))
-    root = np.sqrt(sums[:, WEIGHT])
+    root = np.sqrt(sums[:, PATCH_WEIGHT])
     for k in range(count):
         if root[k] > 0:
             for p in range(7):
-                R[k, p] = sums[k, RESIDUAL + p] / root[k]
+                R[k, p] = sums[k, PATCH_RESIDUAL + p] / root[k]
     # Cholesky factor L of 1 + D^1/2 K D^1/2, row by row, and Z with L Z = R.
     L = np.zeros((count, count))
     Z = np.zeros((count, 7))

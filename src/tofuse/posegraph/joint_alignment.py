@@ -17,9 +17,9 @@ import numpy as np
 from tofuse.arrays import Float64, Int64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels import shared_error as patch_kernels
 from tofuse.kernels import steps
-from tofuse.kernels.alignment import Residuals
+from tofuse.kernels.alignment import POINT_SIZE
+from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import robust, shared_error
 from tofuse.posegraph.descent import vertical
@@ -211,7 +211,7 @@ class Bodies:
 
 @dataclass(eq=False)
 class _Pairs:
-    """Directed pairs, the scales of each, and its latest normal equations."""
+    """Directed pairs, the scales of each, and its latest normal equations: whole, and by patch."""
 
     target: Intp
     source: Intp
@@ -220,7 +220,9 @@ class _Pairs:
     scale_p: Float64
     max_scale: Float64
     system: PairSystem
+    sources: kernels.SourcePoints
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
+    sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
 
 
 def refine(
@@ -269,8 +271,9 @@ def refine(
     half = len(state.target) // 2
     pairs = np.stack([state.target[:half], state.source[:half]], 1)
     last = options.rounds[-1]
-    after = _support(views, poses, errors, known, state, last, options)
-    if not calibrate:
+    by_patch = not calibrate and _depends_on_patches(state, options)
+    after = _support(views, poses, errors, known, state, last, options, by_patch=by_patch)
+    if by_patch:
         _allow_for_shared(views, poses, state, options)
     measured = _pairwise_measurements(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
@@ -334,8 +337,10 @@ def align_views(
             state = _directed(views, near, options, state, priors, bodies)
             since = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
-            _evaluate(views, poses, errors, known, state, stage, options)
-            if stage is options.rounds[-1] and not calibrate:
+            last = stage is options.rounds[-1] and not calibrate
+            by_patch = last and _depends_on_patches(state, options)
+            _evaluate(views, poses, errors, known, state, stage, options, by_patch=by_patch)
+            if by_patch:
                 _allow_for_shared(views, poses, state, options)
             step, change = _solve(poses, state, known, priors, bodies)
             poses = _moved(poses, step, bodies)
@@ -526,7 +531,9 @@ def _moved(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
 def _no_pairs() -> _Pairs:
     none, nothing = np.zeros(0, np.intp), np.zeros(0)
     system = PairSystem(1, none.reshape(0, 2))
-    return _Pairs(none, none, nothing, nothing, nothing, nothing, system)
+    return _Pairs(
+        none, none, nothing, nothing, nothing, nothing, system, _sources([], by_patch=False)
+    )
 
 
 def _directed(
@@ -549,14 +556,32 @@ def _directed(
     first = np.arange(count) == 0
     system = PairSystem(count, np.concatenate([ends, priors.pairs]), fixed=first)
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
-    state = _Pairs(target, source, *unknown, max_scale[source], system)
     photometric = np.array([v.surface.has_albedo for v in views]) & options.photometric
+    sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
+    state = _Pairs(target, source, *unknown, max_scale[source], system, sources)
     state.scale_p[~(photometric[target] & photometric[source])] = 0.0
     row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
     old = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
     for name in ("exposure", "scale_g", "scale_p"):
         getattr(state, name)[old >= 0] = getattr(before, name)[old[old >= 0]]
     return state
+
+
+def _sources(views: Sequence[KeptView], *, by_patch: bool) -> kernels.SourcePoints:
+    """Points of views; of those that occur several times only once."""
+    different = {id(v): v for v in views}
+    row = {key: k for k, key in enumerate(different)}
+    of = np.array([row[id(v)] for v in views], np.intp)
+    points = [np.zeros((0, POINT_SIZE), np.float32), *(v.points for v in different.values())]
+    patches = [v.patches for v in different.values()] if by_patch else []
+    ends = np.cumsum([len(p) for p in points])
+    return kernels.SourcePoints(
+        np.concatenate(points),
+        np.concatenate([np.zeros(0, np.int64), *patches]),
+        ends[of],
+        ends[of + 1],
+        np.array([v.surface.measures_range for v in views], np.bool_),
+    )
 
 
 def _evaluate(
@@ -567,88 +592,77 @@ def _evaluate(
     state: _Pairs,
     stage: Round,
     options: RefineOptions,
+    *,
+    by_patch: bool = False,
 ) -> None:
-    """Sum the normal equations of every directed pair."""
+    """Sum the normal equations of every directed pair, and over patches if needed."""
     T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
     rows = np.empty((len(state.target), kernels.SIZE))
+    sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
-
-    # Pairs of one target in succession, so that it stays in the cache.
+    # All sources of a target in succession, so that it stays in the cache.
     order = np.argsort(state.target, kind="stable")
+    targets, begin = np.unique(state.target[order], return_index=True)
+    end = np.append(begin[1:], len(order))
 
     def work(a: int, b: int) -> None:
-        for k in order[a:b]:
-            source, target = (views[i[k]].surface for i in (state.source, state.target))
-            kernels.pair_equations(
-                views[state.source[k]].points,
+        for k in range(a, b):
+            pairs = order[begin[k] : end[k]]
+            target = views[targets[k]].surface
+            found = np.empty((len(pairs), kernels.SIZE))
+            of_patches = np.empty((len(pairs), *sums.shape[1:]))
+            kernels.target_equations(
+                state.sources,
+                state.source[pairs],
                 target.target_image,
-                np.ascontiguousarray(T_target_source[k]),
-                Residuals(
-                    state.exposure[k],
-                    state.scale_g[k],
-                    state.scale_p[k],
+                T_target_source[pairs],
+                kernels.PairResiduals(
+                    state.exposure[pairs],
+                    state.scale_g[pairs],
+                    state.scale_p[pairs],
                     stage.inflation_m,
                     options.robust,
                     cosine,
                 ),
-                kernels.CameraErrors(errors, known, source.measures_range, target.measures_range),
-                rows[k],
+                errors,
+                known,
+                target.measures_range,
+                found,
+                of_patches,
             )
+            rows[pairs], sums[pairs] = found, of_patches
 
-    run_chunks(work, len(rows), -(-len(rows) // _PAIRS_A_CHUNK))
-    state.rows = rows
+    run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+    state.rows, state.sums = rows, sums
+
+
+def _depends_on_patches(state: _Pairs, options: RefineOptions) -> bool:
+    """Whether errors that patches share are allowed for.
+
+    Only where there are photometric residuals: without them nothing more accurate is left.
+    """
+    return options.shared > 0 and bool((state.scale_p > 0).any())
 
 
 def _allow_for_shared(
     views: Sequence[KeptView], poses: Float64, state: _Pairs, options: RefineOptions
 ) -> None:
-    """Remove from the normal equations what depth errors shared by patches could explain.
-
-    Only where there are photometric residuals: without them nothing more accurate is left.
-    """
+    """Remove from the normal equations what depth errors shared by patches could explain."""
     photometric = np.flatnonzero(state.scale_p > 0)
-    if options.shared == 0 or not len(photometric):
-        return
     T = se3.inverse(poses[state.target[photometric]]) @ poses[state.source[photometric]]
     depth = np.array([v.surface.depth for v in views])[state.target[photometric]]
     growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
-    sums = np.empty((len(photometric), shared_error.PATCHES, patch_kernels.PATCH_SIZE))
-    cosine = float(np.cos(options.max_angle))
-
-    def sum_up(which: Intp) -> None:
-        def work(a: int, b: int) -> None:
-            for k in which[a:b]:
-                source = views[state.source[photometric[k]]]
-                target = views[state.target[photometric[k]]].surface
-                patch_kernels.patch_sums(
-                    source.points,
-                    source.patches,
-                    target.target_image,
-                    np.ascontiguousarray(T[k]),
-                    state.scale_g[photometric[k]],
-                    options.robust,
-                    cosine,
-                    sums[k],
-                )
-
-        run_chunks(work, len(which), -(-len(which) // _PAIRS_A_CHUNK))
-
     # Views of one recording come from one camera: their errors are alike.
     alike = shared_error.alike(views[0].surface)
-    every = np.arange(len(photometric))
-    some = every[:: -(-len(photometric) // _PAIRS_SAMPLED)]
-    sum_up(some)
-    found = shared_error.disagreement(sums[some], state.rows[photometric[some]], alike)
+    some = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
+    sampled = photometric[some]
+    found = shared_error.disagreement(state.sums[sampled], state.rows[sampled], alike)
     variance = options.shared**2 * found.variance(growth[some]) * growth
     if not variance.any():
         return
-    sum_up(np.setdiff1d(every, some))
 
     def work(a: int, b: int) -> None:
-        for k in range(a, b):
-            patch_kernels.discount_shared_errors(
-                sums[k], alike, variance[k], state.rows[photometric[k]]
-            )
+        discount_shared_errors(state.sums, alike, variance[a:b], photometric[a:b], state.rows)
 
     run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
 
@@ -661,10 +675,13 @@ def _support(
     state: _Pairs,
     stage: Round,
     options: RefineOptions,
+    *,
+    by_patch: bool = False,
 ) -> Support:
-    _evaluate(views, poses, errors, known, state, stage, options)
+    _evaluate(views, poses, errors, known, state, stage, options, by_patch=by_patch)
     good = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
-    return Support(state.target, state.source, good, state.rows[:, kernels.TERMS])
+    # A copy, as a view would keep the equations of all pairs in memory.
+    return Support(state.target, state.source, good, state.rows[:, kernels.TERMS].copy())
 
 
 def _pairwise_measurements(poses: Float64, pairs: Intp, state: _Pairs) -> tuple[Float64, Float64]:

@@ -19,7 +19,6 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels import shared_error as patch_kernels
 from tofuse.registration.prepared_view import PreparedView
 
 # Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
@@ -88,14 +87,14 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     Parameters
     ----------
     sums
-        (P, PATCHES, PATCH_SIZE) of `kernels.shared_error.patch_sums`.
+        (P, PATCHES, PATCH_SIZE) of `kernels.refinement.target_equations`.
     rows
         (P, SIZE) normal equations of the pairs, see `kernels.refinement`.
     correlation
         (PATCHES, PATCHES) of the errors.
     """
     count = len(sums)
-    weight = sums[..., patch_kernels.WEIGHT]
+    weight = sums[..., kernels.PATCH_WEIGHT]
     per_weight = 1 / np.maximum(weight, 1e-12)
     known = weight > _MIN_WEIGHT * np.median(weight, axis=1, keepdims=True)
     A = np.zeros((count, kernels.UNKNOWNS, kernels.UNKNOWNS))
@@ -103,13 +102,13 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.H : kernels.G]
     normal = A[:, :7, :7] * np.outer(_UNITS, _UNITS) + np.eye(7) / _LOOSEST**2
     J = np.zeros((count, PATCHES, 7))
-    J[..., :6] = sums[..., patch_kernels.RESPONSE :]
+    J[..., :6] = sums[..., kernels.PATCH_RESPONSE :]
     J *= _UNITS
     taken = per_weight[..., None] * J @ np.linalg.inv(normal) @ np.swapaxes(J, 1, 2)
     left = (np.eye(PATCHES) - taken) * known[:, :, None] * known[:, None, :]
     normalised = np.where(known, weight, 0.0)
     normalised /= np.maximum(normalised.sum(1, keepdims=True), 1e-12)
-    means = sums[..., patch_kernels.RESIDUAL] * per_weight
+    means = sums[..., kernels.PATCH_RESIDUAL] * per_weight
     return Disagreement(
         (normalised * means**2).sum(1),
         (normalised * (left**2 * np.where(known, per_weight, 0.0)[:, None]).sum(2)).sum(1),

@@ -1,0 +1,34 @@
+"""Normal equations of one pair of views, by the kernel for all pairs of a target."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.kernels import refinement as kernels
+
+KNOWN = np.ones(kernels.ERRORS, np.int64)
+
+
+def pair_equations(points, surface, T, residuals, errors=None, known=KNOWN, patches=None, count=0):
+    """Equations (SIZE,) of source points and a target surface, and their sums over patches."""
+    row, sums = np.empty((1, kernels.SIZE)), np.empty((1, count, kernels.PATCH_SIZE))
+    scales = (np.array([scale]) for scale in residuals[:3])
+    kernels.target_equations(
+        kernels.SourcePoints(
+            points,
+            np.zeros(len(points), np.int64) if patches is None else patches,
+            np.array([0]),
+            np.array([len(points)]),
+            np.array([surface.measures_range]),
+        ),
+        np.array([0]),
+        surface.target_image,
+        np.ascontiguousarray(T)[None],
+        kernels.PairResiduals(*scales, *residuals[3:]),
+        np.zeros(kernels.ERRORS) if errors is None else errors,
+        known,
+        surface.measures_range,
+        row,
+        sums,
+    )
+    return row[0], sums[0]
