@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 
 from tofuse.pipeline.checkpoint import Stages
@@ -18,17 +16,16 @@ class Kept(Stages):
     """Stores the state as bytes after every frame, and stops on request."""
 
     def __init__(self, stop_at: int) -> None:
-        self.states: dict[str, tuple[str, dict[str, np.ndarray]]] = {}
+        self.states: dict[str, dict[str, np.ndarray]] = {}
         self.saved: list[str] = []
         self.stop_at = stop_at
 
     def load(self, stage: str) -> object:
-        data = self.states.get(stage)
-        return None if data is None else decode(json.loads(data[0]), data[1])
+        arrays = self.states.get(stage)
+        return None if arrays is None else decode(arrays)
 
     def save(self, stage: str, state: object) -> None:
-        nodes, arrays = encode(state)
-        self.states[stage] = json.dumps(nodes), {k: v.copy() for k, v in arrays.items()}
+        self.states[stage] = {name: array.copy() for name, array in encode(state)}
         self.saved.append(stage)
         if len(self.saved) == self.stop_at:
             raise Stopped

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from corner_views import corner
 from kept_stages import Kept, Stopped
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
@@ -28,6 +29,8 @@ from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.states import StateError, decode, encode, known_types
+from tofuse.posegraph.view_store import KeptView
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.results.folder import CHECKPOINT, STAGING
 from tofuse.results.output import run_json
 from tofuse.results.samples import FrameSample
@@ -57,7 +60,8 @@ def test_stopped_run_resumes_at_any_stage(room_recording: Path, monkeypatch) -> 
     recording = tofuse.open(room_recording).select(every=2)
     kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
     known = {"views": {"falloff": 0.0, "range_falloff": 0.0}}  # not looked for then
-    changes = {"corrections": kept_as_it_is, "odometry": known}
+    coarse = {"voxel_m": 0.05}
+    changes = {"corrections": kept_as_it_is, "odometry": known, "fusion": coarse}
     config = changed(from_method("default"), changes, where="test")
     never = Kept(0)
     whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
@@ -179,8 +183,7 @@ def test_state_round_trip() -> None:
         "nothing": (np.zeros((0, 3), np.float32), np.array(5), [], "\ud800"),
         "frame": FrameRecord(3, 0.1, "tracked", covariance=np.eye(6)),
     }
-    nodes, arrays = encode(state)
-    found = decode(json.loads(json.dumps(nodes)), arrays)
+    found = decode(dict(encode(state)))
     assert list(found) == list(state)
     loop = found["loop"]
     assert loop["self"] is loop
@@ -199,6 +202,31 @@ def test_state_round_trip() -> None:
     assert found["nothing"][2:] == ([], "\ud800")
     assert isinstance(found["frame"], FrameRecord)
     found["frame"].covariance[0, 0] = 5.0
+
+
+def test_large_state_is_stored_in_parts() -> None:
+    many = [np.full(200, float(k)) for k in range(12_000)]
+    state = {"arrays": many, "tuples": [(k, many[k % 7]) for k in range(20_000)]}
+    arrays = dict(encode(state))
+    largest = max(array.nbytes for array in arrays.values())
+    assert largest < 0.9 * sum(array.nbytes for array in many)
+    found = decode(arrays)
+    np.testing.assert_array_equal(found["arrays"], many)
+    assert [k for k, _ in found["tuples"]] == list(range(20_000))
+    assert all(a is found["arrays"][k % 7] for k, a in found["tuples"])
+    assert sum(name.startswith("nodes-") for name in arrays) == 2
+    del arrays["nodes-1"]
+    with pytest.raises(StateError):
+        decode(arrays)
+
+
+def test_derived_values_are_not_stored() -> None:
+    view = KeptView.of(prepare_view(corner(np.eye(4)), SurfaceOptions(radii=(2,))), 100)
+    assert len(view.middle) == 3
+    found = decode(dict(encode(view)))
+    assert "middle" in vars(view)
+    assert "middle" not in vars(found)
+    np.testing.assert_array_equal(found.middle, view.middle)
 
 
 FORGED: dict[str, object] = {
@@ -238,9 +266,10 @@ FORGED: dict[str, object] = {
 
 @pytest.mark.parametrize("name", FORGED)
 def test_forged_state_is_refused(name: str, tmp_path: Path) -> None:
-    arrays = {"a": np.arange(8.0)}
+    nodes = np.frombuffer(json.dumps(FORGED[name]).encode(), np.uint8)
+    arrays = {"nodes-0": nodes, "a": np.arange(8.0)}
     with pytest.raises(StateError) as caught:
-        decode(FORGED[name], arrays)
+        decode(arrays)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200
     notes: list[str] = []
@@ -248,9 +277,8 @@ def test_forged_state_is_refused(name: str, tmp_path: Path) -> None:
     kept.save("fusion", [1])
     path = kept.folder / "fusion.state"
     made = read_npz(path)
-    made["nodes"] = np.frombuffer(json.dumps(FORGED[name]).encode(), np.uint8)
     with path.open("wb") as file:
-        write_npz(file, made | arrays)
+        write_npz(file, (made | arrays).items())
     assert kept.load("fusion") is None
     assert "damaged, and not used" in notes[0]
     assert not path.exists()
@@ -432,7 +460,7 @@ def test_repeatedly_killed_run_gives_same_bytes(
         run, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
     )
     whole, out = tmp_path / "whole", tmp_path / "out"
-    words = (room_recording, "--every", 2, "--seed", 2)
+    words = (room_recording, "--every", 2, "--seed", 2, "--voxel", "5cm")
     assert main(["run", "--out", str(whole), *map(str, words)]) == 0
     assert {p.name for p in whole.iterdir()} == {*SAME, "report.html", "run.json"}
     rng = np.random.default_rng(5)

@@ -16,18 +16,18 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import UInt8
 from tofuse.errors import Ended, InputError, OutputError
 from tofuse.files.arrays import Arrays, read_npz, write_npz
+from tofuse.files.memory import give_back
 from tofuse.files.stamps import Stamp, stamp, stamps_in
-from tofuse.pipeline.states import PIECE, StateError, decode, encode
+from tofuse.pipeline.states import PIECE, StateError, decode, encode, from_json, to_json
 from tofuse.results.folder import CHECKPOINT
 
 # The state of tracking, which is large, is saved at this interval, and at most at this fraction of
@@ -39,9 +39,9 @@ _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
 _WORTH_KEEPING_S = 60.0
 # Names of states, and of temporary files of these.
 _STATE = re.compile(r"[a-z]+\.(state|part)")
-_VERSION = 2  # of the format; 1 were pickles
-_MAX_BYTES, _MAX_NODES_BYTES, _MAX_HEADER_BYTES = 16 << 30, 1 << 30, 4096
-_HEADER, _NODES = "header", "nodes"
+_VERSION = 3  # of the format
+_MAX_BYTES, _MAX_HEADER_BYTES = 16 << 30, 4096
+_HEADER = "header"
 
 
 class Stages(Protocol):
@@ -286,41 +286,25 @@ def _header(path: Path) -> dict[str, Any]:
 
 
 def _header_in(arrays: Arrays) -> dict[str, Any]:
-    header = _json(arrays.pop(_HEADER, None))
+    header = from_json(arrays.pop(_HEADER, None))
     if not isinstance(header, dict) or header.get("version") != _VERSION:
         raise StateError("it is not a checkpoint of this version")
     return header
 
 
-def _json(data: NDArray[Any] | None) -> Any:
-    if data is None or data.dtype != np.uint8:
-        raise StateError("it is not a checkpoint")
-    try:
-        return json.loads(data.tobytes())
-    except (ValueError, RecursionError):
-        raise StateError("it is not a checkpoint") from None
-
-
-def _text(data: Any) -> UInt8:
-    return np.frombuffer(json.dumps(data, separators=(",", ":")).encode(), np.uint8)
-
-
 def _write(path: Path, header: dict[str, Any], state: Any) -> None:
-    nodes, arrays = encode(state)
     # Not synchronised with the disk: after a power failure, checksums show damage.
     with path.open("wb") as file:
-        write_npz(file, {_HEADER: _text(header), _NODES: _text(nodes), **arrays})
+        write_npz(file, chain([(_HEADER, to_json(header))], encode(state)))
+    give_back()
 
 
 def _read(path: Path, key: str) -> Any:
     arrays = read_npz(path, limit=_MAX_BYTES, without=PIECE)
     if _header_in(arrays).get("key") != key:
         raise StateError("it is of another run")
-    nodes = arrays.pop(_NODES, None)
-    if nodes is not None and nodes.nbytes > _MAX_NODES_BYTES:
-        raise StateError("it is too large")
 
     def piece(name: str) -> NDArray[Any]:
         return read_npz(path, only=frozenset({name}))[name]
 
-    return decode(_json(nodes), arrays, piece)
+    return decode(arrays, piece)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -135,8 +134,6 @@ def run(
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
-            # What was stored of the frames is in cycles.
-            gc.collect()
             give_back()
             # BLAS sums differ with its number of threads, and its threads wait by spinning.
             with threadpool_limits(1):

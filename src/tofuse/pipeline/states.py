@@ -5,24 +5,27 @@ the rooms below define, and is filled, not called; then the checks of its constr
 (`state_checks`). Shared objects stay shared.
 
 The data is a list of nodes. A value is a plain number, text or None; or the number of a node, in a
-list of one element. A node is its kind and its content.
+list of one element. A node is its kind and its content. The nodes are stored as JSON, in parts, so
+that the state of a long recording is written with little memory.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import pkgutil
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property
+from functools import cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import InputError
 from tofuse.files.spill import SpillFile
 from tofuse.pipeline.state_checks import check_objects
@@ -63,14 +66,18 @@ _KINDS = "biufcSU"  # of arrays
 # Prefix of arrays that are pieces of a temporary file, which may exceed the memory.
 PIECE = "piece-"
 _SMALL = 1 << 14  # bytes; smaller arrays of one type are stored together
+# Prefix of arrays that are JSON of the nodes, and the number of nodes in each.
+_NODES, _NODES_A_PART = "nodes-", 1 << 14
+_MAX_NODES_BYTES = 1 << 30
+_POOL_BYTES = 1 << 24  # of small arrays that are stored together
 
 
 class StateError(Exception):
     """A state that can't be serialised, or is invalid."""
 
 
-def encode(state: Any) -> tuple[list[Any], Arrays]:
-    """Return the nodes of a state, the first being its root, and its arrays by name.
+def encode(state: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield arrays that describe a state, by name.
 
     Raises
     ------
@@ -81,16 +88,14 @@ def encode(state: Any) -> tuple[list[Any], Arrays]:
 
 
 def decode(
-    nodes: Any,
-    arrays: Mapping[str, NDArray[Any]],
-    piece: Callable[[str], NDArray[Any]] | None = None,
+    arrays: Mapping[str, NDArray[Any]], piece: Callable[[str], NDArray[Any]] | None = None
 ) -> Any:
-    """Return the state from its nodes and arrays.
+    """Return the state that arrays describe.
 
     Parameters
     ----------
-    nodes, arrays
-        As returned by `encode`.
+    arrays
+        As yielded by `encode`.
     piece
         Reads arrays whose names begin with `PIECE`, which are needed one at a time; None if they
         are among the others.
@@ -100,7 +105,36 @@ def decode(
     StateError
         If they are not a valid state.
     """
-    return _Decoder(nodes, arrays, piece or arrays.__getitem__).run()
+    others = {name: array for name, array in arrays.items() if not name.startswith(_NODES)}
+    return _Decoder(_nodes_in(arrays), others, piece or arrays.__getitem__).run()
+
+
+def _nodes_in(arrays: Mapping[str, NDArray[Any]]) -> list[Any]:
+    parts = [array for name, array in arrays.items() if name.startswith(_NODES)]
+    if sum(part.nbytes for part in parts) > _MAX_NODES_BYTES:
+        raise StateError("it is too large")
+    nodes: list[Any] = []
+    for k in range(len(parts)):
+        part = from_json(arrays.get(f"{_NODES}{k}"))
+        if not isinstance(part, list):
+            raise StateError("the list of nodes is invalid")
+        nodes += part
+    return nodes
+
+
+def to_json(data: Any) -> UInt8:
+    """Return plain data as JSON, in an array."""
+    return np.frombuffer(json.dumps(data, separators=(",", ":")).encode(), np.uint8)
+
+
+def from_json(array: NDArray[Any] | None) -> Any:
+    """Return the data in an array of `to_json`; StateError if it is none."""
+    if array is None or array.dtype != np.uint8:
+        raise StateError("it is not a checkpoint")
+    try:
+        return json.loads(array.tobytes())
+    except (ValueError, RecursionError):
+        raise StateError("it is not a checkpoint") from None
 
 
 @cache
@@ -140,18 +174,24 @@ class _Encoder:
     def __init__(self) -> None:
         self._numbers: dict[int, int] = {}
         self._referenced: list[Any] = []  # so that no id of an object is used twice
-        self._nodes: list[Any] = []
-        self._arrays: Arrays = {}
-        self._small: dict[str, list[NDArray[Any]]] = {}
-        self._sizes: dict[str, int] = {}
+        self._named = 0
+        self._complete: Arrays = {}
+        self._pools: dict[str, _Pool] = {}
 
-    def run(self, state: Any) -> tuple[list[Any], Arrays]:
+    def run(self, state: Any) -> Iterator[tuple[str, NDArray[Any]]]:
         self._value([state])
-        for number, item in enumerate(self._referenced):  # which grows meanwhile
-            self._nodes.append(self._node(item))
-            assert len(self._nodes) == number + 1
-        pools = {name: np.concatenate(parts) for name, parts in self._small.items()}
-        return self._nodes, self._arrays | pools
+        nodes: list[Any] = []
+        parts = 0
+        for item in self._referenced:  # which grows meanwhile
+            nodes.append(self._node(item))
+            if len(nodes) == _NODES_A_PART:
+                yield f"{_NODES}{parts}", to_json(nodes)
+                nodes, parts = [], parts + 1
+            yield from self._complete.items()
+            self._complete = {}
+        yield f"{_NODES}{parts}", to_json(nodes)
+        for pool in self._pools.values():
+            yield pool.name, pool.array()
 
     def _value(self, item: Any) -> Any:
         kind = type(item)
@@ -186,32 +226,74 @@ class _Encoder:
         if kind is SpillFile:
             return ["file", item.folder, *self._pieces(item)]
         if known_types().get(_name(kind)) is kind:
-            state = item.__getstate__() or {}
+            state = _attributes(item)
             return ["object", _name(kind), *(v for k in state for v in (k, value(state[k])))]
         raise StateError(f"objects of type {_name(kind)} can't be stored")
 
     def _pieces(self, file: SpillFile) -> list[str]:
         """Return names of the pieces of a temporary file: arrays read when they are written."""
-        names = []
-        for piece in file.pieces():
-            names.append(f"{PIECE}{len(self._arrays)}")
-            made: Any = piece
-            self._arrays[names[-1]] = made
-        return names
+        return [self._stored(PIECE, piece) for piece in file.pieces()]
+
+    def _stored(self, prefix: str, array: Any) -> str:
+        name = f"{prefix}{self._named}"
+        self._named += 1
+        self._complete[name] = array
+        return name
 
     def _placed(self, flat: NDArray[Any]) -> list[Any]:
         """Return the written array that contains the values, their start, and their number."""
         if flat.dtype.kind not in _KINDS:
             raise StateError(f"arrays of {flat.dtype} can't be stored")
         if flat.nbytes > _SMALL:
-            name = f"array-{len(self._arrays)}"
-            self._arrays[name] = flat
-            return [name, 0, len(flat)]
-        name = f"small-{flat.dtype.str[1:]}-{'big' if flat.dtype.byteorder == '>' else 'little'}"
-        start = self._sizes.get(name, 0)
-        self._small.setdefault(name, []).append(flat)
-        self._sizes[name] = start + len(flat)
-        return [name, start, len(flat)]
+            return [self._stored("array-", flat), 0, len(flat)]
+        pool = self._pools.get(flat.dtype.str)
+        if pool is not None and pool.nbytes >= _POOL_BYTES:
+            self._complete[pool.name] = pool.array()
+            pool = None
+        if pool is None:
+            pool = self._pools[flat.dtype.str] = _Pool(f"small-{self._named}")
+            self._named += 1
+        return [pool.name, pool.add(flat), len(flat)]
+
+
+class _Pool:
+    """Small arrays of one type that are stored as one."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.nbytes = 0
+        self._parts: list[NDArray[Any]] = []
+        self._size = 0
+
+    def add(self, flat: NDArray[Any]) -> int:
+        """Add an array and return its start."""
+        start = self._size
+        self._parts.append(flat)
+        self._size += len(flat)
+        self.nbytes += flat.nbytes
+        return start
+
+    def array(self) -> NDArray[Any]:
+        """Return all as one array."""
+        return np.concatenate(self._parts)
+
+
+def _attributes(item: Any) -> dict[str, Any]:
+    """Return the state of an object of ours.
+
+    Of a frozen dataclass its fields, without derived values. (In Python 3.11, access to `__dict__`
+    would create one for good.)
+    """
+    cls = type(item)
+    if _is_frozen(cls) and _member(cls, "__getstate__") is vars(object)["__getstate__"]:
+        return {field.name: getattr(item, field.name) for field in fields(cls)}
+    state: dict[str, Any] = item.__getstate__() or {}
+    return state
+
+
+def _is_frozen(cls: Any) -> bool:
+    options = getattr(cls, "__dataclass_params__", None)
+    return options is not None and bool(options.frozen)
 
 
 _SEQUENCES: dict[type, str] = {list: "list", tuple: "tuple", set: "set", frozenset: "frozenset"}
@@ -221,12 +303,12 @@ _TABLES: dict[type, str] = {dict: "dict", OrderedDict: "ordered"}
 class _Decoder:
     def __init__(
         self,
-        nodes: Any,
+        nodes: list[Any],
         arrays: Mapping[str, NDArray[Any]],
         piece: Callable[[str], NDArray[Any]],
     ) -> None:
         self._piece = piece
-        if not isinstance(nodes, list) or not nodes:
+        if not nodes:
             raise StateError("the list of nodes is missing")
         self._nodes = nodes
         self._arrays = arrays
@@ -298,10 +380,8 @@ class _Decoder:
             raise StateError("names of attributes are invalid")
         if is_dataclass(cls):
             names = {field.name for field in fields(cls)}
-            more = {key for key in state if not isinstance(_member(cls, key), cached_property)}
-            frozen: bool = cls.__dataclass_params__.frozen  # type: ignore[attr-defined]
             lacking = [n for n in names - set(state) if _member(cls, n) is None]
-            if lacking or (frozen and more - names):
+            if lacking or (_is_frozen(cls) and set(state) - names):
                 raise StateError(f"the fields do not match those of {name}")
         if hasattr(made, "__setstate__"):
             made.__setstate__(state)

@@ -109,16 +109,13 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
         if not np.isfinite(getattr(graph, name)).all():
             raise InputError(f"{name} are not all finite", where="pose graph")
     _check_information(graph.information, None, None)
-    lines = [
-        f"{VERTEX} {vertex} {_text(values)}"
-        for vertex, values in zip(graph.ids, _vectors(graph.poses), strict=True)
-    ]
     upper = graph.information[:, _UPPER[0], _UPPER[1]]
     values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
-    ends = graph.ids[graph.edges]
-    lines += [f"{EDGE} {i} {j} {_text(row)}" for (i, j), row in zip(ends, values, strict=True)]
-    with replacing(path) as temporary:
-        temporary.write_bytes("".join(f"{line}\n" for line in lines).encode())
+    vertices = zip(graph.ids, _vectors(graph.poses), strict=True)
+    edges = zip(graph.ids[graph.edges], values, strict=True)
+    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(f"{VERTEX} {vertex} {_text(row)}\n" for vertex, row in vertices)
+        file.writelines(f"{EDGE} {i} {j} {_text(row)}\n" for (i, j), row in edges)
 
 
 def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[int], list[float]]:

@@ -87,8 +87,9 @@ def _write_files(
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
-        text = json.dumps(run_json(result, model.result()), indent=1, allow_nan=False)
-        (folder / "run.json").write_text(text + "\n", encoding="utf-8")
+        with (folder / "run.json").open("w", encoding="utf-8") as file:
+            json.dump(run_json(result, model.result()), file, indent=1, allow_nan=False)
+            file.write("\n")
 
 
 def _write_model(
