@@ -23,7 +23,7 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig import Rig, RigCamera, read_rig, write_rig
 from tofuse.report.scene import CAMERA_COLORS
 from tofuse.report.section_rig import upright
-from tofuse.rigs.calibrate import calibrate_cameras, moves
+from tofuse.rigs.calibrate import Calibration, calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.viewer.content import read_content
 
@@ -50,8 +50,13 @@ def written(folder: Path, count: int = 2) -> Path:
     return folder
 
 
-def test_static_cameras_are_calibrated_from_one_instant() -> None:
-    found = calibrate_cameras([camera(k, images(k)) for k in range(3)], ["a", "b", "c"])
+@pytest.fixture(scope="module")
+def calibrated() -> Calibration:
+    return calibrate_cameras([camera(k, images(k)) for k in range(3)], ["a", "b", "c"])
+
+
+def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration) -> None:
+    found = calibrated
     assert found.how == "one instant"
     assert not found.rig.unplaced
     for stated, T in zip(found.rig.cameras, relative(STANDS), strict=True):
@@ -113,7 +118,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = open_recording(folder)
     assert recording.format == "rig"
     assert len(recording) == 6
-    assert main(["run", str(folder), "--out", str(tmp_path / "model")]) == 0
+    assert main(["run", str(folder), "--out", str(tmp_path / "model"), "--voxel", "3cm"]) == 0
     times, poses = read_tum(tmp_path / "model" / "rig_trajectory.txt")
     assert len(times) == 2
     assert np.allclose(poses, np.eye(4))
@@ -144,16 +149,15 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert shown.of_frames.tolist() == told["of_frames"]
 
 
-def test_displaced_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_displaced_camera_is_found(
+    calibrated: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]
-    out = tmp_path / "rig.json"
-    assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 0
-    rig = read_rig(out)
+    rig = calibrated.rig
     moved = rig.cameras[2].T_rig_camera @ se3.exp([0.03, 0, 0, 0, np.radians(1.5), 0])
     last = replace(rig.cameras[2], T_rig_camera=moved)
     write_rig(tmp_path / "knocked.json", Rig((*rig.cameras[:2], last)))
-    capsys.readouterr()
     assert main(["rig", "check", str(tmp_path / "knocked.json"), *cameras]) == 3
     said = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in said if "moved by" in line] == ["cam2"]

@@ -82,14 +82,17 @@ def test_hand_eye_is_exact_without_errors() -> None:
 
 
 def test_covariance_covers_errors() -> None:
-    squares = []
+    squares, clocks = [], []
     for seed in range(40):
         a, b = tracks(seed)
         found = hand_eye(a, b, OFFSET)
+        clocks.append((found.time_offset_s - OFFSET) / found.time_sigma_s)
         e = se3.log(se3.inverse(found.T_a_b) @ mounted())
         squares.append(e @ np.linalg.solve(found.covariance, e))
     inside = np.mean(np.array(squares) < 12.592)  # 95 % of chi-square with 6 degrees
     assert 0.8 <= inside <= 1.0
+    assert np.mean(np.abs(clocks) < 1.96) >= 0.85
+    assert 0.7 < np.std(clocks) < 1.3
 
 
 def test_rotation_about_one_axis_does_not_constrain_height() -> None:

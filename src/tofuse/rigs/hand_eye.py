@@ -271,18 +271,27 @@ def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float
     # Degrees of freedom: independent errors minus unknowns.
     independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
     left = max(independent - H.shape[0], 6.0)
-    # With few degrees of freedom the 95 % ellipsoid of six unknowns is that of the F distribution.
-    more = independent / left * 6 * float(stats.f.ppf(0.95, 6, left) / stats.chi2.ppf(0.95, 6))
     weighed = J * (w * sigma)[..., None]
     spread = np.tensordot(alike, weighed, 1)
-    B = more * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
+    B = independent / left * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
     if H.shape[0] > 7:  # between two worlds
         H[:6, :6] -= _spurious(w, sigma)
     values, vectors = np.linalg.eigh(H)
     bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
     weak = vectors[:, values < _LOOSEST**-2]
-    C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
+    # Of a pose's six unknowns, and of the clock alone.
+    wider = np.sqrt([_heavier_tails(6, left)] * (len(H) - 1) + [_heavier_tails(1, left)])
+    C = np.outer(wider, wider) * (bread @ B @ bread) + _LOOSEST**2 * weak @ weak.T
     return np.asarray(0.5 * (C + C.T), np.float64)
+
+
+def _heavier_tails(unknowns: int, left: float) -> float:
+    """Return the factor on variances by which the 95 % ellipsoid of unknowns is larger.
+
+    With few degrees of freedom `left` it is that of the F distribution instead of chi-square's.
+    """
+    ratio = stats.f.ppf(0.95, unknowns, left) / stats.chi2.ppf(0.95, unknowns)
+    return float(unknowns * ratio)
 
 
 def _spurious(w: Float64, sigma: Float64) -> Float64:
