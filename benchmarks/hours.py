@@ -11,10 +11,11 @@ A revisit is a segment of the walk in which the camera returns to within 0.5 m a
 earlier pose after at least 20 s elsewhere. It is closed if the estimated relative pose of the
 closest pair is accurate to 5 cm and 1 degree.
 
-`there-and-back` plays a recording forwards and backwards until it has the required length.
+`there-and-back` plays a recording forwards and backwards until it has the required length, with
+every second row and column of its depth images with `--half`.
 
     python benchmarks/hours.py building [--rooms 20] [--frames 20000] [--counts 1000 20000]
-    python benchmarks/hours.py there-and-back RECORDING [--counts 1000 5000 20000]
+    python benchmarks/hours.py there-and-back RECORDING [--half] [--counts 1000 5000 20000]
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from tofuse.recordings.convert import convert
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96
@@ -421,6 +423,31 @@ def there_and_back(recording: Path, count: int, folder: Path | None = None) -> P
     return folder
 
 
+def halved(recording: Path) -> Path:
+    """A native folder with every second row and column of the depth images of a recording."""
+    folder = OUT / f"half-{recording.name}"
+    if folder.exists():
+        return folder
+    source = open_recording(recording)
+    camera = source[0].camera
+    if not isinstance(camera, Pinhole):
+        raise SystemExit(f"{recording}: --half needs a pinhole camera")
+    small = Pinhole(
+        (camera.width + 1) // 2,
+        (camera.height + 1) // 2,
+        camera.fx / 2,
+        camera.fy / 2,
+        camera.cx / 2,
+        camera.cy / 2,
+    )
+    frames = [
+        RangeFrame(k, f.timestamp, small, np.ascontiguousarray(f.depth[::2, ::2]), f.depth_kind)
+        for k, f in enumerate(source)
+    ]
+    convert(Recording.of(ArraySource(frames), recording, "half"), folder)
+    return folder
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     kinds = parser.add_subparsers(dest="kind", required=True)
@@ -432,6 +459,7 @@ def main() -> None:
     made.add_argument("--only-record", action="store_true")
     played = kinds.add_parser("there-and-back")
     played.add_argument("recording", type=Path, help="a native folder")
+    played.add_argument("--half", action="store_true", help="halve the depth images")
     played.add_argument("--counts", type=int, nargs="+", default=[1000, 5000, 20_000])
     for kind in (made, played):
         kind.add_argument("--options", default="", help="more options of `tofuse run`")
@@ -444,7 +472,8 @@ def main() -> None:
             return
         lines = rows(folder, arguments.counts, more, truth=True)
     else:
-        folder = there_and_back(arguments.recording, max(arguments.counts))
+        recording = halved(arguments.recording) if arguments.half else arguments.recording
+        folder = there_and_back(recording, max(arguments.counts))
         lines = rows(folder, arguments.counts, more, truth=False)
     for line in lines:
         print(line, flush=True)
