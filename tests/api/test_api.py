@@ -330,8 +330,8 @@ def test_options_follow_config_file_schema(arrays) -> None:
 
 
 def test_fitted_filter_is_in_report(tmp_path) -> None:
-    simulate("box", tmp_path / "rec", every=20, frames=9, effects=Effects.none(shot_noise=True))
-    options = {"filters": [{"part": "background"}]}
+    simulate("box", tmp_path / "rec", every=20, frames=6, effects=Effects.none(shot_noise=True))
+    options = {"filters": [{"part": "background"}], "fusion": {"voxel_m": 0.02}}
     found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), options, threads=1)
     found.save(tmp_path / "out")
     assert "background" in (tmp_path / "out/report.html").read_text()

@@ -21,8 +21,8 @@ from tofuse.batch import client
 from tofuse.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-JOBS = [f"seed-{k}" for k in range(3)]
-WORDS = ("--every", "4", "--threads", "1")
+JOBS = [f"seed-{k}" for k in range(2)]
+WORDS = ("--every", "4", "--voxel", "10cm", "--threads", "1")
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def batch_benchmark(monkeypatch) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table of three jobs."""
+    """A table of the jobs."""
     path = tmp_path_factory.mktemp("listed") / "list.csv"
-    rows = [f"{room_recording},{name},{k},4" for k, name in enumerate(JOBS)]
-    path.write_text("\n".join(["recording,name,seed,every", *rows]) + "\n")
+    rows = [f"{room_recording},{name},{k},4,10cm" for k, name in enumerate(JOBS)]
+    path.write_text("\n".join(["recording,name,seed,every,voxel", *rows]) + "\n")
     return path
 
 
@@ -89,9 +89,11 @@ def test_bad_recordings_do_not_stop_batch(room_recording: Path, tmp_path: Path, 
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "camera.json").write_text("{")
-    (tmp_path / "list.txt").write_text(f"nothing\nbroken\n{room_recording}\n")
+    (tmp_path / "list.csv").write_text(
+        f"recording,every\nnothing,\nbroken,\n{room_recording},4\n", encoding="utf-8"
+    )
     out = tmp_path / "out"
-    words = ["batch", str(tmp_path / "list.txt"), "--out", str(out), "--workers", "2"]
+    words = ["batch", str(tmp_path / "list.csv"), "--out", str(out), "--workers", "2"]
     assert main([*words, "--only", "nothing"]) == 2
     output = capsys.readouterr().err
     assert "none of 1 recordings gave a result; nothing: " in output
@@ -109,7 +111,7 @@ def test_bad_recordings_do_not_stop_batch(room_recording: Path, tmp_path: Path, 
     assert f'<img src="jobs/{room_recording.name}.jpg"' in page
     assert (out / "jobs" / f"{room_recording.name}.jpg").read_bytes()[:2] == b"\xff\xd8"
     (made,) = (r for r in records(out) if r["state"] == "done")
-    assert made["posed"] == made["frames"] == 8
+    assert made["posed"] == made["frames"] == 2
     assert made["peak_bytes"] > 50_000_000
 
     before = (out / room_recording.name / "run.json").stat().st_mtime_ns
@@ -153,7 +155,7 @@ def test_interrupted_batch_reports_progress(
     assert batch.returncode == 130
     assert (
         output
-        == "tofuse: interrupted, 0 of 3 recordings are done; run the same command again to resume\n"
+        == "tofuse: interrupted, 0 of 2 recordings are done; run the same command again to resume\n"
     )
 
 
@@ -185,7 +187,7 @@ def test_batch_resumes_after_lost_scheduler(
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     out = tmp_path / "out"
-    with batch_benchmark.own_processes(2, tmp_path / "dask") as (address, _):
+    with batch_benchmark.own_processes(1, tmp_path / "dask") as (address, _):
         batch = batch_benchmark.start_batch(listed, out, "--scheduler", address)
         wait_until(lambda: "done" in states(out).values() if out.is_dir() else False)
     _, output = batch.communicate(timeout=60)
@@ -194,7 +196,7 @@ def test_batch_resumes_after_lost_scheduler(
         f"tofuse: {address}: the scheduler disappeared; restart it, and run the same command again "
         "to resume\n"
     )
-    with batch_benchmark.own_processes(2, tmp_path / "dask"):
+    with batch_benchmark.own_processes(1, tmp_path / "dask"):
         words = ("--scheduler", tmp_path / "dask" / "scheduler.json")
         batch_benchmark.finish(batch_benchmark.start_batch(listed, out, *words))
     assert same(batch_benchmark, single_runs, out)

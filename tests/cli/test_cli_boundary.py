@@ -18,7 +18,7 @@ from tofuse import cli
 from tofuse.cli import main, run_command
 from tofuse.cli.streams import SafeStream, safe_streams
 from tofuse.errors import Ended
-from tofuse.kernels import cores
+from tofuse.kernels import cores, jit
 from tofuse.lab.simulation.record import simulate
 
 sys.path.insert(0, str(BENCHMARKS))
@@ -55,8 +55,10 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", CHOSEN)
 def test_hostile_environments_give_result_or_one_line_error(
-    name: str, clouds: Path, tmp_path: Path
+    name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Kernels are not compiled anew where the home can't be written; see test_kernels_jit.py.
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(Path(jit.cache_folder()).parent))
     (environment,) = [e for e in ENVIRONMENTS if e.name == name]
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
     assert outcome.faults == (), outcome.stderr

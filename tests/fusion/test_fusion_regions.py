@@ -208,8 +208,7 @@ def test_spilled_views_are_restored_with_state(room, memory_mb) -> None:
     builder = ModelBuilder(Fusion(voxel_m=0.05, memory_mb=memory_mb))
     for k, T in enumerate(poses):
         builder.add(seen(T, k), None, 1000)
-    nodes, arrays = encode(builder)
-    again = decode(nodes, {name: np.asarray(array) for name, array in arrays.items()})
+    again = decode({name: np.asarray(array) for name, array in encode(builder)})
     made = [each.fuse(dict(enumerate(poses))).mesh for each in (builder, again)]
     same(*made)
     again.add(seen(poses[0], len(poses)), None, 1000)

@@ -317,7 +317,7 @@ def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypa
     )
     monkeypatch.setattr(run_module, "TEXTURE", 256)
     monkeypatch.setattr(paint, "_FACES", 3000)
-    words = ["run", str(room_recording), "--every", "7", "--out"]
+    words = ["run", str(room_recording), "--every", "7", "--voxel", "3cm", "--out"]
     for threads, name in (("1", "a"), ("2", "b")):
         out = str(tmp_path / name)
         assert main([*words, out, "--texture", "--threads", threads]) == 0

@@ -13,8 +13,8 @@ from tofuse.recordings.recording import Recording
 def without_multipath(
     folder: Path, scene: str, camera: str, every: int, frames: int | None = None
 ) -> Recording:
-    """A scene recorded at every `every`-th pose of its path, with all errors except multipath."""
-    effects = Effects(multipath=False)
+    """A scene recorded at every `every`-th pose, without multipath and motion blur."""
+    effects = Effects(multipath=False, smear=False)
     out = folder / scene
     simulate(scene, out, camera=camera, seed=10, every=every, frames=frames, effects=effects)
     return open_recording(out)

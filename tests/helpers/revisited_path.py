@@ -1,15 +1,18 @@
-"""A path that leaves a place and returns to it."""
+"""A path that leaves a place and returns to it, and odometry that drifts along it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from corner_views import corner
 from tofuse.geometry import se3
+from tofuse.odometry.base import Step, Tracker
 from tofuse.posegraph.view_store import Spacing, ViewStore
+from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 ALL = Spacing(angle=0, distance=0)
@@ -25,6 +28,50 @@ def away_and_back(count=13, most=1.1):
     sway = 0.1 * np.sin(2 * a)
     zero = np.zeros(count)
     return se3.exp(np.stack([sway, zero, sway, zero, yaw, zero], axis=-1))
+
+
+@dataclass(frozen=True)
+class Drifting:
+    """Odometry along `away_and_back` with the same error in every step; at its end it stays.
+
+    `drift` is the error as a multiple of `DRIFT`, `sigma` that of its stated standard deviation:
+    4 mm and 3 mrad.
+    """
+
+    count: int
+    drift: float
+    sigma: float
+    part_kind: ClassVar[str] = "odometry"
+    part_name: ClassVar[str] = "drifting"
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    @property
+    def error(self):
+        return se3.exp(self.drift * se3.log(DRIFT))
+
+    def start(self, seed, search=None):
+        return _Drifting(self)
+
+
+class _Drifting(Tracker):
+    def __init__(self, options):
+        self.options = options
+        self.before = None
+
+    def push(self, frame, T_odometry=None, surface=None):
+        options = self.options
+        at = min(frame.index, options.count - 1)
+        truth = away_and_back(options.count)
+        view = prepare_view(frame, SurfaceOptions(radii=(2,)))
+        if self.before is None:
+            self.before = 0, np.eye(4)
+            return Step("tracked", "", np.eye(4), surface=view)
+        k, T = self.before
+        motion = se3.inverse(truth[k]) @ truth[at] @ options.error
+        self.before = at, T @ motion
+        sigma = options.sigma * np.array([0.004] * 3 + [0.003] * 3)
+        registration = Registration(motion, True, 1, 100, 100, 0.0, 0.001, np.diag(sigma**-2.0))
+        return Step("tracked", "", self.before[1], frame.index - 1, registration, view)
 
 
 @pytest.fixture(scope="module")

@@ -127,7 +127,8 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     from tofuse.pipeline.reconstruct import reconstruct
 
     recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
-    config = changed(from_method("default"), {"refinement": {"part": "none"}}, where="test")
+    changes = {"refinement": {"part": "none"}, "fusion": {"voxel_m": 0.1}}
+    config = changed(from_method("default"), changes, where="test")
     result = reconstruct(recording, config)
     assert recording.reference is not None
     assert result.has_pose.all()
@@ -138,11 +139,12 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.evaluation.trajectory import displacement
-    from tofuse.pipeline.config import from_method
+    from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
 
     recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)
-    result = reconstruct(recording, from_method("default"))
+    config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
+    result = reconstruct(recording, config)
     assert recording.reference is not None
     assert result.has_pose.all()
     # 0.27 m if started only near the prediction.

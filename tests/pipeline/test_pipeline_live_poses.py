@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from corner_views import corner
-from revisited_path import DRIFT, away_and_back
+from revisited_path import Drifting, away_and_back
 from tofuse.geometry import se3
-from tofuse.odometry.base import Step, Tracker
+from tofuse.odometry.base import Step
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.live_poses import DELAY, LiveLoops, LivePoses
@@ -21,44 +21,11 @@ from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import ClosedLoop
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.posegraph.revisits import Revisits
-from tofuse.registration.base import Registration
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.results.types import FrameRecord
 
 COUNT = 24
-SMALL = se3.exp(se3.log(DRIFT) / 2)
-
-
-@dataclass(frozen=True)
-class Drifting:
-    """Odometry with the same small error in every step."""
-
-    part_kind: ClassVar[str] = "odometry"
-    part_name: ClassVar[str] = "drifting"
-    takes: ClassVar[frozenset[str]] = frozenset({"range"})
-
-    def start(self, seed, search=None):
-        return _Drifting()
-
-
-class _Drifting(Tracker):
-    def __init__(self):
-        self.before = None
-
-    def push(self, frame, T_odometry=None, surface=None):
-        at = min(frame.index, COUNT - 1)
-        truth = away_and_back(COUNT)
-        view = prepare_view(frame, SurfaceOptions(radii=(2,)))
-        if self.before is None:
-            self.before = 0, np.eye(4)
-            return Step("tracked", "", np.eye(4), surface=view)
-        k, T = self.before
-        motion = se3.inverse(truth[k]) @ truth[at] @ SMALL
-        self.before = at, T @ motion
-        # As uncertain as the drift is large, so that the graph corrects it.
-        information = np.diag([1 / 0.004**2] * 3 + [1 / 0.003**2] * 3)
-        registration = Registration(motion, True, 1, 100, 100, 0.0, 0.001, information)
-        return Step("tracked", "", self.before[1], frame.index - 1, registration, view)
+# As uncertain as the drift is large, so that the graph corrects it.
+DRIFTING = Drifting(COUNT, drift=0.5, sigma=1)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +41,7 @@ def live(frames, threads):
         from_method("default"),
         corrections=(),
         model_filters=(),
-        odometry=Drifting(),
+        odometry=DRIFTING,
         loops=loops,
         refinement=NoRefinement(),
     )
@@ -96,9 +63,9 @@ def test_loops_correct_live_pose_with_fixed_delay(frames):
     # Where the odometry alone ends.
     drifted = np.eye(4)
     for before, after in itertools.pairwise(truth):
-        drifted = drifted @ se3.inverse(before) @ after @ SMALL
+        drifted = drifted @ se3.inverse(before) @ after @ DRIFTING.error
     for _ in range(DELAY + 1):
-        drifted = drifted @ SMALL
+        drifted = drifted @ DRIFTING.error
     assert off(drifted) > 0.08
     assert off(poses[-1]) < 0.5 * off(drifted)
     np.testing.assert_array_equal(poses, live(frames, 2))

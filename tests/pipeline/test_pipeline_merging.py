@@ -46,16 +46,29 @@ def results(tmp_path_factory) -> dict[str, Path]:
     }
 
 
-def merged(*folders, searches=6, **options):
-    sessions = read_sessions(folders, 2, Silent())
+def quick_merge(sessions, searches=6):
+    """A quick configuration that searches for few links between sessions."""
     config = quick(merged_config(sessions))
     joining = replace(config.joining, searches=searches, tries=searches)
-    return merge_sessions(sessions, replace(config, joining=joining), threads=2, **options)
+    return replace(config, joining=joining)
+
+
+def merged(*folders, searches=6, **options):
+    sessions = read_sessions(folders, 2, Silent())
+    return merge_sessions(sessions, quick_merge(sessions, searches), threads=2, **options)
 
 
 @pytest.fixture(scope="module")
 def both(results):
     return merged(results["here"], results["there"])
+
+
+@pytest.fixture(scope="module")
+def pair(both, tmp_path_factory) -> Path:
+    """The result of merging two sessions, in a folder."""
+    folder = tmp_path_factory.mktemp("merged") / "pair"
+    write_result(both, OutputFolder(folder))
+    return folder
 
 
 def copied(folder: Path, to: Path) -> Path:
@@ -123,11 +136,9 @@ def test_flat_of_same_plan_is_not_joined(results) -> None:
     assert exit_status(found) == 3
 
 
-def test_first_session_stays_main_if_others_are_larger(results, tmp_path) -> None:
+def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
     """And merged results can be merged again: joined sessions stay joined."""
-    pair = merged(results["here"], results["there"])
-    write_result(pair, OutputFolder(tmp_path / "pair"))
-    found = merged(results["elsewhere"], tmp_path / "pair", searches=3)
+    found = merged(results["elsewhere"], pair, searches=3)
     assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
     assert found.has_pose.tolist() == [True] * 12 + [False] * 24
     assert "few_poses" not in {reason.code for reason in found.diagnostics.reasons}
@@ -143,15 +154,14 @@ def test_first_session_stays_main_if_others_are_larger(results, tmp_path) -> Non
     assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
 
 
-def test_loops_of_earlier_merge_are_registered_again(both, results, tmp_path) -> None:
-    write_result(both, OutputFolder(tmp_path / "pair"))
-    sessions = read_sessions([results["elsewhere"], tmp_path / "pair"], 2, Silent())
+def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> None:
+    sessions = read_sessions([results["elsewhere"], pair], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < 12 <= p.j]
     assert len(across) >= 2
     assert sessions[0].links == ()
     assert set(sessions[1].links) == set(across)
     # No view may be a candidate by its overlap.
-    config = quick(merged_config(sessions))
+    config = quick_merge(sessions, 3)
     config = replace(config, loops=replace(config.loops, per_view=0))
     found = merge_sessions(sessions, config, threads=2)
     (apart,) = [c.result for c in found.components if not c.connected]
@@ -163,16 +173,14 @@ def test_loops_of_earlier_merge_are_registered_again(both, results, tmp_path) ->
 
 def test_result_is_independent_of_threads(both, results) -> None:
     sessions = read_sessions([results["here"], results["there"]], 1, Silent())
-    config = quick(merged_config(sessions))
-    joining = replace(config.joining, searches=6, tries=6)
     with threads(1):
-        again = merge_sessions(sessions, replace(config, joining=joining), threads=1)
+        again = merge_sessions(sessions, quick_merge(sessions), threads=1)
     assert again.trajectory.tobytes() == both.trajectory.tobytes()
     assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
 
 
 def test_command_writes_result(results, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
+    monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"
     words = ["merge", str(results["here"]), str(results["there"]), "--out", str(out)]
     painted = []
@@ -289,7 +297,7 @@ def test_damaged_result_is_refused(results, tmp_path, changes) -> None:
 
 def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> None:
     """And one that cannot be located in the map leaves it unchanged."""
-    monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
+    monkeypatch.setattr(merging, "merged_config", quick_merge)
     monkeypatch.setattr(merging, "_report", lambda result, folder: None)
     into = copied(results["here"], tmp_path)
     (session, _) = read_sessions([results["there"], results["elsewhere"]], 1, Silent())

@@ -15,7 +15,7 @@ from tofuse.errors import InputError
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.pipeline.config import from_method
+from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.priors import with_prior
 from tofuse.pipeline.reconstruct import device_up, reconstruct
 from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
@@ -25,6 +25,9 @@ from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import read_run_json
 from tofuse.results.types import FrameRecord
+
+# Only the poses matter: the model is coarse.
+COARSE = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +115,8 @@ def test_inconsistent_device_poses_are_ignored(recording) -> None:
     rng = np.random.default_rng(0)
     wrong = recording.reference.copy()
     wrong[:, :3, 3] = rng.uniform(-2, 2, (len(wrong), 3))
-    phone, config = with_prior(by_phone(recording, wrong), from_method("default"), "auto")
-    alone = reconstruct(recording)
+    phone, config = with_prior(by_phone(recording, wrong), COARSE, "auto")
+    alone = reconstruct(recording, COARSE)
     result = reconstruct(phone, config)
     gap = np.linalg.norm(result.trajectory[:, :3, 3] - alone.trajectory[:, :3, 3], axis=1)
     assert gap.max() < 0.01
@@ -154,14 +157,14 @@ def test_device_poses_bound_slide_along_wall(covered) -> None:
     """The images alone do not constrain the motion along it."""
     recording = past_a_corner(covered)
     right = recording.reference
-    alone = reconstruct(recording)
+    alone = reconstruct(recording, COARSE)
     slide = alone.diagnostics.accuracy.unbounded
     assert len(slide) > 5
     rng = np.random.default_rng(1)
     phone = [right[0]]
     for step in se3.inverse(right[:-1]) @ right[1:]:
         phone.append(phone[-1] @ step @ se3.exp(0.001 * rng.standard_normal(6)))
-    result = reconstruct(*with_prior(by_phone(recording, phone), from_method("default"), "auto"))
+    result = reconstruct(*with_prior(by_phone(recording, phone), COARSE, "auto"))
     accuracy = result.diagnostics.accuracy
     assert accuracy.unbounded == ()
     assert set(accuracy.by_odometry) >= set(slide[3:])
@@ -178,7 +181,7 @@ def test_device_poses_bound_slide_along_wall(covered) -> None:
 )
 def test_prior_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
     given = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--prior", prior]
-    assert main([*given, "--end", "4"]) == (2 if sensors is None else 0)
+    assert main([*given, "--end", "2", "--voxel", "10cm"]) == (2 if sensors is None else 0)
     if sensors is None:
         assert "--prior" in capsys.readouterr().err
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import run_json
 
 CAMERA = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5)
+# Only the poses matter: the model is coarse.
+COARSE = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
 
 
 def frame(camera=CAMERA, kind="z") -> RangeFrame:
@@ -80,9 +83,8 @@ def test_implausible_errors_are_refused(wrong) -> None:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Once around a room, with its true camera."""
     folder = tmp_path_factory.mktemp("calibration") / "room"
-    return open_recording(
-        simulate("room", folder, every=16, seed=10, effects=Effects(multipath=False))
-    )
+    effects = Effects(multipath=False, smear=False)
+    return open_recording(simulate("room", folder, every=16, seed=10, effects=effects))
 
 
 def seen_by(recording: Recording, share: float, kind: str = "z") -> Recording:
@@ -116,7 +118,11 @@ def wrong(recording):
 
 
 def test_wrong_focal_length_is_corrected(wrong) -> None:
-    result = reconstruct(wrong)
+    config = replace(COARSE, self_calibration=False)
+    stated = reconstruct(wrong, config)
+    assert stated.diagnostics.calibrated is None
+    assert "calibration_alarm" in {r.code for r in stated.diagnostics.reasons}
+    result = self_calibrated(stated, config, partial(reconstruct, wrong), Silent())
     found = result.diagnostics.calibrated
     assert found is not None
     assert found.focal == pytest.approx(0.05, abs=0.01)
@@ -136,10 +142,6 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
     codes = {r.code for r in result.diagnostics.reasons}
     assert "self_calibrated" in codes
     assert "calibration_alarm" not in codes
-    config = changed(from_method("default"), {"self_calibration": False}, where="test")
-    stated = reconstruct(wrong, config)
-    assert stated.diagnostics.calibrated is None
-    assert "calibration_alarm" in {r.code for r in stated.diagnostics.reasons}
     assert error_of(wrong, result) < 0.3 * error_of(wrong, stated)
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
@@ -147,7 +149,7 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
 def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     """Rotation scales with the focal length and all views agree: only the loop reveals it."""
     wrong = seen_by(recording, 1.05, "range")
-    result = reconstruct(wrong)
+    result = reconstruct(wrong, COARSE)
     found = result.diagnostics.calibrated
     assert found is not None
     assert found.focal == pytest.approx(0.05, abs=0.01)
@@ -157,17 +159,17 @@ def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
 def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     half = replace(recording, indices=recording.indices[:12])
     wrong = seen_by(half, 1.05)
-    result = reconstruct(wrong)
+    result = reconstruct(wrong, COARSE)
     assert result.diagnostics.calibrated is None
     assert "unchecked_calibration" in {r.code for r in result.diagnostics.reasons}
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
-    right = reconstruct(half)
+    right = reconstruct(half, COARSE)
     assert right.diagnostics.accuracy.position_m < 0.5 * result.diagnostics.accuracy.position_m
     assert error_of(half, right) < right.diagnostics.accuracy.position_m
 
 
 def test_correct_focal_length_is_unchanged(recording) -> None:
-    result = reconstruct(recording)
+    result = reconstruct(recording, COARSE)
     assert result.diagnostics.calibrated is None
     assert run_json(result)["self_calibration"] is None
     assert "self_calibrated" not in {r.code for r in result.diagnostics.reasons}
@@ -192,7 +194,7 @@ def said(result, error: float | None, bound: float, posed: int = 3, support: flo
 
 @pytest.fixture(scope="module")
 def any_result(room_recording):
-    return reconstruct(open_recording(room_recording).select(end=3))
+    return reconstruct(open_recording(room_recording).select(end=3), COARSE)
 
 
 def test_no_correction_without_alarm(any_result) -> None:

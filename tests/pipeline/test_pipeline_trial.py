@@ -59,7 +59,7 @@ def test_compensation_is_disabled_without_multipath(straight: Recording) -> None
 
 def test_compensation_is_kept_with_multipath() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
-    recording = simulate_recording("empty-room", every=6, frames=40, effects=effects)
+    recording = simulate_recording("empty-room", every=6, frames=20, effects=effects)
     listener = Listener()
     config = adapted(from_method("default"), recording, 1, listener)
     part = multipath_of(config)

@@ -244,7 +244,8 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     """Whatever the error happens to be: it was not measured."""
     effects = Effects.none(shot_noise=True)
     recording = simulate_recording(scene, frames=8, every=2, texture=False, effects=effects)
-    result = tofuse.reconstruct(recording)
+    coarse = {"fusion": {"voxel_m": 0.1}}  # only the poses matter
+    result = tofuse.reconstruct(recording, coarse)
     d = result.diagnostics
     degenerate = {f.index for f in d.frames if len(f.unobservable)}
     assert len(degenerate) >= 6
@@ -253,7 +254,8 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     assert d.verdict == "degraded"
     assert "unobserved_motion" in [r.code for r in d.reasons]
     # With texture the albedo measures it.
-    textured = tofuse.reconstruct(simulate_recording(scene, frames=8, every=2, effects=effects))
+    recorded = simulate_recording(scene, frames=8, every=2, effects=effects)
+    textured = tofuse.reconstruct(recorded, coarse)
     a = textured.diagnostics.accuracy
     assert a.unbounded == ()
     assert recording.reference is not None

@@ -146,13 +146,13 @@ def refined(part, views, poses):
 
 def test_refinement_is_kept_only_if_views_support_it():
     views, truth = peaks_views(0.05, 2)
-    start = nudged(truth, 0.1)
-    better = refined(Planes(), views, start)
+    start = nudged(truth[:10], 0.1)
+    better = refined(Planes(), views[:10], start)
     assert better.kept
     assert better.support[1] > better.support[0]
-    before = PoseErrors.of(start, truth).position.mean()
-    assert PoseErrors.of(better.poses, truth).position.mean() < before / 3
-    assert {(e.i, e.j) for e in better.edges} == {(k, k + 1) for k in range(19)}
+    before = PoseErrors.of(start, truth[:10]).position.mean()
+    assert PoseErrors.of(better.poses, truth[:10]).position.mean() < before / 3
+    assert {(e.i, e.j) for e in better.edges} == {(k, k + 1) for k in range(9)}
     for edge in better.edges:
         assert np.linalg.eigvalsh(edge.information).min() > 0
     # Disconnected clouds stay, and so does a single one.

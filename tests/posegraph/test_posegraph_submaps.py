@@ -51,8 +51,8 @@ def test_submaps_match_refinement_of_all_views(swing) -> None:
 def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
     views, truth = swing
     start = drifted(truth)
-    some = [views[:20], start[:20]]
-    for submap in (20, 10):
+    some = [views[:12], start[:12]]
+    for submap in (12, 10):
         much = refined(Joint(submap=submap), *some)
         little = refined(Joint(submap=submap), *some, Scratch(200_000, tmp_path))
         np.testing.assert_array_equal(much.poses, little.poses)
@@ -156,7 +156,9 @@ def test_descriptor_index_finds_most_similar_views() -> None:
     assert sum((k, k + 200) in pairs for k in range(200)) > 180
     assert len(pairs) < 0.5 * 400 * 399 / 2
     far = pairwise_dissimilarity(descriptors, i, j, 0.25)
-    np.testing.assert_allclose(far, mutual_dissimilarity(list(descriptors), 0.25)[i, j], atol=0.06)
+    some = (i % 4 == 0) & (j % 4 == 0)
+    mutual = mutual_dissimilarity(list(descriptors[::4]), 0.25)
+    np.testing.assert_allclose(far[some], mutual[i[some] // 4, j[some] // 4], atol=0.06)
     true = np.array([b == a + 200 for a, b in zip(i, j, strict=True)])
     assert far[true].max() < far[~true].min()
 

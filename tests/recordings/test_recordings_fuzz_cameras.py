@@ -13,8 +13,8 @@ from damaged_files import damage
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
-ROUNDS = {"kinect2": 30, "mkv": 30, "helios": 30, "csv": 30}
-CUTS = {"kinect2": 20, "mkv": 12, "aditof": 20}
+ROUNDS = {"aditof": 30, "kinect2": 30, "mkv": 30, "helios": 30, "csv": 30}
+CUTS = {"kinect2": 20, "mkv": 12, "aditof": 12}
 
 
 @pytest.mark.parametrize("name", MAKERS)
