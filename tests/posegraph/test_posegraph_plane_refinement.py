@@ -155,12 +155,17 @@ def test_refinement_is_kept_only_if_views_support_it():
     assert {(e.i, e.j) for e in better.edges} == {(k, k + 1) for k in range(9)}
     for edge in better.edges:
         assert np.linalg.eigvalsh(edge.information).min() > 0
-    # Disconnected clouds stay, and so does a single one.
-    apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(20)])
-    same = refined(Planes(), views, apart)
-    assert not same.kept
-    np.testing.assert_array_equal(same.poses, apart)
     assert not refined(Planes(), views[:1], truth[:1]).kept
+
+
+@pytest.mark.parametrize("count", [2, 10, 20])
+def test_distant_clouds_are_not_moved(count):
+    views, _ = peaks_views(0.05, 2)
+    apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(count)])
+    same = refined(Planes(), views[:count], apart)
+    assert not same.kept
+    assert same.pairs == 0
+    np.testing.assert_array_equal(same.poses, apart)
 
 
 def test_view_of_another_place_does_not_drag_others():

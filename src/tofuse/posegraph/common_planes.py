@@ -53,8 +53,9 @@ class PlaneOptions:
     Attributes
     ----------
     coarsest
-        Size of the largest cells, as a fraction of the diagonal of the middle 90 % of all points;
-        refinement starts three sizes above the smallest that is flat initially.
+        Size of the largest cells, as a fraction of the extent of the median view (the diagonal of
+        the middle 90 % of its points): larger cells would contain views that share no surface.
+        Refinement starts three sizes above the smallest that is flat initially.
     shrink
         Ratio of successive sizes.
     iterations
@@ -121,6 +122,13 @@ class _Points:
     p: Float64
     view: Int64
     count: int
+
+    @cached_property
+    def extent(self) -> float:
+        """Extent of the median view, m; 0 if all are empty."""
+        ends = np.searchsorted(self.view, np.arange(1, self.count))
+        found = [extent(p) for p in np.split(self.p, ends) if len(p)]
+        return float(np.median(found)) if found else 0.0
 
     def world(self, poses: Float64) -> Float64:
         """(M, 3) points in the world, by poses (N, 4, 4)."""
@@ -219,7 +227,7 @@ def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
     The first is some steps above the smallest whose cells are flat at the initial poses; coarser
     ones than needed would lose accuracy. If none is flat, all sizes are returned.
     """
-    sizes, first = [options.coarsest * extent(points.world(poses))], 0
+    sizes, first = [options.coarsest * points.extent], 0
     while sizes[-1] > 0:
         cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
         thick, wide, most = cells.typical()
