@@ -126,7 +126,7 @@ def restore_thinned(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:
 def compare_views(
     views: Sequence[PreparedView], poses: Float64, groups: Sequence[int] | None = None
 ) -> CrossViewConsistency:
-    """Compare pairs of prepare_view views under their poses (N, 4, 4) T_world_camera.
+    """Compare pairs of prepared views under their poses (N, 4, 4) T_world_camera.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ SQUARES_G = 62
 WEIGHT_P = 63
 SQUARES_P = 64
 COUNT_P = 65
-SQUARES_M = 66  # of the inliers' compare_planes, m^2
+SQUARES_M = 66  # of the inliers' distances from planes, m^2
 # Histogram of the squared distances of all compared points, in unscaled variances: four equally
 # wide bins per octave, the first from 0 to 2^-8.
 HISTOGRAM = 67

@@ -33,7 +33,7 @@ def session_sentences(result: Reconstruction) -> list[str]:
 
 
 def change_counts(result: Reconstruction, pair: SessionPair) -> str:
-    """How many surfaces change_counts: "2 surfaces appeared and 1 vanished"; empty if none did."""
+    """How many surfaces changed: "2 surfaces appeared and 1 vanished"; empty if none did."""
     kinds = [c.change.kind for c in result.changes if (c.a, c.b) == (pair.a, pair.b)]
     counts = [(kinds.count(kind), kind) for kind in ("appeared", "vanished") if kind in kinds]
     if not counts:
