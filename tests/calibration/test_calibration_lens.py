@@ -65,8 +65,8 @@ def test_standard_deviations_bound_errors() -> None:
     assert found.sigma["fx"] < 0.003 * TRUE.fx
     assert found.sigma.keys() >= {"k1"}
     # Coefficients that the views do not constrain are fixed at 0, without a deviation.
-    held = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
-    assert all(getattr(found.camera, name) == 0 for name in held)
+    not_estimated = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
+    assert all(getattr(found.camera, name) == 0 for name in not_estimated)
     assert found.rms_px < 0.1
     assert found.before_px == pytest.approx(found.rms_px, abs=0.02)
 

@@ -291,8 +291,8 @@ def test_ranges_beyond_period_are_unwrapped(room_recording, tmp_path) -> None:
         words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
         assert main(words) == 0 or name == "near"
         made = run_json(tmp_path / name)
-        told = {finding["code"] for finding in made["findings"]}
-        assert ("phase_wrap" in told) == (name == "near")
+        codes = {finding["code"] for finding in made["findings"]}
+        assert ("phase_wrap" in codes) == (name == "near")
         points = read_ply(tmp_path / name / "cloud.ply").points
         farthest[name] = np.quantile(np.linalg.norm(points, axis=1), 0.9)
     true = np.quantile(frames[0].radial_range[frames[0].valid], 0.9)
@@ -792,8 +792,8 @@ def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_pat
 def test_optimize_command_keeps_refined_poses(plain_run, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
     assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert re.match(r"8 poses, \d+ edges: squared error", told)
+    output = capsys.readouterr().out
+    assert re.match(r"8 poses, \d+ edges: squared error", output)
     # The edges are those of the refinement, so there is nothing to improve.
     before, after = read_g2o(plain_run / "pose_graph.g2o"), read_g2o(out)
     assert after.ids.tolist() == list(range(8))
@@ -815,10 +815,10 @@ def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
     words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert "1 edge inconsistent with the others" in told
-    assert re.search(r"part from vertex 0: 5 poses, 8 edges", told)
-    assert re.search(r"part from vertex 9: 1 poses, 0 edges", told)
+    output = capsys.readouterr().out
+    assert "1 edge inconsistent with the others" in output
+    assert re.search(r"part from vertex 0: 5 poses, 8 edges", output)
+    assert re.search(r"part from vertex 9: 1 poses, 0 edges", output)
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
 
 

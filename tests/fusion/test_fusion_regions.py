@@ -95,12 +95,12 @@ def test_each_block_has_one_region_with_its_neighbours(room) -> None:
         assert len(region.rows) <= 300
         assert (np.diff(region.rows[: region.own]) > 0).all()
         assert len(np.unique(region.rows)) == len(region.rows)
-        held = set(region.rows.tolist())
+        contained = set(region.rows.tolist())
         for row in region.rows[: region.own]:
             i, j, k = block_of(int(layout.keys[row]))
             around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
             near = [place.get((i + a, j + b, k + c)) for a, b, c in around.tolist()]
-            assert held.issuperset(n for n in near if n is not None)
+            assert contained.issuperset(n for n in near if n is not None)
             assert (region.low < [i, j, k]).all()
             assert (region.high > [i + 1, j + 1, k + 1]).all()
     # Recursive halving: no region is much smaller than the others.

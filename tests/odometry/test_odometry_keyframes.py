@@ -246,28 +246,28 @@ PLAUSIBLE = {
 }
 
 
-def spoilt(request, scene, amplitude, spoil):
+def tracked_with_bad_frame(request, scene, amplitude, damage):
     sequence = request.getfixturevalue(scene)
     frames = list(sequence.frames) if amplitude else unlit(sequence.frames)
-    frames[BAD] = spoil(frames[BAD])
+    frames[BAD] = damage(frames[BAD])
     return run(frames), sequence.poses
 
 
 @pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
-@pytest.mark.parametrize("spoil", UNUSABLE.values(), ids=UNUSABLE.keys())
+@pytest.mark.parametrize("damage", UNUSABLE.values(), ids=UNUSABLE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_unusable_image_is_lost(request, scene, spoil, amplitude):
-    steps, poses = spoilt(request, scene, amplitude, spoil)
+def test_unusable_image_is_lost(request, scene, damage, amplitude):
+    steps, poses = tracked_with_bad_frame(request, scene, amplitude, damage)
     assert_lost(steps[BAD])
     assert components(steps) == [0] * BAD + [None] + [0] * (7 - BAD)
     assert_right(steps, poses)
 
 
 @pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
-@pytest.mark.parametrize("spoil", NONSENSE.values(), ids=NONSENSE.keys())
+@pytest.mark.parametrize("damage", NONSENSE.values(), ids=NONSENSE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_corrupted_image_stays_unconnected(request, scene, spoil, amplitude):
-    steps, poses = spoilt(request, scene, amplitude, spoil)
+def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
+    steps, poses = tracked_with_bad_frame(request, scene, amplitude, damage)
     found = components(steps)
     assert found[:BAD] == [0] * BAD
     assert found.count(found[BAD]) == 1
@@ -278,10 +278,10 @@ def test_corrupted_image_stays_unconnected(request, scene, spoil, amplitude):
     assert found[-1] == 0 or any(i < BAD < j for i, j in certain_links(steps))
 
 
-@pytest.mark.parametrize("spoil", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
+@pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
-def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, spoil):
-    steps, poses = spoilt(request, scene, True, spoil)
+def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, damage):
+    steps, poses = tracked_with_bad_frame(request, scene, True, damage)
     # Poses before it are correct; those after it are mutually consistent.
     assert components(steps)[:BAD] == [0] * BAD
     assert None not in components(steps)
@@ -290,10 +290,10 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, spoil
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
-@pytest.mark.parametrize("spoil", ["mirrored", "upside down", "turned round"])
-def test_run_of_wrong_images_forms_its_own_component(corner, spoil):
+@pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
+def test_run_of_wrong_images_forms_its_own_component(corner, damage):
     frames = list(corner.frames)
-    frames[3:6] = [PLAUSIBLE[spoil](frame) for frame in frames[3:6]]
+    frames[3:6] = [PLAUSIBLE[damage](frame) for frame in frames[3:6]]
     steps = run(frames)
     assert components(steps) == [0, 0, 0, 1, 1, 1, 2, 2]
     assert certain_links(steps)
@@ -302,9 +302,9 @@ def test_run_of_wrong_images_forms_its_own_component(corner, spoil):
     assert_right(steps, right)
 
 
-@pytest.mark.parametrize("spoil", [UNUSABLE["blank"], UNUSABLE["sparse"]], ids=["blank", "sparse"])
-def test_recording_may_start_with_corrupted_frames(room, spoil):
-    steps = run([spoil(room.frames[0]), spoil(room.frames[1]), *room.frames[2:]])
+@pytest.mark.parametrize("damage", [UNUSABLE["blank"], UNUSABLE["sparse"]], ids=["blank", "sparse"])
+def test_recording_may_start_with_corrupted_frames(room, damage):
+    steps = run([damage(room.frames[0]), damage(room.frames[1]), *room.frames[2:]])
     assert components(steps) == [None, None] + [0] * 6
     np.testing.assert_array_equal(steps[2].T_component_camera, np.eye(4))
     assert steps[2].reason == ""

@@ -533,8 +533,8 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
     def said(suspicion: CalibrationCheck) -> list[str]:
-        told = replace(refinement, calibration_check=suspicion)
-        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=told)
+        checked = replace(refinement, calibration_check=suspicion)
+        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=checked)
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = said(found)

@@ -80,7 +80,7 @@ def scripted(pairs):
         def push(self, view, T_component_camera):
             """Nothing to store."""
 
-        def look(self):
+        def detection_job(self):
             self.asked += 1
             here = [p for p in pairs if p[1] == self.asked - 1]
             if not here:
@@ -104,7 +104,7 @@ def test_loops_take_effect_after_fixed_delay():
 
 def test_error_in_job_is_raised():
     class Broken:
-        def look(self):
+        def detection_job(self):
             def work():
                 raise ZeroDivisionError
 
@@ -122,7 +122,7 @@ class _AlwaysClosing:
 
     points: ClassVar[bool] = False
 
-    def look(self):
+    def detection_job(self):
         record = LoopRecord(0, 1, True, "")
         return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
 

@@ -130,8 +130,8 @@ def test_flat_of_same_plan_is_not_joined(results) -> None:
     assert session_sentences(found) == [
         "elsewhere is not joined: no overlap with the first session could be confirmed."
     ]
-    (told,) = [r for r in found.diagnostics.reasons if r.code == "disconnected"]
-    assert "between here and elsewhere" in told.text
+    (reason,) = [r for r in found.diagnostics.reasons if r.code == "disconnected"]
+    assert "between here and elsewhere" in reason.text
     assert found.components[1].result.has_pose.all()
     assert exit_status(found) == 3
 
@@ -263,8 +263,8 @@ def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) ->
     """As results of earlier versions do."""
     again = copied(results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
-    told = {k: run["input"][k] for k in ("path", "format", "frames")}
-    changed_run_json(again, input=told)
+    stated = {k: run["input"][k] for k in ("path", "format", "frames")}
+    changed_run_json(again, input=stated)
     _, session = read_sessions([results["here"], again], 1, Silent())
     assert len(session.recording) == 12
     assert len(session.posed) == 12
@@ -276,8 +276,8 @@ def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
     opening = Opening(tuple(paths), every=2, start=1)
     recording = opening.open()
     result = reconstruct(recording, quick(), threads=2)
-    told = {**result.recording, "opening": opening.to_dict()}
-    write_result(replace(result, recording=told), OutputFolder(tmp_path / "both"))
+    of_both = {**result.recording, "opening": opening.to_dict()}
+    write_result(replace(result, recording=of_both), OutputFolder(tmp_path / "both"))
     sessions = read_sessions([tmp_path / "both", results["elsewhere"]], 1, Silent())
     assert sessions[0].recording.indices.tolist() == list(range(1, 24, 2))
     joined, firsts = merging.joined_recording(sessions)
@@ -301,13 +301,13 @@ def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> No
     monkeypatch.setattr(merging, "_report", lambda result, folder: None)
     into = copied(results["here"], tmp_path)
     (session, _) = read_sessions([results["there"], results["elsewhere"]], 1, Silent())
-    told = reconstruct(session.recording.select(end=2), quick())
+    shortened = reconstruct(session.recording.select(end=2), quick())
 
     def runs_to(folder: Path) -> None:
         """Every run returns this result, whatever the arguments."""
         shutil.rmtree(tmp_path / "new", ignore_errors=True)
         shutil.copytree(folder, tmp_path / "new")
-        monkeypatch.setattr(run_module, "run", lambda *_: told)
+        monkeypatch.setattr(run_module, "run", lambda *_: shortened)
 
     runs_to(results["there"])
     words = ["run", "recording", "--out", str(tmp_path / "new"), "--into", str(into)]

@@ -48,9 +48,9 @@ def made(folder: Path, *priors: object) -> Reconstruction:
 
 def test_priors_are_used_on_request_and_reported(beside, room_recording):
     alone, both = made(beside), made(beside, *BOTH)
-    told = {record.sensor: record for record in both.diagnostics.priors}
-    assert (told["gravity"].measured, told["gravity"].used) == (8, 8)
-    assert (told["odometry"].measured, told["odometry"].used) == (5, 5)
+    records = {record.sensor: record for record in both.diagnostics.priors}
+    assert (records["gravity"].measured, records["gravity"].used) == (8, 8)
+    assert (records["odometry"].measured, records["odometry"].used) == (5, 5)
     assert [s["sensor"] for s in run_json(both)["priors"]] == ["gravity", "odometry"]
     assert len(both.graph.edges) == len(alone.graph.edges) + 5
     assert both.graph.gravity is not None

@@ -108,8 +108,8 @@ def full_turn():
 def test_loop_is_closed_at_45_degrees_of_drift(full_turn):
     views, truth = full_turn
     poses = drifted(truth, 45)
-    blind = found_in(views, poses, Appearance(pairs=0))
-    assert not any(c.record.accepted for c in blind)
+    without_search = found_in(views, poses, Appearance(pairs=0))
+    assert not any(c.record.accepted for c in without_search)
     found = found_in(views, poses, Appearance(pairs=2))
     closed = [c for c in found if c.record.accepted]
     assert closed

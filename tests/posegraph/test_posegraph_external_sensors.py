@@ -89,24 +89,27 @@ def ate(poses: np.ndarray, right: np.ndarray) -> float:
 NODDING = np.array([0, 0, 0, 0.004, 0, 0])
 
 
-def solved(graph: PoseGraph, told: SensorPriors) -> np.ndarray:
-    return LevenbergMarquardt().optimise(with_sensors(graph, told)).graph.poses
+def solved(graph: PoseGraph, measured: SensorPriors) -> np.ndarray:
+    return LevenbergMarquardt().optimise(with_sensors(graph, measured)).graph.poses
 
 
 def test_gravity_removes_roll_and_pitch_drift():
     right = truth()
     graph = tracked(right, NODDING, stated=STATED)
-    told = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
-    held = solved(graph, told)
+    measured = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
+    corrected = solved(graph, measured)
     assert tilt(graph.poses, right) > np.radians(2.5)
-    assert tilt(held, right) < 0.4 * tilt(graph.poses, right)
-    np.testing.assert_array_equal(held[0], graph.poses[0])
-    assert told.records[0].used == N
-    up = told.up(graph.with_poses(held))
+    assert tilt(corrected, right) < 0.4 * tilt(graph.poses, right)
+    np.testing.assert_array_equal(corrected[0], graph.poses[0])
+    assert measured.records[0].used == N
+    up = measured.up(graph.with_poses(corrected))
     assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
     assert SensorPriors().up(graph) is None
     # Gravity does not constrain heading or position.
-    C, free = GraphCovariances(with_sensors(graph, told)).of_poses, GraphCovariances(graph).of_poses
+    C, free = (
+        GraphCovariances(with_sensors(graph, measured)).of_poses,
+        GraphCovariances(graph).of_poses,
+    )
     assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])
     assert C[-1, 4, 4] > 0.5 * free[-1, 4, 4]
 
@@ -132,9 +135,11 @@ def test_accelerated_motion_is_not_taken_for_gravity():
 def test_systematic_error_limits_accuracy_of_vertical():
     right = truth()
     graph = tracked(right, 0 * NODDING)
-    told = measure_all((GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph)
-    assert told.gravity is not None
-    together = (told.gravity[:, 3] ** -2.0).sum() ** -0.5
+    measured = measure_all(
+        (GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph
+    )
+    assert measured.gravity is not None
+    together = (measured.gravity[:, 3] ** -2.0).sum() ** -0.5
     assert 0.0095 < together < 0.0115
     few = sensed(gravity=np.where(np.arange(N)[:, None] < 2, seen_down(right), np.nan))
     none = measure_all((GravityEdges(),), few, graph)
@@ -176,11 +181,11 @@ def test_odometry_is_weighted_by_its_actual_errors():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     noisy = odometer(right, 0.1)
-    told = measure_all((OdometryEdges(relative=0.03, relative_rad=0.03),), sensed(noisy), graph)
-    record = told.records[0]
+    measured = measure_all((OdometryEdges(relative=0.03, relative_rad=0.03),), sensed(noisy), graph)
+    record = measured.records[0]
     assert record.scale is not None
     assert 1.5 < record.scale < 5
-    assert ate(solved(graph, told), right) < 1.1 * ate(graph.poses, right)
+    assert ate(solved(graph, measured), right) < 1.1 * ate(graph.poses, right)
 
 
 def test_odometry_errors_are_estimated_from_constrained_motion():
@@ -192,17 +197,19 @@ def test_odometry_errors_are_estimated_from_constrained_motion():
     slide = wall[graph.edges[:, 1]]
     measurements[slide] = np.eye(4)
     wrong = replace(graph, measurements=measurements)
-    told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), wrong)
-    assert told.verified
-    assert told.records[0].scale == 1
+    measured = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), wrong)
+    assert measured.verified
+    assert measured.records[0].scale == 1
     # If degenerate frames are unknown, their errors are attributed to the odometry.
-    blind = measure_all((OdometryEdges(),), sensed(odometer(right)), wrong)
-    assert blind.records[0].scale is None or blind.records[0].scale > 1
+    unmarked = measure_all((OdometryEdges(),), sensed(odometer(right)), wrong)
+    assert unmarked.records[0].scale is None or unmarked.records[0].scale > 1
     # With degenerate frames only, the odometry is not verified.
     nearly_all = np.arange(N) >= 8
-    told = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=nearly_all), graph)
-    assert told.steps
-    assert not told.verified
+    measured = measure_all(
+        (OdometryEdges(),), sensed(odometer(right), degenerate=nearly_all), graph
+    )
+    assert measured.steps
+    assert not measured.verified
 
 
 @pytest.mark.parametrize(
@@ -227,15 +234,15 @@ def test_jump_of_odometry_is_left_out():
     jumped = odometer(right)
     jumped[30:] = jumped[30:] @ np.eye(4)
     jumped[30:, :3, 3] += [0.5, 0, 0.2]
-    told = measure_all((OdometryEdges(),), sensed(jumped), graph)
-    assert {step.i for step in told.steps} == set(range(N - 1)) - {29}
+    measured = measure_all((OdometryEdges(),), sensed(jumped), graph)
+    assert {step.i for step in measured.steps} == set(range(N - 1)) - {29}
     # Nor are there steps across missing odometry or the start of another recording.
     holes = odometer(right)
     holes[10] = np.nan
     parts = (np.arange(N) >= 40).astype(np.intp)
-    told = measure_all((OdometryEdges(),), replace(sensed(holes), parts=parts), graph)
-    assert {step.i for step in told.steps} == set(range(N - 1)) - {9, 10, 39}
-    steps = told.between([0, 4, 8, 12, 39, 42])
+    measured = measure_all((OdometryEdges(),), replace(sensed(holes), parts=parts), graph)
+    assert {step.i for step in measured.steps} == set(range(N - 1)) - {9, 10, 39}
+    steps = measured.between([0, 4, 8, 12, 39, 42])
     assert [(s.i, s.j) for s in steps] == [(0, 4), (4, 8), (12, 39)]
     expected = se3.inverse(holes[4]) @ holes[8]
     np.testing.assert_allclose(steps[1].T_i_j, expected, atol=1e-9)
@@ -243,10 +250,10 @@ def test_jump_of_odometry_is_left_out():
 
 def test_missing_sensors_change_nothing():
     graph = tracked(truth(), NODDING)
-    told = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)
-    assert not told
-    assert told.records == ()
-    assert with_sensors(graph, told) is graph
+    measured = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)
+    assert not measured
+    assert measured.records == ()
+    assert with_sensors(graph, measured) is graph
 
 
 @pytest.mark.parametrize(
@@ -297,13 +304,13 @@ def test_refinement_takes_unconstrained_tilt_from_gravity():
     ).gravity_of(range(6))
     priors = replace(Priors.none(), gravity=gravity)
     free = refine(views, rolled, options)
-    held = refine(views, rolled, options, priors=priors)
+    corrected = refine(views, rolled, options, priors=priors)
 
     def off(found: np.ndarray) -> float:
         return float(se3.angle(se3.inverse(poses[-1]) @ found[-1]))
 
     assert off(free.poses) > 0.05
-    assert off(held.poses) < 0.01
+    assert off(corrected.poses) < 0.01
     # Without priors: the same to the last bit.
     same = refine(views, rolled, options, priors=Priors.none(), calibrate=[kernels.FOCAL])
     again = refine(views, rolled, options, calibrate=[kernels.FOCAL])

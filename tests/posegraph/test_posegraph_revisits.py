@@ -159,8 +159,8 @@ def test_loops_are_searched_again_after_views_moved(turn):
 
     first = accepted(far)
     assert (0, 12) not in first
-    assert not loops.look_again(dict(enumerate(far)))
-    assert loops.look_again(dict(enumerate(start)))
+    assert not loops.candidates_change(dict(enumerate(far)))
+    assert loops.candidates_change(dict(enumerate(start)))
     again = accepted(start)
     assert again >= first
     assert any(i == 0 and j >= 11 for i, j in again)

@@ -204,6 +204,6 @@ def test_damaged_folders_raise_only_package_errors(folder: Path, tmp_path: Path)
 def test_rig_is_reconstructed_by_one_command(folder: Path, tmp_path: Path, capfd) -> None:
     out = tmp_path / "model"
     assert main(["run", str(folder), "--out", str(out)]) == 0, capfd.readouterr().err
-    told = json.loads((out / "run.json").read_text())
-    assert told["rig"]["cameras"] == list(SERIALS)
-    assert [f["status"] for f in told["frames"]] == ["tracked"] * 4
+    written = json.loads((out / "run.json").read_text())
+    assert written["rig"]["cameras"] == list(SERIALS)
+    assert [f["status"] for f in written["frames"]] == ["tracked"] * 4

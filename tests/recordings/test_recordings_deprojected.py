@@ -77,8 +77,8 @@ def moved(points: Float32) -> Float32:
     return (points @ turn.T + (0.1, 0.2, 3.0)).astype(np.float32)
 
 
-@pytest.mark.parametrize("spoilt", ["moved", "merged", "averaged", "scattered", "behind", "few"])
-def test_other_clouds_stay_clouds(spoilt: str) -> None:
+@pytest.mark.parametrize("change", ["moved", "merged", "averaged", "scattered", "behind", "few"])
+def test_other_clouds_stay_clouds(change: str) -> None:
     rng = np.random.default_rng(1)
     points = cloud_of(seen(PINHOLE, 0)).points
     off = rng.normal(0, 0.004, points.shape).astype(np.float32)
@@ -90,7 +90,7 @@ def test_other_clouds_stay_clouds(spoilt: str) -> None:
         "scattered": scattered,
         "behind": -points,
         "few": points[:300],
-    }[spoilt]
+    }[change]
     assert find_deprojection([CloudFrame.of(other)]) is None
 
 

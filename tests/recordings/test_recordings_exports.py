@@ -50,8 +50,8 @@ def test_organised_clouds_become_images(tmp_path: Path, name: str) -> None:
     moved = [line for line in recording.warnings if "in front of the camera" in line]
     assert len(moved) == (name == "helios")
     if moved:
-        told = float(moved[0].split(" mm ")[0].rsplit(" ", 1)[1])
-        assert told == pytest.approx(1000 * BEHIND_M, abs=0.2)
+        stated = float(moved[0].split(" mm ")[0].rsplit(" ", 1)[1])
+        assert stated == pytest.approx(1000 * BEHIND_M, abs=0.2)
 
 
 @pytest.mark.parametrize("signs", [(-1, -1, 1), (1, -1, -1), (1, -1, 1)])

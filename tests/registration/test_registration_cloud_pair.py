@@ -183,10 +183,10 @@ def maps(source, target, size=0.12):
 
 def test_correct_pose_is_supported_and_not_contradicted(scans):
     source, target, true = scans
-    said = cloud_agreement(*maps(source, target), true)
-    assert said.support > 0.6
-    assert said.contradiction < 0.01
-    assert said.rms_m < 0.03
+    agreement = cloud_agreement(*maps(source, target), true)
+    assert agreement.support > 0.6
+    assert agreement.contradiction < 0.01
+    assert agreement.rms_m < 0.03
 
 
 def test_wrong_pose_is_contradicted_by_free_space(scans):
@@ -194,14 +194,16 @@ def test_wrong_pose_is_contradicted_by_free_space(scans):
     views = maps(source, target)
     right = cloud_agreement(*views, true)
     for wrong in (turn([0, 0, 1], 180), se3.exp([0.6, 0, 0, 0, 0, 0]), turn([1, 0, 0], 20)):
-        said = cloud_agreement(*views, true @ wrong)
-        assert said.violation > 0.02
-        assert said.score < right.score - 0.2
+        agreement = cloud_agreement(*views, true @ wrong)
+        assert agreement.violation > 0.02
+        assert agreement.score < right.score - 0.2
     # Without viewpoints, free space is unknown.
-    blind = maps(se3.transform(ANYWHERE, source.astype(float)), target)
-    assert blind[0].sphere is None
-    said = cloud_agreement(blind[0], replace(blind[1], sphere=None), turn([0, 0, 1], 180))
-    assert said.violation == 0
+    without_viewpoint = maps(se3.transform(ANYWHERE, source.astype(float)), target)
+    assert without_viewpoint[0].sphere is None
+    agreement = cloud_agreement(
+        without_viewpoint[0], replace(without_viewpoint[1], sphere=None), turn([0, 0, 1], 180)
+    )
+    assert agreement.violation == 0
 
 
 def with_mixed_pixels(aside):

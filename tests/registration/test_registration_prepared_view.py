@@ -295,11 +295,13 @@ def smoothed(sigma, seed):
 def test_curved_surface_is_planar_within_stated_noise():
     frame = smoothed(0.01, 1)
     strict = replace(OPTIONS, flatness=0.0, smoothed=NEVER)
-    blind = prepare_view(frame, strict)
-    told = prepare_view(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict)
+    without_sigma = prepare_view(frame, strict)
+    with_sigma = prepare_view(
+        replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict
+    )
     waves = np.s_[4:-4, 60:-4]
-    blind_fraction, told_fraction = ((v.planes[waves][..., 3] > 0).mean() for v in (blind, told))
-    assert blind_fraction < 0.75 < 0.95 < told_fraction
+    low, high = ((v.planes[waves][..., 3] > 0).mean() for v in (without_sigma, with_sigma))
+    assert low < 0.75 < 0.95 < high
 
 
 def test_nearly_flat_surface_is_planar_without_noise():
@@ -397,8 +399,8 @@ def test_colour_constrains_pose_before_flat_wall_at_any_exposure(gain):
     # Of coded values: includes the exponent of the gamma.
     assert aligned.exposure == pytest.approx(-np.log(gain) / 2.2, abs=0.02)
     bare = [prepare_view(f, OPTIONS) for f in (painted(color=False), painted(shift, color=False))]
-    blind = align(bare[1], [Target(bare[0], np.eye(4))], np.eye(4), ProjectiveOptions())
-    assert len(blind.unobservable) == 3
+    without_amplitude = align(bare[1], [Target(bare[0], np.eye(4))], np.eye(4), ProjectiveOptions())
+    assert len(without_amplitude.unobservable) == 3
 
 
 def test_saturated_and_dark_colour_is_invalid():

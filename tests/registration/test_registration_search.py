@@ -90,8 +90,8 @@ def scored(p, n, light, grid, frame, T, reach):
     cosine = np.maximum((plane[:, :3] * m).sum(1), 0)
     weight = fits * cosine * (1 - (r / reach) ** 2)
     lighter = plane[:, 4] - light
-    told = np.isfinite(lighter)
-    return weight.sum() - 2.0 * through.sum(), weight[told], lighter[told]
+    is_compared = np.isfinite(lighter)
+    return weight.sum() - 2.0 * through.sum(), weight[is_compared], lighter[is_compared]
 
 
 def small_poses(rng, count):

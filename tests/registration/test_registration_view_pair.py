@@ -307,8 +307,8 @@ def test_alignment_is_accepted_if_consistent_in_both_directions(pair):
 def test_large_margin_outweighs_degenerate_directions():
     """Otherwise poses along them would fit as well."""
     for margin in (0.02, 0.05):
-        held, loose = (Evidence(0.6, 0.0, margin, k).probability for k in (0, 1))
-        assert loose < held
+        supported, unsupported = (Evidence(0.6, 0.0, margin, k).probability for k in (0, 1))
+        assert unsupported < supported
     assert Evidence(0.6, 0.0, 0.2, 1).probability == Evidence(0.6, 0.0, 0.2).probability
 
 

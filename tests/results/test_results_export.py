@@ -40,8 +40,8 @@ def result(tmp_path: Path) -> Path:
     folder = tmp_path / "result"
     folder.mkdir()
     frames = [{"index": k, "timestamp": t} for k, t in ((1, 0.1), (2, 0.2), (3, 0.3), (5, 0.5))]
-    told = {"T_up_world": T_UP_WORLD.tolist(), "frames": frames}
-    text = json.dumps({"schema": 1, "version": "0", "verdict": "good"} | told)
+    fields = {"T_up_world": T_UP_WORLD.tolist(), "frames": frames}
+    text = json.dumps({"schema": 1, "version": "0", "verdict": "good"} | fields)
     (folder / "run.json").write_text(text)
     write_tum(folder / "trajectory.txt", TIMES, POSES)
     rng = np.random.default_rng(0)

@@ -126,19 +126,19 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stated = read_rig(out).cameras
     assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
     # Its accuracy is that of the rig, not that of one camera jumping from place to place.
-    told = json.loads((tmp_path / "model" / "run.json").read_text())
-    assert told["verdict"] == "good"
-    assert 0.005 < told["accuracy"]["position_m"] < 0.03
-    assert not told["reasons"]
+    run_json = json.loads((tmp_path / "model" / "run.json").read_text())
+    assert run_json["verdict"] == "good"
+    assert 0.005 < run_json["accuracy"]["position_m"] < 0.03
+    assert not run_json["reasons"]
     report = (tmp_path / "model" / "report.html").read_text()
     assert '<section id="rig">' in report
     assert "cam1, cam2</td>" in report
     assert ">cam2</text>" in report or ">cam2<" in report
 
     # The camera of each frame is stated: in the file, in the report and in the viewer.
-    told = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
-    assert told == {"cameras": ["cam0", "cam1", "cam2"], "of_frames": [0, 1, 2, 0, 1, 2]}
-    assert tofuse.load(tmp_path / "model").recording["rig"] == told
+    run_json = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
+    assert run_json == {"cameras": ["cam0", "cam1", "cam2"], "of_frames": [0, 1, 2, 0, 1, 2]}
+    assert tofuse.load(tmp_path / "model").recording["rig"] == run_json
     page = (tmp_path / "model" / "report.html").read_text(encoding="utf-8")
     assert re.findall(r'background:(rgb\(.*?\))"></i>(cam\d)', page) == [
         (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:3])
@@ -146,7 +146,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shown = read_content(tmp_path / "model").rig
     assert shown is not None
     assert shown.names == ("cam0", "cam1", "cam2")
-    assert shown.of_frames.tolist() == told["of_frames"]
+    assert shown.of_frames.tolist() == run_json["of_frames"]
 
 
 def test_displaced_camera_is_found(

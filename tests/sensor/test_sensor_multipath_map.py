@@ -186,7 +186,7 @@ class Recorder(Correction, Corrector):
     """Changes nothing, and records its calls."""
 
     expected: list[np.ndarray | None] = field(default_factory=list)
-    heard: list[tuple[int, np.ndarray]] = field(default_factory=list)
+    received: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -198,12 +198,12 @@ class Recorder(Correction, Corrector):
         return frame
 
     def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
-        self.heard.append((frame.index, T_world_camera))
+        self.received.append((frame.index, T_world_camera))
 
 
 def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
-    ear = Recorder()
-    mapper = Mapper(replace(from_method("default"), corrections=(ear,)))
+    listener = Recorder()
+    mapper = Mapper(replace(from_method("default"), corrections=(listener,)))
     world = (LEFT, RIGHT, FLOOR)
     frames = [replace(seen_from(turned(0.03 * k), *world).frame(), index=k) for k in range(5)]
     frames[3] = frames[3].keep(np.zeros(frames[3].depth.shape, bool))
@@ -211,13 +211,13 @@ def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
     assert poses[3] is None
     tracked = {k: T for k, T in enumerate(poses) if T is not None}
     assert {0, 1, 2} <= set(tracked)
-    assert [index for index, _ in ear.heard] == list(tracked)
-    for index, T in ear.heard:
+    assert [index for index, _ in listener.received] == list(tracked)
+    for index, T in listener.received:
         np.testing.assert_array_equal(T, tracked[index])
-    assert ear.expected[0] is None
-    assert ear.expected[1] is None
-    assert ear.expected[2] is not None
+    assert listener.expected[0] is None
+    assert listener.expected[1] is None
+    assert listener.expected[2] is not None
     motion = se3.inverse(tracked[0]) @ tracked[1]
-    np.testing.assert_allclose(ear.expected[2], tracked[1] @ motion, atol=1e-9)
+    np.testing.assert_allclose(listener.expected[2], tracked[1] @ motion, atol=1e-9)
     # After a lost frame the pose is unknown.
-    assert ear.expected[4] is None
+    assert listener.expected[4] is None

@@ -297,7 +297,7 @@ def test_command_serves_until_interrupted(folder):
     assert (p.returncode, out, err) == (0, "", "")
 
 
-class Heard(Silent):
+class Recorder(Silent):
     def __init__(self):
         self.frames, self.stages = [], []
 
@@ -315,17 +315,19 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
     from tofuse.viewer.server import address
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
-    heard = Heard()
+    recorder = Recorder()
     server = serve()
     try:
         live = LiveView(server)
         began = time.perf_counter()
-        watched_run = run([room_recording], Options(out=tmp_path / "a", end=4), Both(heard, live))
+        watched_run = run(
+            [room_recording], Options(out=tmp_path / "a", end=4), Both(recorder, live)
+        )
         assert live.first_seconds <= time.perf_counter() - began
         # The first frame is shown before any stage begins, and then each one with its pose.
-        assert heard.frames[0][0::2] == (0, 0)
-        assert [k for k, *_ in heard.frames[1:]] == [0, 1, 2, 3]
-        np.testing.assert_allclose(heard.frames[-1][1], watched_run.trajectory[3], atol=0.05)
+        assert recorder.frames[0][0::2] == (0, 0)
+        assert [k for k, *_ in recorder.frames[1:]] == [0, 1, 2, 3]
+        np.testing.assert_allclose(recorder.frames[-1][1], watched_run.trajectory[3], atol=0.05)
         place = address(server)
         with watched(browser, place, ours=place, viewport={"width": 700, "height": 460}) as seen:
             seen.page.get_by_text("writing").wait_for(timeout=30_000)

@@ -1,4 +1,4 @@
-"""Compensation of multipath: light that reaches a pixel by way of other surfaces."""
+"""Compensation of multipath: light that reaches a pixel after reflections at other surfaces."""
 
 from __future__ import annotations
 

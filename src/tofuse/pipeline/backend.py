@@ -269,7 +269,7 @@ class BackEnd:
                 break
             graph = accepted_only(self._config.optimiser.optimise(graph)).graph
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
-            if not self._kept.loops.look_again(poses):
+            if not self._kept.loops.candidates_change(poses):
                 break
             covariances = dict(
                 zip(graph.ids.tolist(), GraphCovariances(graph).of_poses, strict=True)

@@ -88,7 +88,7 @@ class Config(Bounded):
 
     @property
     def window(self) -> int:
-        """How many frames the filters look at, the current one included."""
+        """Number of frames that the filters use, the current one included."""
         return max([f.window for f in (*self.filters, *self.model_filters)], default=1)
 
     def to_dict(self) -> dict[str, Any]:

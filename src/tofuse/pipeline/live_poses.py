@@ -53,7 +53,7 @@ class LiveLoops:
             self.closed += found
             self._job = None
         if self._job is None:
-            work = self._loops.look()
+            work = self._loops.detection_job()
             if work is not None:
                 if self._pool is None:
                     self._pool = job_pool(1, "tofuse-loops")

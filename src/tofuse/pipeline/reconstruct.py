@@ -177,7 +177,7 @@ def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Sta
     recording
         The recording.
     window
-        Number of frames that filters look at, the current one included.
+        Number of frames that the filters use, the current one included.
     stages
         Stores the state whenever that is due.
     """

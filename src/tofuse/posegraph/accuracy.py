@@ -362,7 +362,7 @@ def _aligned(C: Float64, poses: Float64, rms: Bool) -> tuple[Float64, Float64]:
     poses
         (m, 4, 4).
     rms
-        (m,) poses that the alignment looks at.
+        (m,) poses that are aligned.
     """
     m = len(poses)
     C = C.reshape(m, 6, m, 6)

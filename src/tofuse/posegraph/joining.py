@@ -280,8 +280,9 @@ class _Joiner:
     def decide(self, *, single: bool = False) -> None:
         """Join islands as long as links support it, those with the largest weight first.
 
-        A single link is considered only at the end (`single`), unless the camera had no time to
-        get far: another room may look the same, and only links elsewhere contradict.
+        A single link is considered only at the end (`single`), unless the gap is too
+        short to reach another place: another room may look the same, and only links elsewhere
+        contradict.
         """
         while True:
             proposals = []

@@ -101,14 +101,14 @@ class Loops(Protocol):
         """Whether there are enough views for a second detection to be worthwhile."""
         return False
 
-    def look_again(self, poses: Mapping[int, Float64]) -> bool:
+    def candidates_change(self, poses: Mapping[int, Float64]) -> bool:
         """Whether `poses` differ so much from those of the last `finish` that candidates change.
 
         Then `finish` may be called again, with these.
         """
         return False
 
-    def look(self) -> Callable[[], list[ClosedLoop]] | None:
+    def detection_job(self) -> Callable[[], list[ClosedLoop]] | None:
         """Return a function that detects the loops that the newest frame closes; None without any.
 
         It may run on another thread while frames are added. `finish` returns its loops too.

@@ -95,8 +95,8 @@ class _NearbyLoops(Loops):
         for k in self._options.candidates(np.stack(list(self._poses.values()))):
             self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
 
-    def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.look`. They were found when the frame was added."""
+    def detection_job(self) -> Callable[[], list[ClosedLoop]] | None:
+        """See `Loops.detection_job`. They were found when the frame was added."""
         newest = next(reversed(self._poses))
         found = [loop for (_, j), loop in self._closed.items() if j == newest]
         return (lambda: found) if found else None

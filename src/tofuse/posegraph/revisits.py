@@ -208,8 +208,8 @@ class _RevisitLoops(Loops):
         """See `Loops.many`."""
         return len(self._chosen.views) > self._spacing.most
 
-    def look_again(self, poses: Mapping[int, Float64]) -> bool:
-        """See `Loops.look_again`."""
+    def candidates_change(self, poses: Mapping[int, Float64]) -> bool:
+        """See `Loops.candidates_change`."""
         posed = self._chosen.of(poses)
         before = np.array([self._poses[p.index] for p in posed])
         between = se3.inverse(before) @ np.array([poses[p.index] for p in posed])
@@ -221,8 +221,8 @@ class _RevisitLoops(Loops):
         self._confirmed = {p: c for p, c in self._confirmed.items() if c.record.accepted}
         return True
 
-    def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.descriptor`. Poses are comparable only within the current component so far."""
+    def detection_job(self) -> Callable[[], list[ClosedLoop]] | None:
+        """See `Loops.detection_job`. So far, poses are comparable only within a component."""
         posed = self._chosen.views
         if not posed or posed[-1].index != next(reversed(self._poses)):
             return None

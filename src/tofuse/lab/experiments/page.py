@@ -123,7 +123,7 @@ def _run_all(
     peaks = None
     if "peaks" in chosen:
         progress.stage("peaks: registering", seeds * len(SIGMAS_M))
-        peaks = sweep_peaks(range(seed, seed + seeds), told=progress.advance)
+        peaks = sweep_peaks(range(seed, seed + seeds), finished=progress.advance)
     return Results(found, peaks)
 
 

@@ -200,14 +200,14 @@ class PeaksSweep:
 def sweep_peaks(
     seeds: Sequence[int],
     sigmas: Sequence[float] = SIGMAS_M,
-    told: Callable[[], None] = lambda: None,
+    finished: Callable[[], None] = lambda: None,
 ) -> PeaksSweep:
-    """Run every sigma with every seed, and average; calls `told` after every run."""
+    """Run every sigma with every seed, and average; calls `finished` after every run."""
     runs = []
     for sigma in sigmas:
         for seed in seeds:
             runs.append(run_peaks(sigma, seed))
-            told()
+            finished()
     position, rotation, axes = (
         _by_seed(runs, len(sigmas), name) for name in ("position", "rotation", "axes")
     )

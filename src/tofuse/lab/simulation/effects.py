@@ -127,12 +127,12 @@ class Flag(IntFlag):
     WRAPPED = 16
     """Measured in another period than the true one (beyond the ambiguity, or unwrapped wrongly)."""
     MULTIPATH = 32
-    """Light by way of another surface moves the range by more than 3 mm."""
+    """Light reflected by another surface changes the range by more than 3 mm."""
     SCATTER = 64
-    """Light scattered in the lens moves the range by more than 3 mm."""
+    """Light scattered in the lens changes the range by more than 3 mm."""
     SMEAR = 128
-    """Motion between the phase images moves the range by more than 3 mm."""
+    """Motion between the phase images changes the range by more than 3 mm."""
     MIRROR = 256
-    """More than a tenth of the light came by way of a mirroring surface."""
+    """More than a tenth of the light was reflected by a mirror."""
     PASSING = 512
     """On a thing that moves through the scene; no error of the camera."""

@@ -38,8 +38,8 @@ class Arducam:
         saw = f"{len(images)} depth images of Arducam's examples"
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{saw} and camera.json")
-        settle = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(UNSURE, saw, settle)
+        remedy = "use --format arducam with --camera: lens and unit are not in such files"
+        return Sniff(UNSURE, saw, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""

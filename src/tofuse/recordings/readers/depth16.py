@@ -38,8 +38,8 @@ class Depth16:
         saw = f"{len(files)} DEPTH16 images"
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{saw} and camera.json")
-        settle = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(UNSURE, saw, settle)
+        remedy = "use --format depth16 with --camera: size and lens are not in such files"
+        return Sniff(UNSURE, saw, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""

@@ -93,7 +93,7 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
     used = np.flatnonzero(crossings.ravel())
     corner = np.stack(np.unravel_index(used, cells), -1)
     vertices = start + step * (corner + total.reshape(-1, 3)[used] / crossings.ravel()[used, None])
-    vertices = settled(shape, vertices, step)
+    vertices = projected(shape, vertices, step)
     number = np.full(index.size, -1)
     number[used] = np.arange(len(used))
     q = number[np.concatenate(quads)]
@@ -123,7 +123,7 @@ def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
     return np.where(outward[:, None], quads, quads[:, ::-1])
 
 
-def settled(shape: Shape, vertices: Float64, step: float) -> Float64:
+def projected(shape: Shape, vertices: Float64, step: float) -> Float64:
     """Project vertices onto the surface along its gradient, by at most half a cell."""
     moved = vertices
     h = 1e-4

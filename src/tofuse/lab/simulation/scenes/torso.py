@@ -79,7 +79,7 @@ def person() -> tuple[Mesh, list[Material]]:
         """Distance (4, V) in m of points to the nearest part of each material."""
         return np.stack([np.min([s(p) for s, _, m in parts if m is own], 0) for own in materials])
 
-    vertices = implicit.settled(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
+    vertices = implicit.projected(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
     mesh = Mesh(vertices, mesh.faces, mesh.surface)
     return Mesh(vertices, mesh.faces, distances(mesh.corners().mean(1)).argmin(0)), materials
 
