@@ -1,6 +1,6 @@
 """Does `tofuse judge` separate good trajectories from corrupted ones, and rank several rightly?
 
-`spoilt` judges the exact trajectory of simulated recordings (for real ones that of the default
+`corrupted` judges the exact trajectory of simulated recordings (for real ones that of the default
 method, or a reference accurate to a millimetre) with 1 mm and 0.02 degrees of noise, and corrupted
 versions of it at two magnitudes: drift, a jump, a scale error, a time offset, and smoothing.
 Printed, by kind of corruption and by error, are the error (rms displacement of the surfaces in
@@ -12,7 +12,7 @@ best fit. Registrations are computed once per recording, around the good poses; 
 trajectory is judged from scratch. `programs` judges the trajectories of several programs, and
 compares their ranking with that by true error and by map consistency.
 
-    python benchmarks/judging.py spoilt [--scenes room flat] [--seeds 10] [--real] [--whole]
+    python benchmarks/judging.py corrupted [--scenes room flat] [--seeds 10] [--real] [--whole]
     python benchmarks/judging.py programs [--only room]
 """
 
@@ -343,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("what", choices=["spoilt", "programs"])
+    parser.add_argument("what", choices=["corrupted", "programs"])
     parser.add_argument("--scenes", nargs="+", default=["room", "rail", "flat"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[10])
     parser.add_argument("--sizes", nargs="+", type=float, default=SIZES)

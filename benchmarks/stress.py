@@ -221,8 +221,8 @@ class Case:
     truth: Truth
 
 
-def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = ()) -> Intp:
-    """Index (N,) of the group of overlapping frames; -1 if blind or isolated.
+def groups(frames: Sequence[RangeFrame], poses: Float64, unusable: Sequence[int] = ()) -> Intp:
+    """Index (N,) of the group of overlapping frames; -1 if unusable or isolated.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
         Frames of the camera; they are subsampled to about 40 x 30 pixels.
     poses
         (N, 4, 4) true poses.
-    blind
+    unusable
         Positions of frames in which the scene is not visible.
     """
     n = len(frames)
@@ -245,7 +245,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
         clouds.append(np.column_stack([xy[good], np.ones(good.sum())]) * flat[good, None])
         images.append(z)
     fraction = np.zeros((n, n))
-    seeing = [k for k in range(n) if k not in set(blind) and len(clouds[k]) > 20]
+    seeing = [k for k in range(n) if k not in set(unusable) and len(clouds[k]) > 20]
     for i in seeing:
         T = se3.inverse(poses[i]) @ poses
         centre = T[:, :3, 3]
@@ -274,20 +274,20 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = 
 
 
 def as_case(
-    scene: str, name: str, took: Take, *, blind: Sequence[int] = (), seen: Take | None = None
+    scene: str, name: str, took: Take, *, unusable: Sequence[int] = (), seen: Take | None = None
 ) -> Case:
     """Make a case of a take.
 
     Parameters
     ----------
-    blind
+    unusable
         Positions of frames in which the scene is not visible, or gives no constraints.
     seen
         The undisturbed frames, if the disturbance hides the overlap.
     """
     frames = [replace(frame, index=k) for k, frame in enumerate(took.frames)]
     clear = took if seen is None else seen
-    label = groups(clear.frames, took.poses, blind)
+    label = groups(clear.frames, took.poses, unusable)
     source = ArraySource(frames, took.poses, metadata=dict(took.metadata))
     recording = Recording.of(source, f"{scene}, {name}", "simulated")
     return Case(scene, name, recording, Truth(took.poses, label))
@@ -450,7 +450,7 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
                 rng: np.random.Generator, name: str, seconds: float = seconds, how: str = how
             ) -> Case:
                 took, bad = hidden(base(), seconds, how, rng)
-                return as_case(scene.name, name, took, blind=bad)
+                return as_case(scene.name, name, took, unusable=bad)
 
             add(f"lens covered by a {how}, {seconds:g} s", hide)
     kinds: tuple[Kind, ...] = ("box", "person")
@@ -488,7 +488,7 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
     def bare(rng: np.random.Generator, name: str) -> Case:
         took = take(scene, seed, motion="close-up")
         near = np.linalg.norm(took.poses[:, :3, 3] - np.array(scene.bare[0]), axis=1) < 0.25
-        return as_case(scene.name, name, took, blind=np.flatnonzero(near).tolist())
+        return as_case(scene.name, name, took, unusable=np.flatnonzero(near).tolist())
 
     def places(rng: np.random.Generator, name: str) -> Case:
         # Another room of the same flat has known poses; other scenes have not.

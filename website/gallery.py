@@ -124,20 +124,20 @@ def draw(result: Path, truth: Path) -> bytes:
 
 def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
     """Markdown of one exhibit."""
-    told = read_run_json(result / "run.json")
-    posed = len(frames_in_main_model(told))
+    run_json = read_run_json(result / "run.json")
+    posed = len(frames_in_main_model(run_json))
     error = evaluate_trajectory(*read_tum(result / "trajectory.txt"), *read_tum(truth))
     yield f"### {exhibit.title}\n"
     yield f"![{exhibit.title}, seen from above]({exhibit.name}.png)\n"
     yield f"{exhibit.caption}\n"
     yield (
-        f"Verdict: **{told['verdict']}**; {posed} of {len(told['frames'])} frames have a pose;"
-        f" error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
+        f"Verdict: **{run_json['verdict']}**; {posed} of {len(run_json['frames'])} frames have a"
+        f" pose; error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
         f" {np.degrees(error.rotation_rms_rad):.2f} degrees."
     )
-    if told["reasons"]:
+    if run_json["reasons"]:
         yield "\nReasons of the verdict, and notes:\n"
-        yield from (f"- `{r['code']}`: {r['text']}" for r in told["reasons"])
+        yield from (f"- `{r['code']}`: {r['text']}" for r in run_json["reasons"])
     yield ""
 
 

@@ -46,8 +46,10 @@ def moved(poses, *twist):
 
 
 def record(index, status="tracked", covariance=None, unobservable=()):
-    held = np.array(unobservable, float).reshape(-1, 6)
-    return SimpleNamespace(index=index, status=status, covariance=covariance, unobservable=held)
+    directions = np.array(unobservable, float).reshape(-1, 6)
+    return SimpleNamespace(
+        index=index, status=status, covariance=covariance, unobservable=directions
+    )
 
 
 def part(scoring, poses, reasons=(), **options):
@@ -248,7 +250,7 @@ def test_groups_are_overlapping_frames(stress) -> None:
     poses = took.poses.copy()
     poses[6:, 0, 3] += 1.6  # of the 2 m in view
     np.testing.assert_array_equal(stress.groups(took.frames, poses), [0] * 6 + [1] * 6)
-    found = stress.groups(took.frames, poses, blind=[2, 3])
+    found = stress.groups(took.frames, poses, unusable=[2, 3])
     np.testing.assert_array_equal(found, [0, 0, -1, -1, 0, 0] + [1] * 6)
     poses[11, 0, 3] += 50
     assert stress.groups(took.frames, poses)[11] == -1
@@ -258,16 +260,16 @@ def test_groups_are_overlapping_frames(stress) -> None:
 def test_covered_lens_hides_scene(stress, how) -> None:
     took = made_take(stress)
     rng = np.random.default_rng(1)
-    spoilt, bad = stress.hidden(took, 1.0, how, rng)
+    covered, bad = stress.hidden(took, 1.0, how, rng)
     assert len(bad) == 10
     assert bad == list(range(bad[0], bad[0] + 10))
     assert 0 < bad[0] < bad[-1] < 39
-    for k, frame in enumerate(spoilt.frames):
+    for k, frame in enumerate(covered.frames):
         same = (frame.depth == 2.0).mean()
         assert same == 1 if k not in bad else same < 0.12
         if k in bad:
             assert frame.depth.max() == 0 if how == "lid" else np.median(frame.depth) < 0.2
-    case = stress.as_case("wall", how, spoilt, blind=bad)
+    case = stress.as_case("wall", how, covered, unusable=bad)
     np.testing.assert_array_equal(case.truth.groups >= 0, [k not in bad for k in range(40)])
     assert [frame.index for frame in case.recording] == list(range(40))
 

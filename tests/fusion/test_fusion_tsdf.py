@@ -262,10 +262,10 @@ def test_weights_reflect_residual_noise(sigma) -> None:
     pixels = pixels_of(view)[5:-5, 5:-5].astype(float)
     lengths = np.linalg.norm(np.insert(CAMERA.rays(), 2, 1, -1), axis=-1)[5:-5, 5:-5]
     cosine = np.clip(pixels[..., 2] / lengths, 0.5, 1)
-    said = 1 / (cosine * np.sqrt(np.maximum(pixels[..., 4], 1e-9)))
+    stated = 1 / (cosine * np.sqrt(np.maximum(pixels[..., 4], 1e-9)))
     fitted = pixels[..., 4] > 0
     assert fitted.mean() > 0.9
-    ratio = off[fitted].std() / np.median(said[fitted])
+    ratio = off[fitted].std() / np.median(stated[fitted])
     assert 0.2 < ratio < 1.6  # possible relief counts as uncertainty, but not as noise
     assert off[fitted].std() < sigma
 

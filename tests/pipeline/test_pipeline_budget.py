@@ -29,8 +29,8 @@ def test_default_budget_equals_fusion_default() -> None:
 def test_configured_memory_is_divided_too() -> None:
     config = changed(from_method("default"), {"memory_mb": 500}, where="test")
     assert (config.memory_mb, config.fusion.memory_mb) == (500, voxels_mb(500))
-    said = {"memory_mb": 500, "fusion": {"memory_mb": 90}}
-    assert changed(config, said, where="test").fusion.memory_mb == 90
+    changes = {"memory_mb": 500, "fusion": {"memory_mb": 90}}
+    assert changed(config, changes, where="test").fusion.memory_mb == 90
     assert changed(config, {"fusion": {"memory_mb": 80}}, where="test").memory_mb == 500
     with pytest.raises(InputError, match="memory_mb"):
         changed(config, {"memory_mb": "much"}, where="test")

@@ -355,9 +355,9 @@ def test_valid_but_wrong_state_ends_in_one_line(turned_box: Path, tmp_path, capf
         Checkpoints(out, key, pytest.fail).save("tracking", state)
         capfd.readouterr()
         assert main(words) == 2
-        said = capfd.readouterr().err
-        assert said.startswith(f"tofuse: {folder}: can't resume from the checkpoint")
-        assert said.count("\n") == 1
+        message = capfd.readouterr().err
+        assert message.startswith(f"tofuse: {folder}: can't resume from the checkpoint")
+        assert message.count("\n") == 1
         assert not folder.exists()
         assert not (out / "run.json").exists()
 
@@ -466,13 +466,13 @@ def test_repeatedly_killed_run_gives_same_bytes(
     rng = np.random.default_rng(5)
     # In tracking or after it, and at the moves of files.
     for how in ({"event": int(rng.integers(3, 20))}, {"move": int(rng.integers(1, 8))}):
-        status, said = killed(out, *words, **how)
-        assert status == -signal.SIGKILL, said
+        status, message = killed(out, *words, **how)
+        assert status == -signal.SIGKILL, message
         assert not (out / "run.json").exists()
     assert (out / STAGING).is_dir()
-    status, said = killed(out, *words)
+    status, message = killed(out, *words)
     assert status == 0
-    assert "resumes after frame 4" in said
+    assert "resumes after frame 4" in message
     assert {p.name for p in out.iterdir()} == {p.name for p in whole.iterdir()}
     for name in SAME:
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
@@ -536,6 +536,6 @@ def test_spilled_images_survive_checkpoint_in_pieces(
     data = bytearray(path.read_bytes())
     data[data.index(depths[0].tobytes()[:50])] ^= 1
     path.write_bytes(data)
-    said: list[str] = []
-    assert Checkpoints(tmp_path / "out", "key", said.append).load("stage") is None
-    assert "damaged" in said[0]
+    notes: list[str] = []
+    assert Checkpoints(tmp_path / "out", "key", notes.append).load("stage") is None
+    assert "damaged" in notes[0]

@@ -31,8 +31,10 @@ def registration(share=0.5, converged=True, unheld=False) -> Registration:
     return Registration(STEP, converged, 10, found, 1000, 0.3, 0.01, np.eye(6) * 1e4, free)
 
 
-def pair(i, j, share=0.95, rms=0.004, said=10_000) -> PairConsistency:
-    return PairConsistency(i, j, share * said, (1 - share) * said, share * said * rms**2)
+def pair(i, j, share=0.95, rms=0.004, compared=10_000) -> PairConsistency:
+    return PairConsistency(
+        i, j, share * compared, (1 - share) * compared, share * compared * rms**2
+    )
 
 
 def seen(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> CrossViewConsistency:
@@ -350,10 +352,10 @@ def test_excess_distance_of_far_views_counts_in_accuracy() -> None:
 
 
 def test_inconsistent_views_are_named() -> None:
-    said = tuple(
+    pairs = tuple(
         pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
     )
-    (reason,) = judge(evidence(images=CrossViewConsistency(tuple(range(0, 18, 2)), said)))[1]
+    (reason,) = judge(evidence(images=CrossViewConsistency(tuple(range(0, 18, 2)), pairs)))[1]
     assert (reason.code, reason.ranges) == ("images_differ", ((12, 12),))
     assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
 
@@ -532,21 +534,21 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     found = CalibrationCheck(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
-    def said(suspicion: CalibrationCheck) -> list[str]:
+    def warnings_of(suspicion: CalibrationCheck) -> list[str]:
         checked = replace(refinement, calibration_check=suspicion)
         case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=checked)
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
-    (text,) = said(found)
+    (text,) = warnings_of(found)
     assert "a focal length 5.3% larger, but no loop closure confirms it" in text
-    (text,) = said(UNDETERMINED)
+    (text,) = warnings_of(UNDETERMINED)
     assert "does not determine the camera's focal length" in text
     assert text.endswith("An error of 1% would move the poses by 30 mm.")
     small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
-    assert said(replace(found, gap=small)) == said(found)
+    assert warnings_of(replace(found, gap=small)) == warnings_of(found)
     gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02), 1.0, (0.03, 0.02))  # changed, not closed
     short = Gap(2, 4, (0.03, 0.02), (0.03, 0.02), 1.0, (0.003, 0.002))  # hardly changed
-    assert said(replace(found, gap=short)) == said(found)
+    assert warnings_of(replace(found, gap=short)) == warnings_of(found)
     for quiet in (
         CalibrationCheck(focal_sigma=0.001),  # determined, and as stated
         CalibrationCheck(),  # not asked: too few views
@@ -554,7 +556,7 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
         replace(found, gap=gap),  # a loop speaks against it
         replace(found, alarm=True, gap=gap),  # which is an alarm
     ):
-        assert said(quiet) == []
+        assert warnings_of(quiet) == []
 
 
 def test_calibration_alarm_states_error_and_remedy() -> None:

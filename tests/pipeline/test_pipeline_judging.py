@@ -184,10 +184,10 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     report = (tmp_path / "out/report.html").read_text()
     assert "poses.txt: ±" in report
     assert "Inconsistent with the depth: surfaces displaced by about" in report
-    said = kept["deviation"]
-    assert 0 < said["at_least_m"] <= said["estimate_m"] <= said["at_most_m"]
-    assert len(said["frames"]) == len(said["of_frames_m"])
-    assert said["inconsistent_steps"] == [[3, 4]]
+    deviation = kept["deviation"]
+    assert 0 < deviation["at_least_m"] <= deviation["estimate_m"] <= deviation["at_most_m"]
+    assert len(deviation["frames"]) == len(deviation["of_frames_m"])
+    assert deviation["inconsistent_steps"] == [[3, 4]]
     # Its result is replaced only on request, and is a trajectory itself.
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
@@ -214,15 +214,15 @@ def test_device_poses_are_judged_by_default(recording, truth) -> None:
     result = tofuse.reconstruct(recording)
     assert device_sentence(recording, result) == ""  # a simulation has no device
     phone = phone_of(recording, bent(truth))
-    said = device_sentence(phone, result)
-    match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", said)
+    sentence = device_sentence(phone, result)
+    match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", sentence)
     assert match is not None
     wrong, _ = displacement(truth, bent(truth))
     assert wrong < float(match[1]) / 1e3 < 1.6 * wrong
     assert float(match[2]) < 12
     loose = replace(result.diagnostics, accuracy=Accuracy(assessed=True))
-    said = device_sentence(phone, replace(result, diagnostics=loose))
-    assert said.startswith("ARKit's poses differ from these by ")
+    sentence = device_sentence(phone, replace(result, diagnostics=loose))
+    assert sentence.startswith("ARKit's poses differ from these by ")
 
 
 def phone_of(recording, poses):

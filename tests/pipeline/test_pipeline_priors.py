@@ -101,8 +101,8 @@ def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
     np.testing.assert_array_equal(led.odometry, odometry)
     assert kinds(config) == [GravityEdges, OdometryEdges]
     # The odometry of a configuration is kept.
-    said = replace(from_method("default"), priors=(OdometryEdges(relative=0.1),))
-    assert with_prior(phone, said, "device")[1] is said
+    with_odometry = replace(from_method("default"), priors=(OdometryEdges(relative=0.1),))
+    assert with_prior(phone, with_odometry, "device")[1] is with_odometry
 
 
 def test_unknown_prior_is_refused(recording) -> None:

@@ -175,7 +175,7 @@ def test_correct_focal_length_is_unchanged(recording) -> None:
     assert "self_calibrated" not in {r.code for r in result.diagnostics.reasons}
 
 
-def said(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
+def assessed(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
     """A result whose views reveal an error of the focal length."""
     found = CalibrationCheck(
         error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal"
@@ -198,7 +198,7 @@ def any_result(room_recording):
 
 
 def test_no_correction_without_alarm(any_result) -> None:
-    first = said(any_result, None, 0.1)
+    first = assessed(any_result, None, 0.1)
 
     def never(config):
         raise AssertionError("reconstructed again")
@@ -207,9 +207,9 @@ def test_no_correction_without_alarm(any_result) -> None:
 
 
 def test_correction_undone_by_views_is_dropped(any_result) -> None:
-    first = said(any_result, 0.1, 0.2)
+    first = assessed(any_result, 0.1, 0.2)
     for left, kept in ((-0.05, False), (-0.005, True), (0.05, True)):
-        undone = said(any_result, left, 0.05)
+        undone = assessed(any_result, left, 0.05)
         check = undone.diagnostics.refinement.calibration_check
         refinement = replace(
             undone.diagnostics.refinement, calibration_check=replace(check, alarm=False)
@@ -229,12 +229,12 @@ def test_correction_undone_by_views_is_dropped(any_result) -> None:
     ],
 )
 def test_correction_is_kept_only_if_it_helps(any_result, again, kept) -> None:
-    first = said(any_result, 0.05, 0.1)
+    first = assessed(any_result, 0.05, 0.1)
     configs = []
 
     def once(config):
         configs.append(config)
-        return said(any_result, None, **again)
+        return assessed(any_result, None, **again)
 
     result = self_calibrated(first, from_method("default"), once, Silent())
     assert (result.diagnostics.calibrated is not None) == kept
@@ -243,26 +243,28 @@ def test_correction_is_kept_only_if_it_helps(any_result, again, kept) -> None:
 
 
 def test_support_decides_where_nothing_is_bounded(any_result) -> None:
-    first = said(any_result, 0.05, np.inf)
+    first = assessed(any_result, 0.05, np.inf)
     for support, kept in ((0.6, True), (0.4, False)):
         result = self_calibrated(
             first,
             from_method("default"),
-            lambda _, s=support: said(any_result, None, np.inf, support=s),
+            lambda _, s=support: assessed(any_result, None, np.inf, support=s),
             Silent(),
         )
         assert (result.diagnostics.calibrated is not None) == kept
 
 
 def test_second_estimate_is_composed_with_first(any_result) -> None:
-    results = iter([said(any_result, 0.01, 0.05), said(any_result, 0.01, 0.02)])
+    results = iter([assessed(any_result, 0.01, 0.05), assessed(any_result, 0.01, 0.02)])
     configs = []
 
     def once(config):
         configs.append(config)
         return next(results)
 
-    result = self_calibrated(said(any_result, 0.04, 0.1), from_method("default"), once, Silent())
+    result = self_calibrated(
+        assessed(any_result, 0.04, 0.1), from_method("default"), once, Silent()
+    )
     assert result.diagnostics.calibrated is not None
     assert result.diagnostics.calibrated.focal == pytest.approx(1.04 * 1.01 - 1)
     # Each time relative to the stated calibration, not to the corrected one.
@@ -271,7 +273,7 @@ def test_second_estimate_is_composed_with_first(any_result) -> None:
 
 
 def test_excessive_correction_is_not_applied(any_result) -> None:
-    first = said(any_result, 0.7, 0.1)
+    first = assessed(any_result, 0.7, 0.1)
 
     def never(config):
         raise AssertionError("reconstructed again")

@@ -82,9 +82,9 @@ def test_correction_is_left_out_with_too_few_views(straight: Recording) -> None:
     assert multipath_of(config) == Multipath(trial=False, applied=False)
     assert [n for n in listener.notes if "too few views" in n]
     result = tofuse.reconstruct(few, config)
-    said = [r for r in result.diagnostics.reasons if r.code == "correction_left_out"]
-    assert len(said) == 1
-    assert "multipath" in said[0].text
+    left_out = [r for r in result.diagnostics.reasons if r.code == "correction_left_out"]
+    assert len(left_out) == 1
+    assert "multipath" in left_out[0].text
 
 
 def test_explicit_settings_are_not_tried(straight: Recording) -> None:

@@ -64,8 +64,8 @@ def test_focal_length_without_rotation_is_undetermined():
 
     def sigma(views: list[KeptView], poses: np.ndarray) -> float:
         pairs = refine(views, poses, OPTIONS).pairs
-        said = response(views, poses, pairs, OPTIONS)
-        return float(said.sigma(pairs, len(views))[kernels.FOCAL])
+        responses = response(views, poses, pairs, OPTIONS)
+        return float(responses.sigma(pairs, len(views))[kernels.FOCAL])
 
     assert sigma(views, truth) > 0.1
     assert sigma(turned, path(12)) < 0.02

@@ -89,8 +89,8 @@ def test_inconsistent_outliers_are_left_out(seed) -> None:
     right = truth + rng.normal(0, 0.02, (6, 3))
     wrong = rng.uniform(-5, 5, (24, 3))
     order = rng.permutation(30)
-    said = np.concatenate([right, wrong])[order]
-    consistent = np.linalg.norm(said[:, None] - said, axis=-1) < 0.2
+    measured = np.concatenate([right, wrong])[order]
+    consistent = np.linalg.norm(measured[:, None] - measured, axis=-1) < 0.2
     found = maximum_consistent_set(consistent)
     assert sorted(order[found]) == list(range(6))
 

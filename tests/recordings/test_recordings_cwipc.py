@@ -128,7 +128,7 @@ SCALED[:3, :3] *= 2
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (config(6), "version is 6, not 3, 4, 5"),
         (config(True), "version is True"),
@@ -148,9 +148,9 @@ SCALED[:3, :3] *= 2
         (changed(1, type="synthetic"), r"camera\[1\]\.type is synthetic"),
     ],
 )
-def test_invalid_files_are_refused(folder: Path, data: dict, said: str) -> None:
+def test_invalid_files_are_refused(folder: Path, data: dict, message: str) -> None:
     rewrite(folder, data)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=message) as error:
         open_recording(folder)
     assert len(str(error.value).splitlines()) == 1
 

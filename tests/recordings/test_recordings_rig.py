@@ -35,7 +35,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda d: d.update(schema=2), "schema is 2"),
         (lambda d: d.pop("cameras"), "cameras is not a list"),
@@ -49,12 +49,12 @@ def test_round_trip(tmp_path: Path) -> None:
         (lambda d: d["disagreement"][0].update(a="top"), "does not name two cameras"),
     ],
 )
-def test_invalid_files_are_refused(tmp_path: Path, change, said: str) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, change, message: str) -> None:
     data = made().to_dict()
     change(data)
     path = tmp_path / "rig.json"
     path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=message) as error:
         read_rig(path)
     assert "\n" not in str(error.value)
 

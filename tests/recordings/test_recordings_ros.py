@@ -375,10 +375,10 @@ def test_hostile_folders_are_rejected(tmp_path: Path, name: str) -> None:
     bag.info("/camera/depth/camera_info")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
     path = bag.close()
-    said, spoil = HOSTILE[name]
-    spoil(path)
+    message, corrupt = HOSTILE[name]
+    corrupt(path)
     for format_ in ("ros", "realsense-bag"):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             open_recording(path, format=format_)
 
 

@@ -219,13 +219,13 @@ def test_laz_with_more_points_than_its_chunks(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     data.write(path)
     content = bytearray(path.read_bytes())
-    for count, said in (
+    for count, message in (
         (60_000, "chunk table: 50000 points"),
         (90_000_000, "90000000 points don't fit"),
     ):
         struct.pack_into("<I", content, 107, count)
         path.write_bytes(content)
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             tofuse.open(path)
 
 

@@ -108,9 +108,9 @@ def test_implausible_numbers_are_refused(field, value, recording, tmp_path, capf
     path = recording / "camera.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     assert main(["run", str(recording), "--out", str(tmp_path / "out")]) == 2
-    said = capfd.readouterr().err
-    assert field in said
-    assert said.count("\n") == 1
+    message = capfd.readouterr().err
+    assert field in message
+    assert message.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -59,9 +59,9 @@ def test_incomplete_arducam(tmp_path: Path) -> None:
     (folder / other).write_bytes(bytes(4 * (WIDTH + 1) * HEIGHT))
     recording = open_recording(folder)
     items = list(recording.read_all())
-    for k, said in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is of 33 x 24")):
+    for k, message in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is of 33 x 24")):
         assert isinstance(items[k], UnreadableFrameError)
-        assert said in str(items[k])
+        assert message in str(items[k])
     assert isinstance(items[1], RangeFrame)
     assert items[1].confidence_image is None
     assert recording.warnings == ["2 of 4 frames have no confidence"]

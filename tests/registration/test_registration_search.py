@@ -317,10 +317,10 @@ def test_lowest_plane_has_most_points_and_few_below():
 
 def test_best_of_distinct_poses_are_kept():
     rng = np.random.default_rng(1)
-    said = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
+    found = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
     poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
     found = [
-        Candidate(T, replace(said, score=s)) for T, s in zip(poses, rng.random(60), strict=True)
+        Candidate(T, replace(found, score=s)) for T, s in zip(poses, rng.random(60), strict=True)
     ]
     kept = []
     for one in sorted(found, key=lambda c: -c.score):
@@ -393,9 +393,9 @@ def test_single_box_is_ambiguous_by_90_degrees():
     assert metres < 0.1
     assert degrees < 1
     # Neither image contradicts either pose.
-    for said in (agreement(source, target, one) for one in alike):
-        assert said.score > 0.3
-        assert said.contradiction < 0.02
+    for found in (agreement(source, target, one) for one in alike):
+        assert found.score > 0.3
+        assert found.contradiction < 0.02
 
 
 def test_views_of_different_places_agree_less(pair):

@@ -70,13 +70,13 @@ def falling(frame: RangeFrame, exponent: float) -> RangeFrame:
 def test_amplitude_falloff_is_estimated(pair, far, exponent):
     """A pattern that is fixed to the camera neither biases the pose nor contradicts it."""
     views = [surface(falling(frame, exponent)) for frame in pair]
-    said = agreement(*views, TRUE)
-    assert said.falloff == pytest.approx(exponent, abs=0.5)
+    found = agreement(*views, TRUE)
+    assert found.falloff == pytest.approx(exponent, abs=0.5)
     options = SurfaceOptions(radii=(2,), falloff=exponent)
     known = agreement(*(prepare_view(falling(frame, exponent), options) for frame in pair), TRUE)
     assert known.falloff == 0
-    assert said.support == pytest.approx(known.support, abs=0.005)
-    assert said.score == pytest.approx(known.score, abs=0.01)
+    assert found.support == pytest.approx(known.support, abs=0.005)
+    assert found.score == pytest.approx(known.score, abs=0.01)
     found = tofuse.register(*(falling(frame, exponent) for frame in pair))
     metres, degrees = error(found.T_target_source, far.T_target_source)
     assert metres < 0.01
@@ -250,32 +250,39 @@ def test_other_methods_state_no_acceptance(pair):
     assert found.reason == ""
 
 
-def said(support, contradiction, overlap=0.6):
+def agreement_of(support, contradiction, overlap=0.6):
     return Agreement(overlap, support, contradiction * overlap, 0.0, 0.01, 1000, support)
 
 
 def test_probability_follows_evidence():
-    good = Evidence.of(said(0.5, 0.0), 0.3)
+    good = Evidence.of(agreement_of(0.5, 0.0), 0.3)
     assert good.probability > 0.95
     for worse in (
-        Evidence.of(said(0.5, 0.2), 0.3),
-        Evidence.of(said(0.5, 0.0), 0.02),
+        Evidence.of(agreement_of(0.5, 0.2), 0.3),
+        Evidence.of(agreement_of(0.5, 0.0), 0.02),
     ):
         assert worse.probability < good.probability
     assert (
-        Evidence.of(said(0.5, 0.0), -0.1).probability
-        == Evidence.of(said(0.5, 0.0), 0.0).probability
+        Evidence.of(agreement_of(0.5, 0.0), -0.1).probability
+        == Evidence.of(agreement_of(0.5, 0.0), 0.0).probability
     )
     # Support is part of the margin; where no rival was evaluated, it counts by itself.
-    assert Evidence.of(said(0.9, 0.0)).probability > 0.98 > Evidence.of(said(0.3, 0.0)).probability
-    assert Evidence.of(said(0.9, 0.1)).probability < Evidence.of(said(0.9, 0.0)).probability
+    assert (
+        Evidence.of(agreement_of(0.9, 0.0)).probability
+        > 0.98
+        > Evidence.of(agreement_of(0.3, 0.0)).probability
+    )
+    assert (
+        Evidence.of(agreement_of(0.9, 0.1)).probability
+        < Evidence.of(agreement_of(0.9, 0.0)).probability
+    )
 
 
 def test_reason_names_contrary_evidence():
-    words = Evidence.of(said(0.1, 0.2), 0.01, 2).objection()
+    words = Evidence.of(agreement_of(0.1, 0.2), 0.01, 2).objection()
     for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
         assert part in words
-    assert Evidence.of(said(0.6, 0.0), 0.3).objection() == ""
+    assert Evidence.of(agreement_of(0.6, 0.0), 0.3).objection() == ""
 
 
 def test_usual_fit_of_camera_decides_acceptance(pair):

@@ -122,8 +122,8 @@ def test_two_taps_measure_distance_with_error(browser, report):
         page.get_by_role("button", name="Front").click()
         bright = rested(seen).min(-1) > 70
         page.get_by_role("button", name="Measure").click()
-        said = page.locator("#viewer .measured")
-        assert said.inner_text() == "Tap the first point"
+        caption = page.locator("#viewer .measured")
+        assert caption.inner_text() == "Tap the first point"
         box = page.locator(CANVAS).bounding_box()
 
         def tap(left, right):
@@ -131,18 +131,18 @@ def test_two_taps_measure_distance_with_error(browser, report):
             page.mouse.click(box["x"] + left + int(columns[0]), box["y"] + 100 + int(rows[0]))
 
         page.mouse.click(box["x"] + 5, box["y"] + box["height"] - 5)
-        assert said.inner_text() == "No surface there: tap the model"
+        assert caption.inner_text() == "No surface there: tap the model"
         tap(150, 300)
-        assert said.inner_text() == "Tap the second point"
+        assert caption.inner_text() == "Tap the second point"
         tap(450, 600)
-        words = said.inner_text()
+        words = caption.inner_text()
         match = re.fullmatch(r"([\d.]+) (m|mm) ± ([\d.]+) mm", words)
         assert match, words
         # Across a room of 6 m.
         assert 0.5 < float(match[1]) * {"m": 1, "mm": 1e-3}[match[2]] < 6
         assert 2 < float(match[3]) < 150
         page.keyboard.press("Escape")
-        assert said.is_hidden()
+        assert caption.is_hidden()
         seen.check()
 
 
@@ -269,8 +269,8 @@ def test_slider_shows_frames_and_reason_of_loss(browser, report):
         assert changed(first, seen.pixels(shot)) > 0.1
         assert changed(yellow, seen.pixels(CANVAS)) > 0.0002  # another camera is selected
         page.get_by_role("button", name="Next with a problem").click()
-        said = page.locator("#frame-description").inner_text()
-        assert said.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
+        caption = page.locator("#frame-description").inner_text()
+        assert caption.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
         page.locator("#strip rect[data-frame='0']").click(force=True)
         assert page.locator("#frame-description").inner_text().startswith("Frame 0:")
         seen.check()

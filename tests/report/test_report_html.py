@@ -244,19 +244,21 @@ def test_reasons_of_one_kind_are_grouped(tmp_path):
     reasons = tuple(Reason("loop_gap", ((k, 90),), f"Loop {k}-90 drifted.") for k in range(7))
     reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
     text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
-    said = " ".join(text.sections["verdict"].split())
-    assert said.count("Distances across the loop may be distorted") == 1
-    assert all(r.text in said for r in reasons)
+    text_of_verdict = " ".join(text.sections["verdict"].split())
+    assert text_of_verdict.count("Distances across the loop may be distorted") == 1
+    assert all(r.text in text_of_verdict for r in reasons)
     # The gravest reason comes first, wherever it was.
-    assert said.index("Only one.") > said.rindex("drifted.")
+    assert text_of_verdict.index("Only one.") > text_of_verdict.rindex("drifted.")
 
 
 def test_reasons_name_their_frames(tmp_path):
     frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(90))
     reason = Reason("images_differ", ((3, 4), (20, 34), (50, 50)), "Surfaces do not agree.")
     result = lonely(verdict="degraded", reasons=(reason,), frames=frames)
-    said = " ".join(page(tmp_path, result, ReportExtras("x")).sections["verdict"].split())
-    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in said
+    text_of_verdict = " ".join(
+        page(tmp_path, result, ReportExtras("x")).sections["verdict"].split()
+    )
+    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in text_of_verdict
 
 
 def in_parts(number=20):
@@ -437,7 +439,7 @@ def test_model_can_be_coloured_by_attributes_of_points():
     np.testing.assert_allclose(np.diff(of["accuracy"][:3]), np.log(2) / np.log(1.049), atol=1)
     assert accuracy.low == pytest.approx(0.00196, rel=0.1)
     assert accuracy.high == pytest.approx(0.00784, rel=0.1)
-    assert accuracy.said[2].endswith("mm or not constrained")
+    assert accuracy.labels[2].endswith("mm or not constrained")
     # The page decodes the byte, for the ± of a distance.
     low, high = accuracy.span
     assert low * (high / low) ** (of["accuracy"][1] / 255) == pytest.approx(0.00392, rel=0.03)
@@ -623,9 +625,9 @@ def test_poor_results_state_what_is_missing(tmp_path):
     assert "Good: the only frame has a pose" in got.sections["verdict"]
     (tmp_path / "report.html").unlink()
     got = page(tmp_path, *POOR["all lost"])
-    said = " ".join(got.sections["verdict"].split())
-    assert "Failed: do not rely on this model." in said
-    assert "No frame has a pose." in said
+    text_of_verdict = " ".join(got.sections["verdict"].split())
+    assert "Failed: do not rely on this model." in text_of_verdict
+    assert "No frame has a pose." in text_of_verdict
     assert "There is nothing to show" in got.sections["model"]
 
 

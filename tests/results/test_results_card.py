@@ -23,11 +23,11 @@ def of(accuracy, verdict="good", reasons=()):
 
 
 def test_good_result() -> None:
-    said = SEPARATOR.join(card(of(KNOWN)))
-    assert said.startswith("±24 mm (95 %) over ")
-    assert said.endswith(" · weakest: frame 17, 29 mm")
-    assert "0.38 %" in said
-    assert "to improve" not in said
+    line = SEPARATOR.join(card(of(KNOWN)))
+    assert line.startswith("±24 mm (95 %) over ")
+    assert line.endswith(" · weakest: frame 17, 29 mm")
+    assert "0.38 %" in line
+    assert "to improve" not in line
 
 
 def test_improvement_is_suggested() -> None:
@@ -48,11 +48,11 @@ def test_unbounded_and_unassessed_accuracy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("metres", "said"),
+    ("metres", "text"),
     [(0.0023, "2.3 mm"), (0.0238, "24 mm"), (1.2, "1.20 m"), (0.0, "0.0 mm")],
 )
-def test_lengths(metres, said) -> None:
-    assert length(metres) == said
+def test_lengths(metres, text) -> None:
+    assert length(metres) == text
 
 
 @pytest.mark.parametrize("text", ["30mm", "3cm", "0.03", "0.03m", "3e-2", " 30 mm "])

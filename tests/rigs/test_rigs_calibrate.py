@@ -159,8 +159,8 @@ def test_displaced_camera_is_found(
     last = replace(rig.cameras[2], T_rig_camera=moved)
     write_rig(tmp_path / "knocked.json", Rig((*rig.cameras[:2], last)))
     assert main(["rig", "check", str(tmp_path / "knocked.json"), *cameras]) == 3
-    said = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in said if "moved by" in line] == ["cam2"]
+    output = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in output if "moved by" in line] == ["cam2"]
 
 
 def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
@@ -173,9 +173,9 @@ def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     out = tmp_path / "model"
     main(["run", "--rig", str(tmp_path / "rig.json"), *cameras, "--out", str(out)])
     reasons = json.loads((out / "run.json").read_text())["reasons"]
-    (said,) = (r["text"] for r in reasons if r["code"] == "rig_changed")
-    assert "cam1 by" in said
-    assert "cam2" not in said
+    (text,) = (r["text"] for r in reasons if r["code"] == "rig_changed")
+    assert "cam1 by" in text
+    assert "cam2" not in text
 
 
 def test_rig_folder_with_missing_camera_is_refused(

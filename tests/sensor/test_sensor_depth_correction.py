@@ -33,7 +33,7 @@ def test_saved_correction_is_loaded(tmp_path, with_pixels) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"range_m": [0.0, 1.0]}, "bias_m"),
         ({"range_m": [0.0, 1.0], "bias_m": [0.0]}, "shape"),
@@ -43,10 +43,10 @@ def test_saved_correction_is_loaded(tmp_path, with_pixels) -> None:
         ({"range_m": ["a"], "bias_m": [0.0]}, "range_m"),
     ],
 )
-def test_invalid_files_are_refused_in_one_line(tmp_path, arrays, said) -> None:
+def test_invalid_files_are_refused_in_one_line(tmp_path, arrays, message) -> None:
     path = tmp_path / "correction.npz"
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=message) as error:
         DepthCorrection.load(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)

@@ -114,8 +114,8 @@ def test_invalid_result_is_reported_in_one_line(folder, tmp_path, how, capsys):
     if how != "missing":
         damaged(shutil.copytree(folder, out), how)
     assert main(["view", str(out), "--no-open"]) == 2
-    said = capsys.readouterr().err
-    assert re.fullmatch(r"tofuse: .*out.*\n", said)
+    message = capsys.readouterr().err
+    assert re.fullmatch(r"tofuse: .*out.*\n", message)
 
 
 def test_view_file_is_reproducible(tmp_path):

@@ -57,7 +57,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Counts:
-    """Number of points that each filter saw and removed, by its name."""
+    """Number of points that each filter received and removed, by its name."""
 
     seen: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)

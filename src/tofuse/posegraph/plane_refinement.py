@@ -100,7 +100,7 @@ class _Planes(Refiner):
 
 
 def _edges(found: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
-    """What all views together say of neighbours: of all pairs it would be said many times."""
+    """Joint measurements of neighbouring views; those of all pairs would be counted many times."""
     out = []
     for (i, j), C in zip(found.pairs, found.covariance, strict=True):
         if j == i + 1 and not (lost[i] or lost[j]):

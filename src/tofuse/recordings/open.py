@@ -161,9 +161,9 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     if len(sure) == 1:
         return [_Located(path, readers()[next(iter(sure))])]
     if len(sure) > 1:
-        saw = "; ".join(f"{name}: {sniff.saw}" for name, sniff in sure.items())
+        evidence = "; ".join(f"{name}: {sniff.evidence}" for name, sniff in sure.items())
         raise InputError(
-            f"could be several formats ({saw})",
+            f"could be several formats ({evidence})",
             where=path,
             remedy=f"use --format {' or '.join(sure)}",
         )
@@ -225,18 +225,18 @@ def _parts(path: Path) -> list[_Located]:
 
 def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     if sniffs:
-        saw = "; ".join(dict.fromkeys(sniff.saw for sniff in sniffs.values()))
+        evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
         remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
         return InputError(
-            f"could not be identified: it has {saw}",
+            f"could not be identified: it has {evidence}",
             where=path,
             remedy=", or ".join(dict.fromkeys(remedies)),
         )
     remedy = "check the path"
     if path.is_dir():
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
-        saw = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
-        problem = f"is not a recording of a known format: it contains {saw}"
+        evidence = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
+        problem = f"is not a recording of a known format: it contains {evidence}"
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
     else:

@@ -23,14 +23,14 @@ class Sniff:
     confidence
         0 to 1; a path is opened automatically from `SURE` on. 1 is for names and contents that
         no other format has.
-    saw
-        The evidence, for messages.
+    evidence
+        What indicates the format, for messages.
     remedy
         What to do if the confidence is below `SURE`.
     """
 
     confidence: float
-    saw: str
+    evidence: str
     remedy: str = ""
 
 

@@ -118,8 +118,8 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
     """
     within = tolerance(source, target)
     ways = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
-    said = [_one_way(seen, by, T, within) for seen, by, T in ways]
-    near, on_surface, free, squares = np.mean(said, axis=0)
+    found = [_one_way(seen, by, T, within) for seen, by, T in ways]
+    near, on_surface, free, squares = np.mean(found, axis=0)
     return Agreement(
         overlap=float(near + free),
         support=float(on_surface),

@@ -339,9 +339,9 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     if after.agreement.score < best.agreement.score - _GIVEN_UP:
         found = replace(found, T_target_source=T)
         after = best
-    said = after.agreement
+    agreement = after.agreement
     rival = None if poses is None else _rival(views, poses, best, after.T_target_source)
-    lead = None if rival is None else said.score - max(rival.agreement.score, 0.0)
+    lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(found.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
     evidence = views.evidence(after, lead, len(found.unobservable))
@@ -353,8 +353,8 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
         probability=evidence.probability,
         reason=reason,
         runner_up=None if rival is None or rival is _NOWHERE else rival.T_target_source,
-        overlap=said.overlap,
-        support=said.support,
-        contradiction=said.contradiction,
-        violation=said.violation,
+        overlap=agreement.overlap,
+        support=agreement.support,
+        contradiction=agreement.contradiction,
+        violation=agreement.violation,
     )

@@ -69,13 +69,13 @@ class Evidence:
     @classmethod
     def of(
         cls,
-        said: Agreement,
+        agreement: Agreement,
         margin: float | None = None,
         degenerate: int = 0,
         model: Model = IMAGES,
     ) -> Evidence:
         """Make the evidence from the agreement of both views."""
-        return cls(said.support, said.contradiction, margin, degenerate, model)
+        return cls(agreement.support, agreement.contradiction, margin, degenerate, model)
 
     @property
     def searched(self) -> Float64:
@@ -108,18 +108,20 @@ class Evidence:
         """Return the reason why the pose is rejected; empty if it is accepted."""
         if self.probability >= ACCEPTED:
             return ""
-        said = []
+        problems = []
         if self.support < _LITTLE_SUPPORT:
-            said.append(f"only {self.support:.0%} of the points of both views support the pose")
+            problems.append(f"only {self.support:.0%} of the points of both views support the pose")
         if self.margin is not None and self.margin < _SMALL_LEAD:
             lead = max(self.margin, 0.0)
-            said.append(f"another pose fits nearly as well, with {lead:.1%} less support")
+            problems.append(f"another pose fits nearly as well, with {lead:.1%} less support")
         if self.contradiction > CONTRADICTION:
-            said.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
+            problems.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
         if self.degenerate:
             plural = "direction is" if self.degenerate == 1 else "directions are"
-            said.append(f"{self.degenerate} {plural} degenerate")
-        return "; ".join(said) or f"the pose is right with a probability of {self.probability:.0%}"
+            problems.append(f"{self.degenerate} {plural} degenerate")
+        return (
+            "; ".join(problems) or f"the pose is right with a probability of {self.probability:.0%}"
+        )
 
 
 def logistic(x: float) -> float:

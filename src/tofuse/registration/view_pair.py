@@ -244,8 +244,8 @@ class _Pair:
         same = both_ways_agree(T, back.T_world_source, far_m, _BOTH_WAYS)
         if not same or not self.usual.assess(back).usual:
             return None
-        said = agreement(self.source, self.target, T, self.compared)
-        return _Pose(views, T, there, options, said) if said.score > 0 else None
+        agreed = agreement(self.source, self.target, T, self.compared)
+        return _Pose(views, T, there, options, agreed) if agreed.score > 0 else None
 
     def chosen(
         self, near: _Pose | None, match: Match, prepared: Search, guessed: bool
@@ -269,9 +269,9 @@ class _Pair:
         options = replace(_PATIENT, prior_m=error_m, prior_rad=_AFTER_SEARCH)
         views = self._compensated(match.agreement.falloff)
         aligned = self._aligned(views, match.T_target_source, options)
-        said = prepared.compared.at(aligned.T_world_source)
-        if said.score >= match.score - _GIVEN_UP:
-            return _Pose(views, aligned.T_world_source, aligned, options, said)
+        agreed = prepared.compared.at(aligned.T_world_source)
+        if agreed.score >= match.score - _GIVEN_UP:
+            return _Pose(views, aligned.T_world_source, aligned, options, agreed)
         return _Pose(views, match.T_target_source, aligned, options, match.agreement)
 
     def nearer(self, near: _Pose, best: _Pose, prepared: Search) -> _Pose:
@@ -280,9 +280,9 @@ class _Pair:
         An insignificant lead does not outweigh the guess, and neither does one along directions
         that are degenerate for both: there the pose with the largest overlap leads.
         """
-        said = prepared.compared.at(near.T_target_source)
-        near = replace(near, agreement=said)
-        if said.score >= best.agreement.score - _TIE:
+        agreed = prepared.compared.at(near.T_target_source)
+        near = replace(near, agreement=agreed)
+        if agreed.score >= best.agreement.score - _TIE:
             return near
         gap = se3.log(se3.inverse(near.T_target_source) @ best.T_target_source) / UNITS
         weak = near.aligned.unobservable

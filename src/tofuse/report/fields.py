@@ -30,7 +30,7 @@ class Field:
         (K,).
     low, high
         Values at the ends of the colour bar, at which colours are clamped.
-    said
+    labels
         Tick labels at the lower end, in the middle and at the upper end.
     span
         Values that the bytes 0 and 255 represent.
@@ -43,7 +43,7 @@ class Field:
     values: Float64
     low: float
     high: float
-    said: tuple[str, str, str]
+    labels: tuple[str, str, str]
     span: tuple[float, float]
     logarithmic: bool = False
 
@@ -51,7 +51,7 @@ class Field:
         """Return the field for the viewer: values as bytes, and the ends of the colour bar."""
         return {
             "label": self.label,
-            "said": self.said,
+            "labels": self.labels,
             "ends": [float(self.normalized(np.array(end))) for end in (self.low, self.high)],
             "span": self.span,
             "values": pack(np.round(255 * self.normalized(self.values)).astype(np.uint8)),
@@ -84,9 +84,9 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     out.append(_height(-points[:, 1], height_range(points)))
     if views is not None:
         low, high = _ends(views.astype(float))
-        said = (f"{low:.0f}", "", f"{high:.0f}")
+        labels = (f"{low:.0f}", "", f"{high:.0f}")
         values = views.astype(float)
-        out.append(Field("views", "Number of views", values, low, high, said, (low, high)))
+        out.append(Field("views", "Number of views", values, low, high, labels, (low, high)))
     return out
 
 
@@ -97,8 +97,8 @@ def normalized_accuracy(metres: Float64) -> Float64:
 
 def _height(heights: Float64, ends: tuple[float, float]) -> Field:
     low, high = ends
-    said = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
-    return Field("height", "Height", heights, low, high, said, ends)
+    labels = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
+    return Field("height", "Height", heights, low, high, labels, ends)
 
 
 def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
@@ -111,11 +111,11 @@ def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
     high = max(high, 1.01 * low)
     beyond = " or not constrained" if (values >= UNKNOWN_M).mean() > 0.001 else ""
     middle = float(np.sqrt(low * high))
-    said = (
+    labels = (
         f"±{words.length(low)}", f"±{words.length(middle)}", f"±{words.length(high)}{beyond}"
     )  # fmt: skip
     span = (_FINEST_M, unknown)
-    return Field("accuracy", "Accuracy (95 %)", values, low, high, said, span, logarithmic=True)
+    return Field("accuracy", "Accuracy (95 %)", values, low, high, labels, span, logarithmic=True)
 
 
 def _ends(values: Float64) -> tuple[float, float]:

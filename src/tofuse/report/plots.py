@@ -415,11 +415,11 @@ def rig(
     figure, axes = _plan(box, view)
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
-    for a, b, said in pairs:
+    for a, b, text in pairs:
         ends = project(middles[[a, b]], view)
         axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
         axes.annotate(
-            said,
+            text,
             ends.mean(0),
             color=MUTED,
             fontsize=10,

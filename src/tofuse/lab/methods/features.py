@@ -84,13 +84,13 @@ class Features(Bounded, Registrar):
         found = consensus(pairs, self.consensus, rng)
         scores = [c.score / len(pairs) for c in found]
         if self.verify:
-            said = [agreement(s, t, c.T_target_source).score for c in found]
-            if max(said) <= 0:
+            agreed = [agreement(s, t, c.T_target_source).score for c in found]
+            if max(agreed) <= 0:
                 raise RegistrationError(
                     f"{found[0].count} of {len(pairs)} pairs of points agree on a motion that "
                     "what both images saw contradicts"
                 )
-            scores = [a + b for a, b in zip(scores, said, strict=True)]
+            scores = [a + b for a, b in zip(scores, agreed, strict=True)]
         best = max(range(len(found)), key=lambda k: scores[k])
         rival = max((score for k, score in enumerate(scores) if k != best), default=0.0)
         return registration_of(pairs, found[best], scores[best] - max(rival, 0.0))

@@ -78,10 +78,10 @@ class PlaneSets(Bounded, Registrar):
         poses = _distinct(self._poses(a, b, guess, depth), depth)[:_JUDGED]
         if not poses:
             raise RegistrationError("no plane of one view matches one of the other")
-        said = [agreement(s, t, T).score for _, _, T in poses]
-        scores = [fraction + score for (fraction, _, _), score in zip(poses, said, strict=True)]
+        agreed = [agreement(s, t, T).score for _, _, T in poses]
+        scores = [fraction + score for (fraction, _, _), score in zip(poses, agreed, strict=True)]
         best = max(range(len(poses)), key=lambda k: scores[k])
-        if said[best] <= 0:
+        if agreed[best] <= 0:
             raise RegistrationError(
                 f"{len(poses[best][1])} planes match under a pose that what both images saw "
                 "contradicts"

@@ -35,11 +35,11 @@ class Arducam:
         images = _images(path, "depth")
         if not images:
             return None
-        saw = f"{len(images)} depth images of Arducam's examples"
+        evidence = f"{len(images)} depth images of Arducam's examples"
         if is_file(path / "camera.json"):
-            return Sniff(1.0, f"{saw} and camera.json")
+            return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(UNSURE, saw, remedy)
+        return Sniff(UNSURE, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""

@@ -35,11 +35,11 @@ class Depth16:
         files = _files(path)
         if not files:
             return None
-        saw = f"{len(files)} DEPTH16 images"
+        evidence = f"{len(files)} DEPTH16 images"
         if is_file(path / "camera.json"):
-            return Sniff(1.0, f"{saw} and camera.json")
+            return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(UNSURE, saw, remedy)
+        return Sniff(UNSURE, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""

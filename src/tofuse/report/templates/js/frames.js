@@ -1,6 +1,6 @@
 // The frames' pictures, the strip of frames, and everything on the page that points at frames.
 function startFrames(bus) {
-  const strip = document.getElementById("strip"), said = document.getElementById("strip-said");
+  const strip = document.getElementById("strip"), caption = document.getElementById("strip-caption");
   const player = document.getElementById("player"), data = document.querySelector("script#pictures");
   const pictures = data ? JSON.parse(data.textContent) : null;
   const choose = (index, shown) => bus.dispatchEvent(new CustomEvent("chosen", { detail: { index, shown } }));
@@ -38,11 +38,11 @@ function startFrames(bus) {
     show(0);
   }
 
-  // What is said of a frame on hover can also be tapped.
+  // The tooltip of a frame can also be tapped.
   if (strip) {
     const tell = (e) => {
       const cell = e.target.closest("rect"), title = cell && cell.querySelector("title");
-      if (title) said.textContent = title.textContent;
+      if (title) caption.textContent = title.textContent;
       return cell;
     };
     strip.addEventListener("pointerover", tell);

@@ -2,7 +2,7 @@
 function makeTimeline(box, frames, ramp, bus) {
   const canvas = box.querySelector(".timeline canvas");
   if (!canvas || !frames || !frames.index.length) return;
-  const said = box.querySelector(".timeline span"), n = frames.index.length;
+  const caption = box.querySelector(".timeline span"), n = frames.index.length;
   const INKS = ["#2f9e62", "#f2ad38", "#f24c59", "#7b828c"], WORDS = ["tracked", "predicted", "lost", "skipped"];
   const LANES = ramp && frames.errors ? [[6, 10], [18, 10]] : [[6, 14]];
   let chosen = -1, ranges = [];
@@ -58,12 +58,12 @@ function makeTimeline(box, frames, ramp, bus) {
     const there = canvas.getBoundingClientRect();
     return Math.max(0, Math.min(n - 1, Math.floor((e.clientX - there.left) / there.width * n)));
   };
-  const tell = (row) => { said.textContent = `Frame ${frames.index[row]}: ${WORDS[Number(frames.status[row])]}`; };
+  const describe = (row) => { caption.textContent = `Frame ${frames.index[row]}: ${WORDS[Number(frames.status[row])]}`; };
   canvas.addEventListener("pointermove", (e) => {
-    tell(rowOf(e));
+    describe(rowOf(e));
     if (e.buttons & 1) choose(rowOf(e));
   });
-  canvas.addEventListener("pointerleave", () => { if (chosen >= 0) tell(chosen); });
+  canvas.addEventListener("pointerleave", () => { if (chosen >= 0) describe(chosen); });
   canvas.addEventListener("pointerdown", (e) => choose(rowOf(e)));
   function choose(row) {
     if (row === chosen) return;
@@ -72,7 +72,7 @@ function makeTimeline(box, frames, ramp, bus) {
   bus.addEventListener("chosen", (e) => {
     const row = rowAt(e.detail.index);
     chosen = frames.index[row] === e.detail.index ? row : -1;
-    if (chosen >= 0) tell(chosen);
+    if (chosen >= 0) describe(chosen);
     draw();
   });
   bus.addEventListener("marked", (e) => { ranges = e.detail.ranges; draw(); });

@@ -128,7 +128,7 @@ async function startViewer(box, scene, bus) {
       bar.hidden = !field;
       if (field) {
         bar.querySelector("strong").textContent = field.label;
-        bar.querySelectorAll("span").forEach((tick, k) => { tick.textContent = field.said[k]; });
+        bar.querySelectorAll("span").forEach((tick, k) => { tick.textContent = field.labels[k]; });
       }
     }
     if (!cameras) return;
