@@ -12,7 +12,8 @@ from made_rooms import OTHER, at, seen, surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
-from tofuse.posegraph.joining import Joining, Stretch
+from tofuse.posegraph.gaps import Stretch
+from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.search import SearchOptions

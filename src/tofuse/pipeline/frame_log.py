@@ -12,7 +12,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Step
 from tofuse.posegraph.external_sensors import SensorData
-from tofuse.posegraph.joining import Stretch
+from tofuse.posegraph.gaps import Stretch
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link

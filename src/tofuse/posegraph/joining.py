@@ -15,26 +15,30 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from tofuse.arrays import Float64, Intp
+from tofuse.arrays import Float64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
-from tofuse.kernels.motion import retract, twist_between
-from tofuse.normal import SIGMA_OF_MEDIAN
-from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.cut_edges import cut_edges, sides_without
+from tofuse.posegraph.gaps import (
+    CONVERGENCE,
+    Stretch,
+    View,
+    end_speeds,
+    extrapolated,
+    largest_motion,
+    motion_over,
+    odometry_over,
+)
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
-from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.confidence import CONTRADICTION, logistic
-from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD, SearchOptions, differ
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
@@ -47,7 +51,6 @@ from tofuse.registration.view_descriptor import (
 from tofuse.registration.view_pair import follow, register_pair
 
 How = Literal["links", "motion", "odometry"]
-View = PosedView[PreparedView]
 
 # Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
 _LEARN = 16
@@ -58,19 +61,14 @@ _VERIFY, _OVERLAP = 8, 0.2
 # Contradiction is unusual beyond this many standard deviations above the median of neighbours.
 # Wrong poses within one scene contradict by more than the last number in any case.
 _SIGMAS, _MIN_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
-# Largest drift within components, as a fraction of the path; largest error of a link, and range of
-# convergence of an alignment: fractions of the depth, and rad.
-_DRIFT, _LINK_ERROR, _MAX_ALIGNED = 0.05, 0.02, 0.1
-# Motions on either side of a gap that bound the camera's speed within it, the factor on their
-# maximum, and a distance that is always possible (fraction of the depth, rad).
-_AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
+# Largest drift within components, as a fraction of the path; largest error of a link: fraction of
+# the depth, and rad.
+_DRIFT, _LINK_ERROR = 0.05, 0.02
+# A motion that is always possible: fraction of the depth, and rad.
+_NEAR = 0.3
 # Factor on the 90 % quantile of the speed that the camera hardly exceeds. Where it had no time to
 # lose sight of the place, up to this fraction of the overlap may contradict.
 _HARDLY, _SAME_PLACE = 2.0, 0.3
-# Largest standard deviation of a gap that is bridged by motion alone: fraction of the depth, rad.
-_BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
-# Minimum number of tracked motions that odometry is compared with.
-_MIN_COMPARED = 10
 # Largest weight of rival links, relative to the accepted ones.
 _RIVAL = 0.5
 _SHIFT = 0.35
@@ -80,42 +78,6 @@ _ALL = 512
 # poses.
 _MAX_PROBABILITY = 0.998
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """A component as tracked.
-
-    Attributes
-    ----------
-    component
-        Its number.
-    frames
-        (N,) indices, ascending.
-    times
-        (N,) s.
-    poses
-        (N, 4, 4) T_component_camera.
-    views
-        The stored views of its frames.
-    recording
-        Number of its recording, if several are merged: no motion is known between these.
-    odometry
-        (N, 4, 4) T_odometry_camera by external odometry, NaN where there is none; None without any.
-    """
-
-    component: int
-    frames: Intp
-    times: Float64
-    poses: Float64
-    views: tuple[View, ...]
-    recording: int = 0
-    odometry: Float64 | None = None
-
-    @cached_property
-    def depth(self) -> float:
-        """Median depth of its views, m."""
-        return float(np.median([v.depth for v in self.views])) if self.views else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +217,7 @@ class _Joiner:
         self._searches = options.searches + len(stretches) + total // _FRAMES_PER_SEARCH
         self._usual = UsualFit()
         self._contradiction = CONTRADICTION
-        steps = [_speeds(s, end=True) for s in stretches]
+        steps = [end_speeds(s, end=True) for s in stretches]
         known = np.concatenate(steps)
         # (2,) m/s and rad/s that the camera hardly exceeds. Motions at which tracking failed may
         # have been faster than all others.
@@ -393,8 +355,8 @@ class _Joiner:
             if a is b or before.recording != after.recording:
                 continue
             bridges: list[tuple[Link | None, How]] = [
-                (_by_odometry(before, after), "odometry"),
-                (_bridged(before, after), "motion"),
+                (odometry_over(before, after), "odometry"),
+                (extrapolated(before, after), "motion"),
             ]
             for link, how in bridges:
                 if link is not None and not self._contradicts(a, b, link):
@@ -682,7 +644,7 @@ class _Joiner:
         from_i, from_j = self._path(a, i), self._path(b, j)
         for first, second, T, at_implied in self._overlapping(a, b, T_a_b):
             drift = _DRIFT * (from_i[first.index] + from_j[second.index])
-            if drift > _MAX_ALIGNED:
+            if drift > CONVERGENCE:
                 continue
             seen = at_implied
             if seen.contradiction > self._contradiction:
@@ -717,7 +679,7 @@ class _Joiner:
                     continue
                 reach = self._speed * elapsed
                 if reach[0] < far * before.depth and reach[1] < far:
-                    between = _over_the_gap(before, after, T)
+                    between = motion_over(before, after, T)
                     metres = float(np.linalg.norm(between[:3, 3]))
                     if metres < far * before.depth and float(se3.angle(between)) < far:
                         return True
@@ -758,12 +720,12 @@ class _Joiner:
                 first, second = self._in_time(c, d)
                 if first.recording != second.recording:
                     continue
-                between = _over_the_gap(first, second, T)
-                reach = _reach(first, second)
+                between = motion_over(first, second, T)
+                farthest = largest_motion(first, second)
                 depth = first.depth
                 if (
-                    np.linalg.norm(between[:3, 3]) > reach[0] + _NEAR * depth
-                    or float(se3.angle(between)) > reach[1] + _NEAR
+                    np.linalg.norm(between[:3, 3]) > farthest[0] + _NEAR * depth
+                    or float(se3.angle(between)) > farthest[1] + _NEAR
                 ):
                     return False
         return True
@@ -779,12 +741,6 @@ def _link(first: View, second: View, found: Registration | None) -> Link | None:
 def _transformed(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:
     """Poses of components in another frame."""
     return {c: np.asarray(T_other @ T_c, np.float64) for c, T_c in T.items()}
-
-
-def _over_the_gap(before: Stretch, after: Stretch, T: Mapping[int, Float64]) -> Float64:
-    """The motion from the end of one component to the start of another, with T by component."""
-    end = T[before.component] @ before.poses[-1]
-    return np.asarray(se3.inverse(end) @ T[after.component] @ after.poses[0], np.float64)
 
 
 def _best(links: Sequence[Link]) -> Link:
@@ -806,98 +762,3 @@ def _key(a: _Island, b: _Island, between: Sequence[Link]) -> tuple[int, ...]:
 def _weight(link: Link) -> float:
     """Weight of a link: a certain one counts twice."""
     return (2.0 if link.certain else 1.0) * (0.5 + (link.registration.support or 0.0))
-
-
-def _speeds(stretch: Stretch, *, end: bool) -> Float64:
-    """(n, 2) m/s and rad/s of the motions next to one end."""
-    some = slice(-_AROUND, None) if end else slice(None, _AROUND)
-    poses, times = stretch.poses[some], stretch.times[some]
-    if len(poses) < 2:
-        return np.zeros((0, 2))
-    elapsed = np.maximum(np.diff(times), 1e-9)
-    return _lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
-
-
-def _reach(before: Stretch, after: Stretch) -> Float64:
-    """(2,) m and rad that the camera may have moved during a gap; infinite if unknown."""
-    speeds = np.concatenate([_speeds(before, end=True), _speeds(after, end=False)])
-    if len(speeds) < _AROUND // 4:
-        return np.full(2, np.inf)
-    elapsed = max(float(after.times[0] - before.times[-1]), 0.0)
-    return np.asarray(np.maximum(_FASTER * speeds.max(0), HANDHELD) * elapsed)
-
-
-def _by_odometry(before: Stretch, after: Stretch) -> Link | None:
-    """The motion over a gap by odometry; None without any, or if it is too uncertain.
-
-    Its errors are those of the tracked motions on both sides, and grow as in a random walk.
-    """
-    elapsed = float(after.times[0] - before.times[-1])
-    if before.odometry is None or after.odometry is None or elapsed <= 0:
-        return None
-    T = np.asarray(se3.inverse(before.odometry[-1]) @ after.odometry[0], np.float64)
-    misfits, lengths, intervals = [], [], []
-    for side, odometry in ((before, before.odometry), (after, after.odometry)):
-        tracked = se3.inverse(side.poses[:-1]) @ side.poses[1:]
-        measured = se3.inverse(odometry[:-1]) @ odometry[1:]
-        misfits.append(se3.log(se3.inverse(tracked) @ measured))
-        lengths.append(_lengths(measured))
-        intervals.append(np.diff(side.times))
-    misfit = np.concatenate(misfits)
-    known = np.isfinite(misfit).all(1)
-    if known.sum() < _MIN_COMPARED or not np.isfinite(T).all():
-        return None
-    steps = max(elapsed / max(float(np.median(np.concatenate(intervals))), 1e-9), 1.0)
-    # Errors of odometry are in proportion to the motion.
-    usual = np.median(np.concatenate(lengths)[known], axis=0) * steps
-    more = np.maximum(_lengths(T[None])[0] / np.maximum(usual, 1e-9), 1.0)
-    one = SIGMA_OF_MEDIAN * np.median(np.abs(misfit[known]), axis=0)
-    sigma = one * np.sqrt(steps) * np.repeat(more, 3)
-    limit = np.repeat([_MAX_ALIGNED * before.depth, _MAX_ALIGNED], 3)
-    if (sigma > limit).any():
-        return None
-    how = "bridged by odometry"
-    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), how)
-
-
-def _lengths(T: Float64) -> Float64:
-    """(K, 2) lengths, m, and angles, rad, of motions (K, 4, 4)."""
-    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(se3.angle(T))], 1)
-
-
-def _bridged(before: Stretch, after: Stretch) -> Link | None:
-    """The motion over a gap, extrapolated from both sides; None if it is too uncertain."""
-    elapsed = float(after.times[0] - before.times[-1])
-    n = 5
-    if min(len(before.frames), len(after.frames)) < n or elapsed <= 0:
-        return None
-
-    def velocities(stretch: Stretch, some: slice) -> Float64:
-        poses, times = stretch.poses[some], stretch.times[some]
-        return np.stack(
-            [
-                twist_between(poses[k], poses[k + 1]) / max(float(times[k + 1] - times[k]), 1e-9)
-                for k in range(len(poses) - 1)
-            ]
-        )
-
-    v, w = velocities(before, slice(-n, None)), velocities(after, slice(None, n))
-    interval = float(np.median(np.diff(np.concatenate([before.times[-n:], after.times[:n]]))))
-    change = np.concatenate([np.diff(v, axis=0), np.diff(w, axis=0)])
-    # A random walk of the velocity, observed at both ends.
-    wander = np.sqrt((change**2).mean(0)) * np.sqrt(max(elapsed / max(interval, 1e-9), 1.0))
-    apart = np.abs(v[-2:].mean(0) - w[:2].mean(0))
-    sigma = np.hypot(0.5 * wander, 0.5 * apart) * elapsed
-    depth = before.depth
-    limit = np.repeat([_BRIDGE_M * depth, _BRIDGE_RAD], 3)
-    if (sigma > limit).any():
-        return None
-    T = retract(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
-    how = "bridged by the motion before and after the gap"
-    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), how)
-
-
-def _link_over_gap(before: Stretch, after: Stretch, T: Float64, sigma: Float64, how: str) -> Link:
-    """Return the link, given T (4, 4) from the frame after to the one before, and (6,) sigmas."""
-    made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
-    return Link(int(before.frames[-1]), int(after.frames[0]), made, certain=False, how=how)
