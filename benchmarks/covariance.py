@@ -32,8 +32,9 @@ from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit
 from tofuse.sensor.models import camera_model

@@ -38,8 +38,9 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import Scene, build
 from tofuse.recordings.native import corrected_depth
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import covariance
 from tofuse.sensor.models import CameraModel, camera_model
 from tofuse.sensor.noise import of_camera

@@ -43,7 +43,8 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (

@@ -35,8 +35,9 @@ from tofuse.lab.methods.plane_sets import PlaneSets
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.fpfh import Fpfh
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.search import SearchOptions
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.view_pair import register_pair
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -59,7 +59,8 @@ from tofuse.registration.confidence import (
     Evidence,
     logistic,
 )
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.view_pair import follow, register_pair
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0

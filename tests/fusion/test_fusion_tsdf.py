@@ -30,7 +30,8 @@ from tofuse.kernels.blocks import (
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import refinement as kernels
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import Smoothed, SurfaceOptions
+from tofuse.registration.surface_options import Smoothed, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 

@@ -10,7 +10,8 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
 

@@ -13,7 +13,8 @@ from tofuse.geometry import se3
 from tofuse.odometry.base import Step, Tracker
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.base import Registration
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 ALL = Spacing(angle=0, distance=0)
 

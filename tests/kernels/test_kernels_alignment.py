@@ -9,7 +9,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import motion, steps
-from tofuse.registration.prepared_view import Projection
+from tofuse.registration.projection import Projection
 
 CAMERA = Pinhole(24, 18, 30.0, 30.0, 11.5, 8.5)
 LENS = BrownConrady(24, 18, 30.0, 30.0, 11.5, 8.5, k1=-0.15, k2=0.05)

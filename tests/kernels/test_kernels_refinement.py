@@ -11,8 +11,9 @@ from corner_views import SHARP, corner, unpack
 from pair_equations import KNOWN, pair_equations
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import points_of
+from tofuse.registration.surface_options import SurfaceOptions
 
 SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
 

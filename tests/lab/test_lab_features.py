@@ -14,7 +14,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.keypoints import channel_image, keypoints
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,
@@ -23,6 +23,7 @@ from tofuse.registration.sample_consensus import (
     loose_directions,
     motion_of,
 )
+from tofuse.registration.surface_options import SurfaceOptions
 
 CAMERA = Pinhole(176, 132, 200.0, 200.0, 87.5, 65.5)
 WAYS = ("samples", "compatible")

@@ -12,7 +12,8 @@ from tofuse.geometry import se3
 from tofuse.lab.methods.plane_sets import PlaneSets
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.plane_detection import detect_planes
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 WORLD = [((0, 1, 0), 1.0), ((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)]
 

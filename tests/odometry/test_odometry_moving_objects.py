@@ -25,8 +25,9 @@ from tofuse.odometry.moving_objects import (
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import agreement
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.sensor.models import camera_model
 
 FRAMES = 18

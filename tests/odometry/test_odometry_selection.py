@@ -11,7 +11,8 @@ from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.geometry import se3
 from tofuse.odometry.keyframes import Keyframes
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 SHARP = SurfaceOptions(radii=(2,))
 # A camera that translates and turns slowly.

@@ -30,7 +30,8 @@ from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.states import StateError, decode, encode, known_types
 from tofuse.posegraph.view_store import KeptView
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.results.folder import CHECKPOINT, STAGING
 from tofuse.results.output import run_json
 from tofuse.results.samples import FrameSample

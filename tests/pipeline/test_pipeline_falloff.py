@@ -18,8 +18,9 @@ from tofuse.pipeline.config import from_method
 from tofuse.pipeline.falloff import estimate_falloff
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.sensor.models import camera_model
 
 

@@ -6,7 +6,8 @@ import pytest
 
 import tofuse
 from tofuse.posegraph.view_store import PosedView
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 
 @pytest.fixture(scope="module")

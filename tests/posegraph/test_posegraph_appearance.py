@@ -14,8 +14,9 @@ from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.search import SearchOptions
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.view_descriptor import mutual_dissimilarity, view_descriptor
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)

@@ -17,7 +17,8 @@ from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import ACCEPTED
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.verification import Assessment
 
 turn = revisited_path.turn  # the fixture

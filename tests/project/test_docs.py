@@ -29,8 +29,8 @@ from tofuse.lab import demo
 from tofuse.pipeline.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
-from tofuse.registration.prepared_view import SurfaceOptions
 from tofuse.registration.projective import ProjectiveOptions
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.results.output import run_json
 from tofuse.results.pair import FILES as PAIR_FILES

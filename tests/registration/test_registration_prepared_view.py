@@ -11,15 +11,11 @@ import pytest
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
 from tofuse.kernels.threads import threads
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.registration.prepared_view import (
-    PreparedView,
-    Projection,
-    Smoothed,
-    SurfaceOptions,
-    prepare_view,
-    with_extended_planes,
-)
+from tofuse.registration.extended_planes import with_extended_planes
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.projection import Projection
 from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import Smoothed, SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1

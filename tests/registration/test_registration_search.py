@@ -18,7 +18,7 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.floor import find_floor, find_floors
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import (
     DISTINCT_M,
@@ -28,6 +28,7 @@ from tofuse.registration.search import (
     differ,
     search,
 )
+from tofuse.registration.surface_options import SurfaceOptions
 
 
 def view(*arguments, **options):

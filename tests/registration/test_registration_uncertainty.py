@@ -9,8 +9,9 @@ from tofuse.kernels import tiles
 from tofuse.kernels.alignment import POINT_SIZE, Residuals
 from tofuse.kernels.spurious_information import spurious_information
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import (
     Patches,
     UncertaintyOptions,

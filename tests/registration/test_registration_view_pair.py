@@ -17,8 +17,9 @@ from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.confidence import ACCEPTED, Evidence
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_pair import follow, register_pair
 

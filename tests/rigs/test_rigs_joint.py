@@ -15,7 +15,8 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation.rig import around, relative
 from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.rigs.joint import View, disagreements, refine_together
 
 

@@ -17,7 +17,8 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.registration.plane_detection import detect_planes
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.sensor.noise import NoiseModel
 
 _SEARCHED = 60  # maximum number of frames

@@ -21,7 +21,8 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import evenly
 from tofuse.registration.agreement import AgreementOptions, agreement
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 # Points per image, and the width of the images that they are compared with.
 _POINTS = 700

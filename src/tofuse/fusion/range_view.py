@@ -14,14 +14,11 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.median import median
 from tofuse.kernels.tsdf import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.registration.prepared_view import (
-    PreparedView,
-    Projection,
-    SurfaceOptions,
-    dilated,
-    prepare_view,
-    with_extended_planes,
-)
+from tofuse.registration.extended_planes import with_extended_planes
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.projection import Projection
+from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.registration.view_planes import dilated
 
 # Weights, in 1/m^2, are stored as logarithms: six steps per octave, from 2^-14 on.
 _STEPS, _MIN_LOG2 = 6.0, -14.0

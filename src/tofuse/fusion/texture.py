@@ -20,7 +20,7 @@ from tofuse.kernels.atlas import UNOWNED, Blending, ColoredView, add_view, draw_
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.registration.prepared_view import Projection
+from tofuse.registration.projection import Projection
 
 # Depth tolerance of the visibility test: m, plus a fraction of the depth.
 _TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02

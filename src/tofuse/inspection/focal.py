@@ -20,7 +20,8 @@ from tofuse.inspection.geometry import check_kind, wrong_focal
 from tofuse.inspection.motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import VIEW_COLUMNS, Sample, part_starts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 # Rotation between views as a fraction of the field of view, and the smallest useful rotation.
 _TURN, _MIN_TURN = 0.25, np.radians(4.0)

@@ -14,7 +14,8 @@ from tofuse.inspection.motion import Pair, aligned_pair
 from tofuse.inspection.planar import Distortion, Region, fit_distortion, regions_of
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording, evenly
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 # The faults concern the whole image; a higher resolution would only take longer.
 VIEW_COLUMNS = 128

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from tofuse.bounds import Bounded, Bounds
-from tofuse.registration.prepared_view import SurfaceOptions
 from tofuse.registration.projective import ProjectiveOptions
+from tofuse.registration.surface_options import SurfaceOptions
 
 
 @dataclass(frozen=True)

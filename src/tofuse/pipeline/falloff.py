@@ -31,8 +31,9 @@ from tofuse.kernels.alignment import POINT, POINT_ALBEDO
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align, points_of
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.verification import PATIENT
 from tofuse.registration.view_points import landing_pixels
 

@@ -26,7 +26,8 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.view_store import Outline, PosedView
 from tofuse.registration.base import Registration
-from tofuse.registration.prepared_view import PreparedView, Projection
+from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.projection import Projection
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
 

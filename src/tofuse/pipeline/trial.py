@@ -28,7 +28,7 @@ from tofuse.normal import robust_sigma
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import (
     Aligned,
     Level,
@@ -36,6 +36,7 @@ from tofuse.registration.projective import (
     Target,
     align,
 )
+from tofuse.registration.surface_options import SurfaceOptions
 
 # Views per run, each run being one sample; and starts of the runs as fractions of the recording.
 _VIEWS = 4

@@ -19,7 +19,8 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA, TargetImage
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
-from tofuse.registration.prepared_view import PreparedView, Projection
+from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.projection import Projection
 from tofuse.registration.projective import points_of
 
 # For estimates of the overlap: points of a view, and width of its image.

@@ -17,7 +17,8 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, measured_as_clouds, register_clouds
 from tofuse.registration.fpfh import Fpfh
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair

@@ -17,13 +17,14 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,
     consensus,
     registration_of,
 )
+from tofuse.registration.surface_options import SurfaceOptions
 
 
 @part("registration", "features")

@@ -18,7 +18,8 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.plane_detection import Plane, detect_planes
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
+from tofuse.registration.surface_options import SurfaceOptions
 
 # Min sine of the angle between two normals that determine a rotation, and min volume spanned by
 # three that determine a translation.
