@@ -49,6 +49,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.results.output import frames_in_main_model
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96
@@ -361,7 +362,7 @@ def run(folder: Path, out: Path, frames: int, more: list[str]) -> Usage:
 def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> Iterator[str]:
     """One line for each length."""
     yield (
-        f"{'frames':>7}{'metres':>8}{'posed':>7}{'ATE, cm':>9}{'revisits':>10}{'closed':>8}"
+        f"{'frames':>7}{'metres':>8}{'in main':>8}{'ATE, cm':>9}{'revisits':>10}{'closed':>8}"
         f"{'ms/frame':>12}{'CPU ms':>8}{'CPU ratio':>14}{'peak, MB':>10}  verdict"
     )
     first = np.nan
@@ -374,7 +375,7 @@ def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> It
         each, cpu = 1e3 * used.seconds / count, 1e3 * used.cpu_s / count
         first = cpu if np.isnan(first) else first
         about = json.loads((out / "run.json").read_text())
-        posed = sum(f["status"] in ("tracked", "predicted") for f in about["frames"]) / count
+        posed = len(frames_in_main_model(about))
         figures = [np.nan] * 4
         if truth:
             times, estimate = read_tum(out / "trajectory.txt")
@@ -386,7 +387,7 @@ def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> It
             figures = [metres, 100 * score.ate_rms_m, len(visits)]
             figures.append(sum(closed(visit, poses, known) for visit in visits))
         yield (
-            f"{count:>7}{figures[0]:>8.0f}{posed:>7.1%}{figures[1]:>9.2f}{figures[2]:>10.0f}{figures[3]:>8.0f}"
+            f"{count:>7}{figures[0]:>8.0f}{posed:>8}{figures[1]:>9.2f}{figures[2]:>10.0f}{figures[3]:>8.0f}"
             f"{each:>12.1f}{cpu:>8.1f}{cpu / first:>14.2f}{used.peak / 1e6:>10.0f}"
             f"  {about['verdict']}"
         )
