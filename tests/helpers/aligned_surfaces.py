@@ -9,7 +9,7 @@ import numpy as np
 
 from corner_views import SHARP, corner
 from tofuse.geometry import se3
-from tofuse.posegraph.joint_alignment import RefineOptions
+from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.registration.prepared_view import prepare_view
 
 OPTIONS = RefineOptions()

@@ -12,7 +12,9 @@ from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
-from tofuse.posegraph.joint_alignment import Priors, Refined, align_pairs, refine, response
+from tofuse.posegraph.camera_response import response
+from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
+from tofuse.posegraph.priors import Priors
 from tofuse.posegraph.view_store import KeptView
 
 

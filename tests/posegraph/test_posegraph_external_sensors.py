@@ -22,8 +22,10 @@ from tofuse.posegraph.external_sensors import (
     with_sensors,
 )
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.joint_alignment import Priors, RefineOptions, refine
+from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.pair_equations import RefineOptions
+from tofuse.posegraph.priors import Priors
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view
 

@@ -14,7 +14,8 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.posegraph import shared_error
-from tofuse.posegraph.joint_alignment import RefineOptions, refine
+from tofuse.posegraph.joint_alignment import refine
+from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view
 

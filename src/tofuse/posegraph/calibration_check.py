@@ -21,17 +21,16 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import (
-    Priors,
     Refined,
-    RefineOptions,
-    Round,
     align_pairs,
     align_views,
     refine,
-    response,
     spread_evenly,
 )
+from tofuse.posegraph.pair_equations import RefineOptions, Round
+from tofuse.posegraph.priors import Priors
 from tofuse.posegraph.split_half import aligned_motion
 from tofuse.posegraph.view_store import KeptView
 

@@ -12,7 +12,8 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.accuracy import without_degenerate
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.joint_alignment import RefineOptions, spread_evenly
+from tofuse.posegraph.joint_alignment import spread_evenly
+from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.view_store import KeptView, PosedView, overlaps
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align

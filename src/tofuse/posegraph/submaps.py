@@ -20,17 +20,10 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.executors import executor
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.joint_alignment import (
-    UNITS,
-    Priors,
-    Refined,
-    RefineOptions,
-    Support,
-    refine,
-    spread_evenly,
-    support_of,
-)
+from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_evenly, support_of
 from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.pair_equations import RefineOptions
+from tofuse.posegraph.priors import UNITS, Priors
 from tofuse.posegraph.view_store import KeptView, Outlined, looked_at, overlaps
 
 A = TypeVar("A")

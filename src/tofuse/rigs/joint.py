@@ -19,7 +19,8 @@ from tofuse.geometry import se3
 from tofuse.kernels import rig as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
-from tofuse.posegraph.joint_alignment import UNITS, Round
+from tofuse.posegraph.pair_equations import Round
+from tofuse.posegraph.priors import UNITS
 from tofuse.posegraph.view_store import KeptView
 from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 

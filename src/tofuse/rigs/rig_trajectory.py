@@ -17,7 +17,8 @@ from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.joint_alignment import Bodies, RefineOptions, refine
+from tofuse.posegraph.joint_alignment import Bodies, refine
+from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.refinement import followed, pairwise_measurements
 from tofuse.posegraph.submaps import fell
 from tofuse.posegraph.view_store import KeptView, Spacing

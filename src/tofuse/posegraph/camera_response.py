@@ -1,0 +1,134 @@
+"""Response of refined views to errors of the camera that all of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.arrays import Float64, Intp
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.pair_equations import (
+    RefineOptions,
+    directed_pairs,
+    evaluate,
+    rescale,
+    without_exposure,
+)
+from tofuse.posegraph.priors import DAMPING, Priors, weak_prior
+from tofuse.posegraph.view_store import KeptView
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Sensitivity of each pair to single errors of the camera, all poses being free to follow.
+
+    Attributes
+    ----------
+    gradient, information
+        (M, ERRORS) of each pair i < j, both directions together: first derivative of half its
+        squared residuals at zero error, and half the second.
+    motion
+        (ERRORS, N, 6) twist by which each pose follows, per unit of the error.
+    """
+
+    gradient: Float64
+    information: Float64
+    motion: Float64
+
+    def estimate(self) -> Float64:
+        """(ERRORS,) least-squares estimate of each error alone, by one Gauss-Newton step."""
+        return np.asarray(
+            -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
+        )
+
+    def sigma(self, pairs: Intp, views: int) -> Float64:
+        """(ERRORS,) standard deviations, from the spread between views (sandwich estimator).
+
+        It includes noise that neighbouring pixels share and errors of single views, but not errors
+        that all views have in common.
+
+        Parameters
+        ----------
+        pairs
+            (M, 2) positions of the views.
+        views
+            Number of views.
+        """
+        left = self.gradient + self.information * self.estimate()
+        of_view = np.zeros((views, left.shape[1]))
+        for ends in pairs.T:
+            np.add.at(of_view, ends, left)
+        spread = np.sqrt((of_view**2).sum(0))
+        return np.asarray(spread / np.maximum(self.information.sum(0), 1e-12), np.float64)
+
+
+def response(
+    views: Sequence[KeptView],
+    poses: Float64,
+    pairs: Intp,
+    options: RefineOptions,
+    *,
+    priors: Priors | None = None,
+) -> Response:
+    """Compute the sensitivity of refined views to errors of the camera that they share.
+
+    Parameters
+    ----------
+    views, options
+        As for `refine`.
+    poses
+        (N, 4, 4) T_world_camera, refined without any error.
+    pairs
+        (M, 2) positions of views i < j.
+    priors
+        Measurements by other sensors.
+    """
+    priors = priors or Priors.none()
+    none, asked = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
+    stage = options.rounds[-1]
+    state = directed_pairs(views, pairs, options)
+    system = priors.system(len(views), np.stack([state.target, state.source], 1))
+    evaluate(views, poses, none, np.ones_like(asked), state, stage, options)
+    without_exposure(state)
+    rescale(state, stage)
+    evaluate(views, poses, none, asked, state, stage, options)
+    H, g = without_exposure(state)
+    m = len(priors.pairs)
+    i, j = system.pairs.T
+    T_i_j = se3.inverse(poses[i]) @ poses[j]
+    more_H, more_g = priors.equations(T_i_j[len(H) :])
+    n = len(poses)
+    matrix, gradient = system.relative(
+        np.concatenate([H[:, :6, :6], more_H]),
+        np.concatenate([g[:, :6], more_g]),
+        T_i_j,
+        weak_prior(n),
+    )
+    factor = system.factor(matrix, gradient, DAMPING)
+    assert factor is not None, "every pose has a prior, so the system is not singular"
+    A = se3.adjoint(se3.inverse(T_i_j[: len(H)]))
+
+    def relative(step: Float64) -> Float64:
+        return step[state.source] - (A @ step[state.target][..., None])[..., 0]
+
+    start = factor.step()
+    assert start is not None, "the system is finite"
+    rest = relative(start)
+    slope = g[:, :6] + (H[:, :6, :6] @ rest[..., None])[..., 0]
+    first, second = np.empty((len(H), kernels.ERRORS)), np.empty((len(H), kernels.ERRORS))
+    motion = np.empty((kernels.ERRORS, n, 6))
+    for k in range(kernels.ERRORS):
+        mixed = H[:, :6, 6 + k]
+        column = system.gradient(np.concatenate([mixed, np.zeros((m, 6))]), T_i_j)
+        by_error = factor.solve(column)
+        assert by_error is not None, "the system is finite"
+        motion[k] = by_error
+        follow = relative(motion[k])
+        first[:, k] = g[:, 6 + k] + (mixed * rest).sum(1) + (slope * follow).sum(1)
+        second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * follow).sum(1)
+        second[:, k] += np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
+    half = len(pairs)
+    return Response(first[:half] + first[half:], second[:half] + second[half:], motion)
