@@ -9,6 +9,7 @@ of all results are compared byte by byte with those of the runs alone, except fo
 
     python benchmarks/batch.py                                  100 recordings, ten kills
     python benchmarks/batch.py --recordings 6 --frames 3        a quick check
+    python benchmarks/batch.py --modes LocalCluster             one of the modes
 
 Needs `pip install tofuse[dask]`.
 """
@@ -33,6 +34,7 @@ from time import perf_counter, sleep
 import numpy as np
 
 OUT = Path(__file__).parent / "out" / "batch"
+MODES = ("machine", "LocalCluster", "processes")
 # The times in a report.
 _TIMES = re.compile(
     r'<tr><td>[\w ]+</td><td class="number">[^<]*</td><td class="bars">.*?</tr>'
@@ -228,6 +230,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     out: Path = arguments.out
@@ -269,19 +272,22 @@ def main() -> None:
         same = same_results(recordings, alone, folder)
         row(f"{how}, {kills} kills", 2, perf_counter() - start, None, same)
 
-    one = timed("this machine", 1, None, "--workers", 1)
-    fastest = timed("this machine", 2, one, "--workers", 2)
-    killed("this machine", lambda batch: lambda: children(batch.pid), "--workers", 2)
-    with local_cluster(1) as (address, _):
-        one = timed("`LocalCluster`", 1, None, "--scheduler", address)
-    with local_cluster(2) as (address, pids):
-        fastest = timed("`LocalCluster`", 2, one, "--scheduler", address)
-        killed("`LocalCluster`", lambda _: pids, "--scheduler", address)
-    with own_processes(1, out / "dask") as (address, _):
-        one = timed("workers of their own", 1, None, "--scheduler", address)
-    with own_processes(2, out / "dask") as (address, pids):
-        fastest = timed("workers of their own", 2, one, "--scheduler", address)
-        killed("workers of their own", lambda _: pids, "--scheduler", address)
+    if "machine" in arguments.modes:
+        one = timed("this machine", 1, None, "--workers", 1)
+        fastest = timed("this machine", 2, one, "--workers", 2)
+        killed("this machine", lambda batch: lambda: children(batch.pid), "--workers", 2)
+    if "LocalCluster" in arguments.modes:
+        with local_cluster(1) as (address, _):
+            one = timed("`LocalCluster`", 1, None, "--scheduler", address)
+        with local_cluster(2) as (address, pids):
+            fastest = timed("`LocalCluster`", 2, one, "--scheduler", address)
+            killed("`LocalCluster`", lambda _: pids, "--scheduler", address)
+    if "processes" in arguments.modes:
+        with own_processes(1, out / "dask") as (address, _):
+            one = timed("workers of their own", 1, None, "--scheduler", address)
+        with own_processes(2, out / "dask") as (address, pids):
+            fastest = timed("workers of their own", 2, one, "--scheduler", address)
+            killed("workers of their own", lambda _: pids, "--scheduler", address)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
@@ -19,7 +20,7 @@ from tofuse.batch.cluster import DaskWorkers
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.table import COLUMNS, duration, write_table
-from tofuse.batch.work import Task
+from tofuse.batch.work import Task, work
 from tofuse.batch.workers import LocalWorkers, Workers
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
@@ -410,3 +411,22 @@ def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> 
 )
 def test_durations_are_formatted(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="reads /proc")
+def test_jobs_do_not_inherit_memory_limit_of_dask_workers(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")
+    monkeypatch.setenv("OF_THE_USER", "1")
+    job = Job("a", str(tmp_path / "missing"))
+    folder = BatchFolder(tmp_path / "out")
+    folder.prepare()
+    write_table([job], folder)
+    seen: list[bytes] = []
+
+    def on_start(process: subprocess.Popen[bytes]) -> None:
+        seen.append(Path(f"/proc/{process.pid}/environ").read_bytes())
+
+    record = work(Task(job, str(folder.path), 1), on_start)
+    assert record.state == "failed"
+    assert b"OF_THE_USER=1" in seen[0]
+    assert b"MALLOC_TRIM_THRESHOLD_" not in seen[0]

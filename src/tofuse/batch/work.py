@@ -6,6 +6,7 @@ Imports nothing heavy, as the workers and the scheduler of a cluster load it.
 from __future__ import annotations
 
 import json
+import os
 import platform
 import signal
 import subprocess
@@ -23,6 +24,9 @@ from tofuse.files.locking import locked
 
 # Runs the command, and ends when its parent does.
 _MODULE = "tofuse.cli.job"
+# Dask's nannies set it for their workers, so that these return freed memory at once. It makes jobs
+# slower, whose memory is returned when they end.
+_NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ def _start_process(task: Task, folder: BatchFolder, lock: int) -> subprocess.Pop
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                env={k: v for k, v in os.environ.items() if k != _NOT_INHERITED},
                 start_new_session=True,  # Ctrl-C reaches only this process: checkpoints stay
                 pass_fds=() if sys.platform == "win32" else (lock,),
             )
