@@ -30,8 +30,8 @@ from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import corrected_depth
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions

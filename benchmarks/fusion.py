@@ -54,8 +54,8 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import corrected_depth
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 

@@ -12,10 +12,10 @@ earlier pose after at least 20 s elsewhere. It is closed if the estimated relati
 closest pair is accurate to 5 cm and 1 degree.
 
 `there-and-back` plays a recording forwards and backwards until it has the required length, with
-every second row and column of its depth images with `--half`.
+only every N-th row and column of its depth images with `--thin N`.
 
     python benchmarks/hours.py building [--rooms 20] [--frames 20000] [--counts 1000 20000]
-    python benchmarks/hours.py there-and-back RECORDING [--half] [--counts 1000 5000 20000]
+    python benchmarks/hours.py there-and-back RECORDING [--thin 2] [--counts 1000 5000 20000]
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.output import frames_in_main_model
+from tofuse.results.run_json import frames_in_main_model
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96
@@ -424,28 +424,25 @@ def there_and_back(recording: Path, count: int, folder: Path | None = None) -> P
     return folder
 
 
-def halved(recording: Path) -> Path:
-    """A native folder with every second row and column of the depth images of a recording."""
-    folder = OUT / f"half-{recording.name}"
+def thinned(recording: Path, every: int) -> Path:
+    """A native folder with every n-th row and column of the depth images of a recording."""
+    folder = OUT / f"every-{every}-{recording.name}"
     if folder.exists():
         return folder
     source = open_recording(recording)
     camera = source[0].camera
     if not isinstance(camera, Pinhole):
-        raise SystemExit(f"{recording}: --half needs a pinhole camera")
-    small = Pinhole(
-        (camera.width + 1) // 2,
-        (camera.height + 1) // 2,
-        camera.fx / 2,
-        camera.fy / 2,
-        camera.cx / 2,
-        camera.cy / 2,
-    )
+        raise SystemExit(f"{recording}: --thin needs a pinhole camera")
+    size = -(-camera.width // every), -(-camera.height // every)
+    lens = (value / every for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    small = Pinhole(*size, *lens)
     frames = [
-        RangeFrame(k, f.timestamp, small, np.ascontiguousarray(f.depth[::2, ::2]), f.depth_kind)
+        RangeFrame(
+            k, f.timestamp, small, np.ascontiguousarray(f.depth[::every, ::every]), f.depth_kind
+        )
         for k, f in enumerate(source)
     ]
-    convert(Recording.of(ArraySource(frames), recording, "half"), folder)
+    convert(Recording.of(ArraySource(frames), recording, "thinned"), folder)
     return folder
 
 
@@ -460,7 +457,7 @@ def main() -> None:
     made.add_argument("--only-record", action="store_true")
     played = kinds.add_parser("there-and-back")
     played.add_argument("recording", type=Path, help="a native folder")
-    played.add_argument("--half", action="store_true", help="halve the depth images")
+    played.add_argument("--thin", type=int, default=1, help="use every n-th row and column")
     played.add_argument("--counts", type=int, nargs="+", default=[1000, 5000, 20_000])
     for kind in (made, played):
         kind.add_argument("--options", default="", help="more options of `tofuse run`")
@@ -473,7 +470,9 @@ def main() -> None:
             return
         lines = rows(folder, arguments.counts, more, truth=True)
     else:
-        recording = halved(arguments.recording) if arguments.half else arguments.recording
+        recording = arguments.recording
+        if arguments.thin > 1:
+            recording = thinned(recording, arguments.thin)
         folder = there_and_back(recording, max(arguments.counts))
         lines = rows(folder, arguments.counts, more, truth=False)
     for line in lines:

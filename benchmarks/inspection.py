@@ -31,8 +31,8 @@ from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan
 from tofuse.lab.simulation.scene import SCENES, build
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.models import CameraModel, camera_model
 

@@ -22,7 +22,7 @@ from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
-from tofuse.results.output import read_run_json
+from tofuse.results.run_json import read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "images" / "room.png"

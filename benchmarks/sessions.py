@@ -33,7 +33,8 @@ from tofuse.lab.simulation.record import Plan, plan, write
 from tofuse.lab.simulation.scenes import flat, furniture
 from tofuse.lab.simulation.scenes.assembly import Assembly, placed
 from tofuse.pipeline.merging import MergeOptions, merge_files
-from tofuse.pipeline.run import Options, run
+from tofuse.pipeline.options import Options
+from tofuse.pipeline.run import run
 from tofuse.results.sessions import probability_text
 from tofuse.results.types import Reconstruction
 

@@ -22,8 +22,8 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.open import open_recording
 from tofuse.sensor.models import CAMERAS, camera_model
 

@@ -24,7 +24,7 @@ from tofuse.lab.simulation.record import Plan
 from tofuse.lab.simulation.scenes.assembly import Assembly, placed, shell
 from tofuse.lab.simulation.scenes.furniture import chair
 from tofuse.lab.simulation.texture import Material
-from tofuse.recordings.native import corrected_depth
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.models import CameraModel, camera_model
 

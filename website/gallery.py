@@ -24,8 +24,9 @@ from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.lab.demo import simulate_to
-from tofuse.pipeline.run import Options, run
-from tofuse.results.output import frames_in_main_model, read_run_json
+from tofuse.pipeline.options import Options
+from tofuse.pipeline.run import run
+from tofuse.results.run_json import frames_in_main_model, read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -29,7 +29,7 @@ from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rati
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.evaluating import evaluate
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-from tofuse.recordings.native import NativeSource
+from tofuse.recordings.readers.native import NativeSource
 from tofuse.recordings.recording import ArraySource, Recording, evenly
 
 # A synthetic room, and poses in it -------------------------------------------------------------

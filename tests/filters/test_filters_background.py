@@ -20,8 +20,8 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.lab.simulation.scenes import box
 from tofuse.parts import to_dict
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import corrected_depth
 
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 

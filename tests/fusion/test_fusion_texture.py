@@ -23,6 +23,7 @@ from tofuse.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.atlas import UNOWNED, draw_triangles
+from tofuse.pipeline import options as options_module
 from tofuse.pipeline import paint
 from tofuse.pipeline import run as run_module
 from tofuse.recordings.frames import RangeFrame
@@ -315,7 +316,7 @@ def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypa
     monkeypatch.setattr(
         run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
     )
-    monkeypatch.setattr(run_module, "TEXTURE", 256)
+    monkeypatch.setattr(options_module, "TEXTURE", 256)
     monkeypatch.setattr(paint, "_FACES", 3000)
     words = ["run", str(room_recording), "--every", "7", "--voxel", "3cm", "--out"]
     for threads, name in (("1", "a"), ("2", "b")):

@@ -13,7 +13,7 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 from tofuse.lab.simulation.scene import build
-from tofuse.recordings.native import NativeSource
+from tofuse.recordings.readers.native import NativeSource
 
 
 @pytest.fixture(scope="module")

@@ -33,9 +33,9 @@ from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.results.folder import CHECKPOINT, STAGING
-from tofuse.results.output import run_json
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
+from written_run_json import run_json
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 

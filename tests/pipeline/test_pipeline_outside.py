@@ -17,8 +17,8 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.posegraph.refinement import Joint
 from tofuse.recordings.open import open_recording
-from tofuse.results.output import run_json
 from tofuse.results.types import Reconstruction
+from written_run_json import run_json
 
 BOTH = (GravityEdges(), OdometryEdges())
 
@@ -84,7 +84,7 @@ def test_missing_sensor_files_change_nothing(room_recording):
 
 
 def test_rotating_object_has_no_gravity(tmp_path):
-    from tofuse.pipeline.run import Options, resolve
+    from tofuse.pipeline.options import Options, resolve
 
     assert resolve(Options(tmp_path)).priors == (GravityEdges(),)
     assert resolve(Options(tmp_path, object=True)).priors == ()

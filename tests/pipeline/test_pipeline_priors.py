@@ -23,7 +23,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.output import read_run_json
+from tofuse.results.run_json import read_run_json
 from tofuse.results.types import FrameRecord
 
 # Only the poses matter: the model is coarse.

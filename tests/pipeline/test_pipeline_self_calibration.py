@@ -23,7 +23,7 @@ from tofuse.posegraph.refinement import Refinement
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.output import run_json
+from written_run_json import run_json
 
 CAMERA = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5)
 # Only the poses matter: the model is coarse.

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tofuse.pipeline.backend import BackEnd
+from tofuse.pipeline.assessment import on_a_single_link
+from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import LoopRecord
-from tofuse.posegraph.joining import Join
+from tofuse.posegraph.islands import Join
 from tofuse.registration.base import Link, Registration
 
 FOUND = Registration(np.eye(4), True, 5, 100, 100, 0.1, 0.01, np.eye(6))
@@ -43,5 +44,5 @@ def loop(i, j, accepted=True):
     ],
 )
 def test_frames_behind_a_single_link(joins, loops, expected) -> None:
-    end = SimpleNamespace(_joins=joins, _posed=POSED)
-    assert BackEnd._on_a_single_link(end, loops) == expected
+    tracked = TrackedGraph(POSED, {}, joins)
+    assert on_a_single_link(tracked, loops) == expected

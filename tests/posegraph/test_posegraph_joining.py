@@ -13,10 +13,13 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
 from tofuse.posegraph.gaps import Stretch
+from tofuse.posegraph.islands import Islands
+from tofuse.posegraph.join_checks import JoinChecks
 from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.search import SearchOptions
+from tofuse.registration.verification import IN_SIGHT
 from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
@@ -264,16 +267,14 @@ def test_join_by_single_link_is_reconsidered() -> None:
     assert all(join.link is not wrong for join in group.joins)
 
 
-def test_short_gap_does_not_support_distant_pose(three, monkeypatch) -> None:
+def test_short_gap_does_not_support_distant_pose(three) -> None:
     """A single link is used at once if it implies no motion; but not if it implies motion."""
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
-    monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
-    joiner = joining._Joiner(Joining(), three[:2], SearchOptions())
-    joiner.decide()
-    a, b = joiner._islands
+    islands = Islands(three[:2])
+    checks = JoinChecks(islands)
+    a, b = islands.all
     right = se3.inverse(PATH[0]) @ PATH[12]
-    assert joiner._is_near(a, b, right, joining.IN_SIGHT)
-    assert not joiner._is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), joining.IN_SIGHT)
+    assert checks.is_near(a, b, right, IN_SIGHT)
+    assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), IN_SIGHT)
 
 
 def test_motion_between_recordings_is_unconstrained(monkeypatch) -> None:
@@ -383,7 +384,7 @@ def probable(first, second, p, T=None):
 def min_probability(three, monkeypatch):
     """Join two components by links alone, and return the probability; None if rejected."""
     monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
-    monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
+    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
 
     def joined(links, at_least=0.9):
         groups = replace(SPARSELY, min_probability=at_least).join(three[:2], links)
@@ -400,21 +401,21 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert one == pytest.approx(0.95)
     # The same views again add little: here the rotations are 0.24 rad.
     same = min_probability([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
-    odds = 19 ** (1 + 0.24 / joining.IN_SIGHT) / 2
+    odds = 19 ** (1 + 0.24 / IN_SIGHT) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
     other = min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
     assert other > same
 
 
 def test_failed_tries_lower_probability(three, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
+    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
     a, b = three[0].views, three[1].views
     right = probable(a[-1], b[0], 0.96)
     joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2], SearchOptions())
     joiner.add(right)
-    assert joiner._probability(*joiner._islands, [right]) == pytest.approx(0.96)
+    assert joiner._probability(*joiner._islands.all, [right]) == pytest.approx(0.96)
     joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
-    assert joiner._probability(*joiner._islands, [right]) == pytest.approx(24 / 28)
+    assert joiner._probability(*joiner._islands.all, [right]) == pytest.approx(24 / 28)
     joiner.decide(single=True)
     assert len(joiner.groups()) == 2
 

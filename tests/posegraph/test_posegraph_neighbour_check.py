@@ -77,9 +77,9 @@ def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
         return np.linalg.norm((se3.inverse(T) @ se3.inverse(truth[k - 1]) @ truth[k])[:3, 3])
 
     # Least squares alone separates the uncertain pair, which was correct.
-    plain = end._config.optimiser.optimise(end.graph([loop])).graph
+    plain = end._config.optimiser.optimise(end._tracked.build([loop])).graph
     assert moved(plain, unusual) > 0.07
-    optimisation, confirmed = end._optimise(end.graph([loop]), [loop], SensorPriors())
+    optimisation, confirmed = end._optimise(end._tracked.build([loop]), [loop], SensorPriors())
     assert confirmed == {unusual}
     assert moved(optimisation.graph, unusual) < 0.04
     assert moved(optimisation.graph, wrong) < moved(plain, wrong)
@@ -94,7 +94,7 @@ def test_registration_contradicted_by_images_stays_uncertain(posed_views) -> Non
         np.diag(SIGMA**-2),
     )
     end = chain(posed, truth, {wrong: 100.0}, wrong)
-    optimisation, confirmed = end._optimise(end.graph([loop]), [loop], SensorPriors())
+    optimisation, confirmed = end._optimise(end._tracked.build([loop]), [loop], SensorPriors())
     assert not confirmed
     relative = se3.inverse(se3.inverse(truth[2]) @ truth[3]) @ (
         se3.inverse(optimisation.graph.poses[2]) @ optimisation.graph.poses[3]

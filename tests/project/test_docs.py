@@ -32,12 +32,12 @@ from tofuse.posegraph.graph import LoopRecord
 from tofuse.registration.projective import ProjectiveOptions
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import UncertaintyOptions
-from tofuse.results.output import run_json
 from tofuse.results.pair import FILES as PAIR_FILES
 from tofuse.results.pair import pair_json
 from tofuse.results.types import Component
 from tofuse.results.verdict import REASONS
 from tofuse.sensor.models import CAMERAS
+from written_run_json import run_json
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]

@@ -19,9 +19,9 @@ from tofuse.errors import InputError, OutputError
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.recordings.convert import convert
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.native import NativeSource
 from tofuse.recordings.noise import family_of
 from tofuse.recordings.open import open_recording
+from tofuse.recordings.readers.native import NativeSource
 from tofuse.recordings.recording import Recording
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")

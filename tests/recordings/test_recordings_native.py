@@ -24,7 +24,8 @@ from tofuse.geometry.cameras import (
 )
 from tofuse.geometry.se3 import exp
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.native import NativeSource, RecordingWriter
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.readers.native import NativeSource
 from tofuse.sensor.depth_correction import DepthCorrection
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)

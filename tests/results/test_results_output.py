@@ -15,8 +15,10 @@ from made_results import contents, result, torn
 from tofuse.errors import InputError, OutputError
 from tofuse.pipeline.run import exit_status
 from tofuse.results.folder import STAGING, OutputFolder, component_number, is_result
-from tofuse.results.output import frames_in_main_model, plain, read_run_json, run_json, write_result
+from tofuse.results.output import write_result
+from tofuse.results.run_json import frames_in_main_model, plain, read_run_json
 from tofuse.results.types import FrameRecord
+from written_run_json import run_json
 
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
 
@@ -157,7 +159,9 @@ def test_interrupted_moves_are_finished_by_next_run(tmp_path, monkeypatch, moved
 
 def test_run_json_matches_contract(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
-    data = json.loads((tmp_path / "run.json").read_text(), parse_constant=lambda c: pytest.fail(c))
+    text = (tmp_path / "run.json").read_text()
+    data = json.loads(text, parse_constant=lambda c: pytest.fail(c))
+    assert text == json.dumps(data, indent=1) + "\n"
     assert list(data) == [
         "schema",
         "version",

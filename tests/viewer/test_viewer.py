@@ -23,8 +23,9 @@ from tofuse.cli import main
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
+from tofuse.pipeline.options import Options
 from tofuse.pipeline.progress import Silent
-from tofuse.pipeline.run import Options, run
+from tofuse.pipeline.run import run
 from tofuse.recordings.frames import CloudFrame
 from tofuse.report.images import viridis
 from tofuse.report.pictures import draw

@@ -25,7 +25,7 @@ from tofuse.pipeline.merging import merge as merge_results
 from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import reconstruct as reconstruct_recording
 from tofuse.pipeline.reconstruct import view_kind
-from tofuse.pipeline.run import write_report_files
+from tofuse.pipeline.report_files import write_report_files
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.recording import Recording
 from tofuse.results.card import SEPARATOR, card

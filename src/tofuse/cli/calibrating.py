@@ -16,7 +16,7 @@ from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.recordings.camera_file import camera_fields
-from tofuse.recordings.native import read_correction
+from tofuse.recordings.correction_file import read_correction
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording

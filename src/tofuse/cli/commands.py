@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from viser import ViserServer
 
-    from tofuse.pipeline.run import Options
+    from tofuse.pipeline.options import Options
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_options(arguments: argparse.Namespace) -> Options:
     """Return the options of ``tofuse run``."""
-    from tofuse.pipeline.run import Options
+    from tofuse.pipeline.options import Options
 
     return from_arguments(Options, arguments)
 
@@ -307,7 +307,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
 def judge(arguments: argparse.Namespace) -> int:
     """``tofuse judge``."""
     from tofuse.pipeline.judging import JudgeOptions, judge_files, sentence
-    from tofuse.results.output import plain
+    from tofuse.results.run_json import plain
 
     _check_overwrite(arguments)
     options = from_arguments(JudgeOptions, arguments)
@@ -379,8 +379,8 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Print a summary of a result, or with `as_json` one JSON line."""
     from tofuse.results.card import SEPARATOR, card
     from tofuse.results.folder import component_name
-    from tofuse.results.output import accuracy_json, plain, reasons_json
     from tofuse.results.ranges import in_words
+    from tofuse.results.run_json import accuracy_json, plain, reasons_json
     from tofuse.results.sessions import session_sentences
 
     d = result.diagnostics

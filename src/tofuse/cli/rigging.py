@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
-from tofuse.results.output import plain
+from tofuse.results.run_json import plain
 from tofuse.rigs.calibrate import Calibration, loosest
 from tofuse.rigs.check import Moved
 

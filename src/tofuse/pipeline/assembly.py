@@ -16,8 +16,10 @@ from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
+from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.joining import Group, Join
+from tofuse.posegraph.islands import Join
+from tofuse.posegraph.joining import Group
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
 from tofuse.results.types import Reconstruction
 
@@ -55,7 +57,7 @@ class Assembly:
         """Return the pose graph of a component as tracked, with loops."""
         own = log.of_component(component)
         poses = poses_in_world(own, {component: np.eye(4)})
-        return self._back_end(own, poses, ()).graph(loops)
+        return TrackedGraph(own.posed, poses, ()).build(loops)
 
     def _join(self, log: FrameLog, stages: Stages) -> list[Group]:
         """Decide which components are connected, and how, from all views."""

@@ -23,7 +23,7 @@ from tofuse.posegraph.loops import LoopDetector
 from tofuse.posegraph.refinement import NoRefinement, Refining
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.search import SearchOptions
-from tofuse.results.output import read_run_json
+from tofuse.results.run_json import read_run_json
 
 ViewKind = Literal["range", "cloud"]
 

@@ -19,7 +19,7 @@ from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
-from tofuse.results.output import frame_clock, read_run_json
+from tofuse.results.run_json import frame_clock, read_run_json
 
 Poses = str | Path | Float64
 

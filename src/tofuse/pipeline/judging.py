@@ -49,8 +49,9 @@ from tofuse.recordings.recording import Recording, evenly
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.card import bound, length
 from tofuse.results.folder import OutputFolder
-from tofuse.results.output import accuracy_json, plain, reasons_json, write_result
+from tofuse.results.output import write_result
 from tofuse.results.ranges import Range, in_words, runs_of
+from tofuse.results.run_json import accuracy_json, plain, reasons_json
 from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
 

@@ -13,10 +13,10 @@ from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.odometry.base import Step
-from tofuse.pipeline.backend import BackEndInput
 from tofuse.pipeline.budget import views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
+from tofuse.pipeline.stage_results import BackEndInput
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame

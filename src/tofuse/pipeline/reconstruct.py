@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.arrays import Float32, Float64
+from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.ply import read_ply
-from tofuse.geometry import se3
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
@@ -34,7 +31,6 @@ from tofuse.results.types import Reconstruction
 _TRACKING = "tracking"
 # Frames that are read and prepared in advance; each takes a multiple of its images' size.
 _AHEAD = 6
-_TRUTH_POINTS = 100_000
 
 
 def reconstruct(
@@ -287,40 +283,3 @@ def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
     up: Float64 = np.median(known, axis=0)
     length = float(np.linalg.norm(up))
     return up / length if length > 0.1 else None
-
-
-def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:
-    """Return the reference poses (N, 4, 4) in the result's world, NaN for frames without one.
-
-    They are aligned at the first frame with a pose in both.
-    """
-    reference = recording.reference
-    if reference is None:
-        return None
-    both = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
-    if len(both) == 0:
-        return None
-    k = both[0]
-    T_world_reference = result.trajectory[k] @ se3.inverse(reference[k])
-    return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
-
-
-def truth_points(recording: Recording) -> Float32 | None:
-    """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
-    path = Path(recording.path) / "truth" / "surface.ply"
-    if not path.is_file():
-        return None
-    truth = read_ply(path)
-    if truth.faces is None or len(truth.faces) == 0:
-        return truth.points.astype(np.float32)
-    corners = truth.points[truth.faces].astype(float)
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    rng = np.random.default_rng(0)
-    chosen = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
-    u, v = rng.random((2, _TRUTH_POINTS, 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
-    return points.astype(np.float32)

@@ -22,8 +22,8 @@ from tofuse.pipeline.progress import Progress
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
-from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
+from tofuse.results.run_json import main_poses, read_run_json
 
 _REMEDY = "pass the --out of `tofuse run`"
 

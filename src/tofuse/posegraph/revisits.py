@@ -185,6 +185,8 @@ class _RevisitLoops(Loops):
         self._spacing, self._appearance = spacing, appearance
         self._store = views
         self._chosen: ViewStore[PreparedView] = ViewStore(spacing)
+        self._latest: int | None = None  # index of the latest frame
+        # Of views only, as long recordings have many more frames.
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
         self._seen: dict[int, _Entry] = {}
@@ -198,9 +200,10 @@ class _RevisitLoops(Loops):
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Loops.push`."""
-        self._poses[view.index] = T_component_camera
+        self._latest = view.index
         newest = self._store.views[-1] if self._store.views else None
         if newest is not None and newest.index == view.index:
+            self._poses[view.index] = T_component_camera
             self._chosen.push_posed(newest)
 
     @property
@@ -224,7 +227,7 @@ class _RevisitLoops(Loops):
     def detection_job(self) -> Callable[[], list[ClosedLoop]] | None:
         """See `Loops.detection_job`. So far, poses are comparable only within a component."""
         posed = self._chosen.views
-        if not posed or posed[-1].index != next(reversed(self._poses)):
+        if not posed or posed[-1].index != self._latest:
             return None
         posed = [p for p in posed if p.component == posed[-1].component]
         poses = np.stack([p.T_component_camera for p in posed])
@@ -243,9 +246,14 @@ class _RevisitLoops(Loops):
         self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
     ) -> list[ClosedLoop]:
         """See `Loops.finish`. Given loops replace detected ones."""
-        self._poses, self._covariances = dict(poses), dict(covariances)
-        self._path_length = _path_lengths(poses)
-        posed = self._chosen.of(poses)
+        posed, path = self._chosen.of(poses), _path_lengths(poses)
+        by_index = {p.index: p for p in posed}
+        known = {p.index: p for p in self._store.of(poses)}
+        views = by_index.keys() | known.keys()
+        self._poses = {index: poses[index].copy() for index in views}
+        self._covariances = {index: covariances[index].copy() for index in views}
+        self._path_length = {index: path[index].copy() for index in views}
+        del path
         self._learn(posed)
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
         seen = self._views(posed)
@@ -253,7 +261,6 @@ class _RevisitLoops(Loops):
         found = self._confirm_all([(posed[i], posed[j]) for i, j in pairs])
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
-        by_index = {p.index: p for p in posed}
         rejected = sorted(
             (pair for pair, loop in closed.items() if not loop.record.accepted),
             key=lambda pair: -(closed[pair].record.overlap or 0.0),
@@ -264,7 +271,6 @@ class _RevisitLoops(Loops):
         asked = [*rejected[: self._options.searches * times], *alike]
         closed.update(self._searched(asked, by_index, closed, alike))
         self._closed = {p: c for p, c in closed.items() if c.record.accepted}
-        known = {p.index: p for p in self._store.of(poses)}
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
                 loop, known, lambda i, j: self._confirm(known[i], known[j])

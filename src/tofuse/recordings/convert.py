@@ -14,13 +14,10 @@ import numpy as np
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import new_folder
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.recordings.depth_counts import MAX_COUNTS
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-from tofuse.recordings.native import (
-    MAX_COUNTS,
-    NativeSource,
-    RecordingWriter,
-    same_distortion,
-)
+from tofuse.recordings.native import RecordingWriter, same_distortion
+from tofuse.recordings.readers.native import NativeSource
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 

@@ -10,8 +10,8 @@ from tofuse.errors import InputError
 from tofuse.files.images import check_first_size, read_color, read_image
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.sources import FileSource
 

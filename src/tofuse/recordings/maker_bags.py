@@ -25,8 +25,8 @@ from tofuse.recordings.bags import (
 )
 from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
 from tofuse.recordings.color import sampled_color
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.ros_messages import ENCODINGS, color_image, image
 from tofuse.recordings.sources import FileSource

@@ -35,7 +35,7 @@ from tofuse.results.folder import (
     lock_folder,
 )
 from tofuse.results.nerfstudio import write_nerfstudio
-from tofuse.results.output import read_run_json
+from tofuse.results.run_json import read_run_json
 from tofuse.results.tiles import is_tiles, write_tiles
 
 # Default number of triangles, and the maximum size of a .glb with their texture.

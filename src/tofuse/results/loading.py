@@ -16,7 +16,7 @@ from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.results.folder import component_name, finish_interrupted, is_result
-from tofuse.results.output import main_poses, read_run_json
+from tofuse.results.run_json import main_poses, read_run_json
 from tofuse.results.types import (
     Component,
     Diagnostics,

@@ -1,37 +1,30 @@
-"""The files of an output folder: written, and `run.json` and the poses read again."""
+"""Writes the files of an output folder."""
 
 from __future__ import annotations
 
 import importlib.util
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.arrays import Float64, Intp
-from tofuse.errors import InputError
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
-from tofuse.files.reading import parsed, read_text
-from tofuse.files.trajectory import read_tum, write_tum
+from tofuse.files.trajectory import write_tum
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import job_pool
-from tofuse.posegraph.accuracy import Accuracy
-from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.g2o import write_g2o
-from tofuse.posegraph.refinement import Refinement
 from tofuse.results import tiles
-from tofuse.results.folder import TILES, TILESET, OutputFolder, component_name, is_result
-from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
+from tofuse.results.folder import TILES, OutputFolder, component_name
+from tofuse.results.run_json import write_run_json
+from tofuse.results.types import Reconstruction
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
@@ -87,9 +80,7 @@ def _write_files(
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
-        with (folder / "run.json").open("w", encoding="utf-8") as file:
-            json.dump(run_json(result, model.result()), file, indent=1, allow_nan=False)
-            file.write("\n")
+        write_run_json(folder / "run.json", result, model.result())
 
 
 def _write_model(
@@ -185,311 +176,3 @@ def _write_mesh(
         GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
     )
     return tiled
-
-
-def run_json(result: Reconstruction, tiled: tiles.TilingSummary | None = None) -> dict[str, Any]:
-    """Return the content of `run.json`, schema 1: SI units and radians, null instead of NaN.
-
-    Parameters
-    ----------
-    result
-        The result.
-    tiled
-        Summary of its tiles, if it has any.
-    """
-    d = result.diagnostics
-    return plain(
-        {
-            "schema": 1,
-            "version": __version__,
-            "input": {
-                **{key: result.recording[key] for key in ("path", "format", "frames")},
-                "opening": result.recording.get("opening"),
-            },
-            "warnings": result.recording.get("warnings", []),
-            "findings": result.recording.get("findings", []),
-            "seed": result.seed,
-            "threads": result.threads,
-            "config": result.config,
-            "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
-            "verdict": d.verdict,
-            "accuracy": accuracy_json(d.accuracy),
-            "self_calibration": _calibration(d.calibrated),
-            "reasons": reasons_json(d.reasons),
-            "frames": [
-                {
-                    "index": f.index,
-                    "timestamp": f.timestamp,
-                    "status": f.status,
-                    "reason": f.reason,
-                    "valid_share": f.valid_share,
-                    "inlier_share": f.inlier_share,
-                    "rms_m": f.rms_m,
-                    "covariance": None if f.covariance is None else f.covariance.ravel(),
-                    "unobservable": f.unobservable,
-                    "component": f.component,
-                    "session": _session_of(f.index, result),
-                }
-                for f in d.frames
-            ],
-            "T_up_world": result.T_up_world,
-            "tiles": _tiles(tiled),
-            "rig": result.recording.get("rig"),
-            "components": [_component(c) for c in result.components],
-            "sessions": [
-                {
-                    "name": s.name,
-                    "result": s.result,
-                    "opening": s.opening,
-                    "config": s.config,
-                    "first": s.first,
-                    "count": s.count,
-                    "T_main_session": s.T_main_session,
-                }
-                for s in result.sessions
-            ],
-            "session_pairs": [asdict(pair) for pair in result.session_pairs],
-            "changes": [
-                {
-                    "a": c.a,
-                    "b": c.b,
-                    "kind": c.change.kind,
-                    "centre_m": c.change.centre,
-                    "size_m": c.change.size,
-                    "volume_m3": c.change.volume_m3,
-                }
-                for c in result.changes
-            ],
-            "loops": [
-                {
-                    "i": p.i,
-                    "j": p.j,
-                    "accepted": p.accepted,
-                    "reason": p.reason,
-                    "overlap": p.overlap,
-                    "rms_m": p.rms_m,
-                    "free_space_violation": p.free_space_violation,
-                    "margin": p.margin,
-                }
-                for p in d.loops
-            ],
-            "optimiser": [
-                {
-                    "first": p.first,
-                    "vertices": p.vertices,
-                    "edges": p.edges,
-                    "before": p.before,
-                    "after": p.after,
-                    "improved": p.improved,
-                    "converged": p.converged,
-                }
-                for p in d.parts
-            ],
-            "priors": [
-                {
-                    "sensor": s.sensor,
-                    "measured": s.measured,
-                    "used": s.used,
-                    "scale": s.scale,
-                    "text": s.text,
-                }
-                for s in d.priors
-            ],
-            "refinement": _refinement(d.refinement),
-            "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},
-        }
-    )
-
-
-def _tiles(tiled: tiles.TilingSummary | None) -> dict[str, Any] | None:
-    """The summary of the tiles; None without tiles."""
-    if tiled is None:
-        return None
-    return {
-        "tileset": f"{TILES}/{TILESET}",
-        "levels": tiled.levels,
-        "tiles": tiled.tiles,
-        "faces": tiled.faces,
-        "overview_faces": len(tiled.overview.faces),
-    }
-
-
-def _session_of(index: int, result: Reconstruction) -> int | None:
-    """Number of the session that a frame belongs to; None where there is only one recording."""
-    return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
-
-
-def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
-    """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
-    if not is_result(folder):
-        return None
-    frames = read_run_json(folder / "run.json").get("frames", [])
-    try:
-        times = np.array([frame["timestamp"] for frame in frames], float)
-        return times, np.array([frame["index"] for frame in frames], np.intp)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError("has no times of frames", where=folder / "run.json") from error
-
-
-def accuracy_json(a: Accuracy) -> dict[str, Any]:
-    """Return the accuracy as in `run.json`, except that infinite bounds are not yet null."""
-    worst = None
-    if a.worst is not None:
-        w = a.worst
-        worst = {"frame": w.frame, "position_m": w.position_m, "rotation_rad": w.rotation_rad}
-    return {
-        "position_m": a.position_m,
-        "rotation_rad": a.rotation_rad,
-        "relative": a.relative,
-        "assessed": a.assessed,
-        "worst": worst,
-        "unbounded": list(a.unbounded),
-        "by_odometry": list(a.by_odometry),
-    }
-
-
-def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
-    """Return the reasons as `run.json` has them."""
-    return [
-        {
-            "code": r.code,
-            "frames": list(r.frames),
-            "ranges": [list(each) for each in r.ranges],
-            "text": r.text,
-        }
-        for r in reasons
-    ]
-
-
-def _component(c: Component) -> dict[str, Any]:
-    return {
-        "frames": [list(each) for each in c.frames],
-        "T_main_component": c.T_main_component,
-        "joined": c.joined,
-    }
-
-
-def _refinement(r: Refinement | None) -> dict[str, Any] | None:
-    """Outcome of the global refinement; None where no view took part."""
-    if r is None or not r.views:
-        return None
-    return {
-        "kept": r.kept,
-        "views": r.views,
-        "pairs": r.pairs,
-        "moved_m": r.moved_m,
-        "moved_rad": r.moved_rad,
-        "support_before": r.support[0],
-        "support_after": r.support[1],
-        "camera": r.errors,
-        "suspicion": _suspicion(r.calibration_check),
-    }
-
-
-def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
-    """The self-calibration; None where there was none."""
-    if found is None:
-        return None
-    return {
-        "focal": found.focal,
-        "offset_m": found.offset_m,
-        "sigma": dict(found.sigmas),
-        "stated_bound_m": found.bound_m[0],
-        "corrected_bound_m": found.bound_m[1],
-    }
-
-
-def _suspicion(s: CalibrationCheck | None) -> dict[str, Any] | None:
-    """The check of the camera's calibration; None where it was not made."""
-    if s is None:
-        return None
-    gap = s.gap
-    return {
-        "alarm": s.alarm,
-        "camera": s.errors,
-        "sigma": s.sigmas,
-        "focal_sigma": s.focal_sigma,
-        "focal_motion_m": 0.01 * s.motion["focal"][0] if s.motion else None,
-        "support": s.support,
-        "loop": None
-        if gap is None
-        else {
-            "i": gap.i,
-            "j": gap.j,
-            "gap_m": gap.before[0],
-            "gap_rad": gap.before[1],
-            "calibrated_gap_m": gap.after[0],
-            "calibrated_gap_rad": gap.after[1],
-        },
-    }
-
-
-def plain(value: Any) -> Any:
-    """Convert arrays and NumPy numbers to JSON values; NaN and infinity become null."""
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        whole = value.dtype.kind in "iub" or (value.dtype.kind == "f" and np.isfinite(value).all())
-        return value.tolist() if whole else plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
-def read_run_json(path: str | Path) -> dict[str, Any]:
-    """Read a `run.json`.
-
-    Raises
-    ------
-    InputError
-        If it can't be read, or is not a `run.json` of schema 1.
-    """
-    path = Path(path)
-    data = parsed(json.loads, read_text(path), where=path, what="JSON")
-    if not isinstance(data, dict) or data.get("schema") != 1:
-        raise InputError("is not a run.json of schema 1", where=path)
-    return data
-
-
-def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
-    """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
-
-    Parameters
-    ----------
-    folder
-        The result.
-    run
-        Its `run.json`.
-
-    Raises
-    ------
-    InputError
-        If `run.json` and `trajectory.txt` are of different runs.
-    """
-    indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
-    _, poses = read_tum(folder / "trajectory.txt")
-    if len(indices) != len(poses):
-        raise InputError(
-            f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}",
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
-        )
-    return indices, poses
-
-
-def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the entries of `run.json` for the frames with a line in `trajectory.txt`, in order.
-
-    Results of version 0.1 have no components: every pose is in the main model.
-    """
-    connected = [c["T_main_component"] is not None for c in run.get("components", ())]
-    return [
-        frame
-        for frame in run["frames"]
-        if frame["status"] in ("tracked", "predicted")
-        and (frame.get("component") is None or connected[frame["component"]])
-    ]

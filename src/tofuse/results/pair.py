@@ -24,7 +24,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.results.output import plain
+from tofuse.results.run_json import plain
 
 MARKER = "registration.json"
 FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)

@@ -23,8 +23,8 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
-from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
+from tofuse.results.run_json import main_poses, read_run_json
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"

@@ -25,7 +25,7 @@ from tofuse.report.pictures import Pictures
 from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
-from tofuse.results.output import main_poses, read_run_json
+from tofuse.results.run_json import main_poses, read_run_json
 from tofuse.viewer.level_of_detail import OVERVIEW_FACES, select_tiles
 from tofuse.viewer.view_file import read_view_file
 

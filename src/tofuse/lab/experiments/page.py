@@ -23,7 +23,7 @@ from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
 from tofuse.lab.experiments.statements import Judged, Results, judge_all
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.results.output import plain
+from tofuse.results.run_json import plain
 
 if TYPE_CHECKING:
     from jinja2 import Template

@@ -14,8 +14,8 @@ from tofuse.filters.base import apply_filters
 from tofuse.geometry import se3
 from tofuse.lab.simulation.record import Plan, plan
 from tofuse.pipeline.config import Config
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
 
 # About 1 cm apart in a room, so that distances are accurate to half of that.

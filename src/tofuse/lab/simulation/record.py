@@ -22,8 +22,9 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.passing import Passing, enter
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.lab.simulation.render import Rendered, render
+from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import RecordingWriter, corrected_depth
+from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.models import CameraModel, camera_model

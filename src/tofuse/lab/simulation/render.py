@@ -11,8 +11,8 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.scene import Scene, Sequence
+from tofuse.recordings.depth_counts import INVALID_DEPTH, depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import INVALID_DEPTH, depth_from_counts
 from tofuse.sensor.models import CameraModel
 
 _DEFAULT = Effects()

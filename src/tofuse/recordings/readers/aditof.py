@@ -17,8 +17,8 @@ from tofuse.files.reading import files_with, input_error, is_file, is_folder
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 

@@ -19,8 +19,8 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource, read_matrix_pose

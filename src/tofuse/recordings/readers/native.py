@@ -1,16 +1,344 @@
-"""Reader of the native folder."""
+"""The native recording: a folder of PNG images (or PLY clouds), described by a camera.json."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import is_file, is_folder, read_text
+from tofuse.files.images import check_first_size, read_color, read_image
+from tofuse.files.reading import files_with, is_file, is_folder, list_folder, read_text
+from tofuse.files.tables import read_columns, read_numbers
+from tofuse.geometry.cameras import Camera, Pinhole, range_from_z, z_from_range
 from tofuse.parts import part
-from tofuse.recordings.native import NativeSource
+from tofuse.recordings.camera_file import (
+    CameraFile,
+    checked_lens,
+    load_camera,
+    read_camera_file,
+    read_rays,
+)
+from tofuse.recordings.color import sampled_color
+from tofuse.recordings.correction_file import corrected_depth, read_correction
+from tofuse.recordings.depth_counts import depth_from_counts
+from tofuse.recordings.frames import (
+    DepthKind,
+    Frame,
+    RangeFrame,
+)
+from tofuse.recordings.imu import gravity_at
+from tofuse.recordings.native import LENS_COLUMNS
 from tofuse.recordings.reader import SURE, UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
+from tofuse.sensor.depth_correction import DepthCorrection
+from tofuse.sensor.frequencies import DISAGREEMENT, combined
+from tofuse.sensor.models import SPEED_OF_LIGHT
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+class NativeSource(FileSource):
+    """A native folder.
+
+    Attributes
+    ----------
+    camera
+        The camera of all frames; None for clouds.
+    description
+        Content of camera.json.
+    imu
+        Columns of imu.csv by name, or None.
+    frame_columns
+        Columns of frames.csv by name, each (N,), or None.
+
+    Raises
+    ------
+    InputError
+        Naming file and field, if the folder isn't complete and consistent.
+    """
+
+    concurrent = True
+
+    def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
+        self.folder = folder
+        self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
+        name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
+        self.files = files_with(folder / name, *suffixes)
+        if not self.files:
+            raise InputError(
+                f"has no {suffixes[0]} files",
+                where=folder / name,
+                remedy="check that the recording is complete",
+            )
+        self.description, self.camera = self._read_camera(camera_file)
+        rate = self.description.frame_rate_hz
+        super().__init__(np.arange(len(self.files)) / (rate or 1.0))
+        self._read_timestamps()
+        self.amplitude = self._channel("amplitude", ".png")
+        self.confidence = self._channel("confidence", ".png")
+        self.color = self._channel("color", *_IMAGES)
+        self.sigma = self._channel("sigma", ".png")
+        self.rays = self._channel("rays", ".npy")
+        self.by_frequency = self._frequencies()
+        if camera_file is not None:
+            self.rays = []  # a given camera applies to all frames
+        self.correction = self._read_correction()
+        self.imu = self._read_table("imu.csv")
+        self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
+        self.cameras = self._frame_lenses() if camera_file is None else []
+        if self.sigma and self.description.sigma_unit_m is None:
+            raise InputError(
+                "is missing, and there is sigma/",
+                where=f"{self.folder / 'camera.json'}: sigma_unit_m",
+                remedy="set the metres per count of sigma",
+            )
+        if is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+        self._read_gravity()
+        self._check_sizes()
+        self._fill_metadata()
+
+    def load(self, index: int) -> Frame:
+        """See `FileSource.load`."""
+        timestamp = float(self.timestamps[index])
+        if self.camera is None:
+            return ply_frame(self.files[index], index, timestamp)
+        size = (self.camera.width, self.camera.height)
+        camera = self._camera_of(index, self.camera)
+        kind = self.description.depth_kind
+        if self.by_frequency:
+            depth = self._combined(index, camera, size, kind)
+        else:
+            counts = read_image(self.files[index], size=size, dtype="uint16")
+            depth = depth_from_counts(counts, self.description.depth_unit_m)
+        if self.correction is not None:
+            depth = corrected_depth(self.correction, camera, depth, kind)
+        frame = RangeFrame(index, timestamp, camera, depth, kind)
+        amplitude = confidence = color = sigma = None
+        if self.amplitude:
+            amplitude = read_image(self.amplitude[index], size=size, dtype="uint16")
+            amplitude = amplitude.astype(np.float32)
+        if self.confidence:
+            confidence = read_image(self.confidence[index], size=size, dtype="uint8")
+            confidence = confidence.astype(np.uint8, copy=False)
+        if self.color:
+            path = self.color[index]
+            color = sampled_color(frame, read_color(path), self.description.color, path)
+        if self.sigma:
+            counts = read_image(self.sigma[index], size=size, dtype="uint16")
+            sigma = counts.astype(np.float32) * np.float32(self.description.sigma_unit_m or 0)
+        return RangeFrame(
+            index,
+            timestamp,
+            camera,
+            frame.depth,
+            kind,
+            amplitude,
+            confidence,
+            color,
+            sigma,
+            color_registered=self.description.color_registered,
+            amplitude_kind=self.description.amplitude_kind or "raw",
+            ambiguity_m=self.description.ambiguity_m,
+        )
+
+    def _camera_of(self, index: int, camera: Camera) -> Camera:
+        """Return the camera of one frame, where each has its own."""
+        if self.cameras:
+            own = self.cameras[index]
+            if isinstance(own, InputError):
+                raise own
+            return own
+        if not self.rays:
+            return camera
+        table = read_rays(self.rays[index])
+        if (table.width, table.height) != (camera.width, camera.height):
+            raise InputError(
+                f"is {table.width} x {table.height}, the images {camera.width} x {camera.height}",
+                where=self.rays[index],
+                remedy="use the table of this frame",
+            )
+        return table
+
+    def _frame_lenses(self) -> list[Pinhole | InputError]:
+        """The lens of each frame, if frames.csv contains fx, fy, cx and cy."""
+        columns, camera = self.frame_columns, self.camera
+        if (
+            columns is None
+            or not isinstance(camera, Pinhole)
+            or not set(LENS_COLUMNS) <= set(columns)
+        ):
+            return []
+        cameras: list[Pinhole | InputError] = []
+        known: dict[tuple[float, ...], Pinhole] = {}
+        for k, row in enumerate(zip(*(columns[name] for name in LENS_COLUMNS), strict=True)):
+            try:
+                values = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
+                values |= {name: float(v) for name, v in zip(LENS_COLUMNS, row, strict=True)}
+                where = f"{self.folder / 'frames.csv'}, row {k + 1}"
+                size = (camera.width, camera.height)
+                if row not in known:
+                    known[row] = checked_lens(type(camera), size, values, where)
+                cameras.append(known[row])
+            except InputError as error:
+                cameras.append(error)
+        return cameras
+
+    def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:
+        path = self.folder / "camera.json"
+        if not self.is_clouds:
+            return load_camera(given or path)
+        if given is not None:
+            raise InputError(
+                "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
+            )
+        if is_file(path):
+            return read_camera_file(path, clouds=True), None
+        return CameraFile(None, None), None
+
+    def _read_timestamps(self) -> None:
+        path = self.folder / "timestamps.txt"
+        if not is_file(path):
+            return
+        table = read_numbers(path)
+        if len(table) != len(self.files):
+            raise self._count_error(path, f"{len(table)} lines")
+        if table.shape[1] != 1:
+            raise InputError(
+                f"has {table.shape[1]} numbers per line", where=path, remedy="use one, in seconds"
+            )
+        self.timestamps = table[:, 0]
+        check_timestamps(self.timestamps, path, self.warnings)
+
+    def _channel(self, name: str, *suffixes: str) -> list[Path]:
+        folder = self.folder / name
+        if self.is_clouds or not is_folder(folder):
+            return []
+        files = files_with(folder, *suffixes)
+        if len(files) != len(self.files):
+            raise self._count_error(folder, f"{len(files)} images")
+        if [f.stem for f in files] != [f.stem for f in self.files]:
+            self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
+        return files
+
+    def _frequencies(self) -> dict[float, list[Path]]:
+        """The depth images by modulation frequency in Hz, if several were recorded separately."""
+        folder = self.folder / "frequencies"
+        if self.is_clouds or not is_folder(folder):
+            return {}
+        images: dict[float, list[Path]] = {}
+        for own in list_folder(folder):
+            try:
+                hertz = float(own.name)
+            except ValueError:
+                hertz = math.nan
+            if not 1e5 <= hertz <= 1e10 or not is_folder(own):
+                raise InputError(
+                    "isn't a frequency", where=own, remedy="name the folder in Hz, as 30000000"
+                )
+            images[hertz] = files_with(own, ".png")
+            if len(images[hertz]) != len(self.files):
+                raise self._count_error(own, f"{len(images[hertz])} images")
+        if len(images) == 1:
+            raise InputError(
+                "has only one frequency", where=folder, remedy="use two or more, or remove it"
+            )
+        return images
+
+    def _combined(
+        self, index: int, camera: Camera, size: tuple[int, int], kind: DepthKind
+    ) -> Float32:
+        """The depth that is consistent with all frequencies; 0 where there is none."""
+        unit = self.description.depth_unit_m
+        periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
+        ranges = []
+        for files in self.by_frequency.values():
+            counts = read_image(files[index], size=size, dtype="uint16")
+            depth = depth_from_counts(counts, unit)
+            ranges.append(depth if kind == "range" else range_from_z(camera, depth))
+        radial, apart = combined(ranges, periods)
+        agreed = np.where(apart < DISAGREEMENT * min(periods), radial, np.float32(0))
+        return agreed if kind == "range" else z_from_range(camera, agreed)
+
+    def _read_correction(self) -> DepthCorrection | None:
+        path = self.folder / "correction.npz"
+        if self.camera is None or not is_file(path):
+            return None
+        correction = read_correction(path)
+        try:
+            correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
+        except InputError as error:
+            raise InputError(error.problem, where=path, remedy=error.remedy) from error
+        return correction
+
+    def _read_table(self, name: str, rows: int | None = None) -> dict[str, Float64] | None:
+        path = self.folder / name
+        if not is_file(path):
+            return None
+        columns = read_columns(path)
+        length = len(next(iter(columns.values())))
+        if rows is not None and length != rows:
+            raise self._count_error(path, f"{length} rows")
+        return columns
+
+    def _read_gravity(self) -> None:
+        if self.imu is None:
+            return
+        self.gravity = gravity_at(self.timestamps, self.imu)
+        path = self.folder / "imu.csv"
+        if self.gravity is None:
+            self.warnings.append(
+                f"{path}: has no columns timestamp, ax, ay, az, so gravity is unknown"
+            )
+        elif not np.isfinite(self.gravity).any():
+            self.warnings.append(f"{path}: has no samples near the time of any frame")
+
+    def _count_error(self, where: Path, count: str) -> InputError:
+        return InputError(
+            f"has {count}, {self.files[0].parent.name}/ has {len(self.files)} files",
+            where=where,
+            remedy="make the counts agree, or remove it",
+        )
+
+    def _check_sizes(self) -> None:
+        """Compare the size in camera.json with the first readable header of each channel."""
+        if self.camera is None:
+            return
+        size, where = (self.camera.width, self.camera.height), "camera.json states"
+        remedy = "use the camera.json of these images"
+        for channel in (self.files, self.amplitude, self.confidence, self.sigma):
+            check_first_size(channel, size, where, remedy)
+        color = self.description.color
+        if color is None:
+            remedy += '; or describe its camera by "color" in camera.json'
+        else:
+            size = (color.camera.width, color.camera.height)
+        check_first_size(self.color, size, where, remedy)
+
+    def _fill_metadata(self) -> None:
+        about = self.description
+        if about.unknown:
+            self.warnings.append(
+                f"{self.folder / 'camera.json'}: unknown fields ignored: {', '.join(about.unknown)}"
+            )
+        for name in ("sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
+            if getattr(about, name) is not None:
+                self.metadata[name] = getattr(about, name)
+        if self.camera is not None:
+            self.metadata["depth_unit_m"] = about.depth_unit_m
+            self.metadata["depth_kind"] = about.depth_kind
+            self.metadata["corrected"] = self.correction is not None
+            if self.sigma:
+                self.metadata["sigma_unit_m"] = about.sigma_unit_m
+        if is_folder(self.folder / "truth"):
+            self.metadata["truth"] = str(self.folder / "truth")
 
 
 @part("reader", "native", label="validated")

@@ -17,8 +17,8 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in, read_json
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose

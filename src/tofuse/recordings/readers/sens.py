@@ -20,8 +20,8 @@ from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
 from tofuse.recordings.color import sampled_color
+from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose

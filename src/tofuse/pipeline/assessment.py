@@ -1,0 +1,285 @@
+"""Accuracy and verdict of a reconstructed part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.arrays import Float64, Intp
+from tofuse.corrections.camera_errors import CameraErrors
+from tofuse.evaluation.cross_view import CrossViewConsistency, cross_view_consistency
+from tofuse.evaluation.trajectory import displacement
+from tofuse.fusion.model import Model
+from tofuse.fusion.pose_errors import with_pose_errors
+from tofuse.normal import OF_95_PERCENT
+from tofuse.odometry.given import GivenPoses
+from tofuse.parts import name_of
+from tofuse.pipeline.checks import Evidence, judge
+from tofuse.pipeline.config import Config
+from tofuse.pipeline.frame_log import FrameLog
+from tofuse.pipeline.stage_results import BackEndInput, Optimised, Refined
+from tofuse.pipeline.tracked_graph import TrackedGraph
+from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of, covariances_of
+from tofuse.posegraph.calibration_check import CalibrationCheck
+from tofuse.posegraph.covariances import GraphCovariances
+from tofuse.posegraph.cut_edges import cut_edges
+from tofuse.posegraph.external_sensors import SensorPriors, with_sensors
+from tofuse.posegraph.graph import LoopRecord, PoseGraph
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.refinement import Refinement
+from tofuse.recordings.frames import RangeFrame
+from tofuse.results.types import Component, FrameRecord, Reason, Verdict
+from tofuse.results.verdict import ranked
+
+
+@dataclass(frozen=True, eq=False)
+class Assessed:
+    """The result of the assessment.
+
+    Attributes
+    ----------
+    verdict, reasons
+        "good", "degraded" or "failed", and why.
+    accuracy
+        Bounds of the pose errors.
+    records
+        Of all frames, with the covariances of their poses.
+    model
+        The model, whose errors include those of the poses.
+    """
+
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    accuracy: Accuracy
+    records: tuple[FrameRecord, ...]
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """Assesses one connected part.
+
+    Attributes
+    ----------
+    config
+        The configuration.
+    log
+        The frames of the part.
+    tracked
+        Its pose graph.
+    stored
+        Stored observations.
+    given
+        Given loops.
+    """
+
+    config: Config
+    log: FrameLog
+    tracked: TrackedGraph
+    stored: BackEndInput
+    given: Sequence[GivenLoop]
+
+    def run(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        model: Model,
+        components: tuple[Component, ...],
+    ) -> Assessed:
+        """Compare images at the final poses, bound the errors of the poses, and judge.
+
+        Parameters
+        ----------
+        closed, refined
+            Results of the earlier stages.
+        model
+            The fused model.
+        components
+            As in `Reconstruction`.
+        """
+        graph, stored = refined.graph, self.stored
+        loops = tuple(c.record for c in closed.loops)
+        cross_view = self._cross_view(graph)
+        accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
+        if stored.knows_errors:
+            model = self._with_pose_errors(model, graph, covariances)
+        records = self._records(covariances)
+        posed, entries = self.tracked.posed, self.log.entries
+        evidence = Evidence(
+            records=records,
+            registrations=tuple(None if e.step is None else e.step.registration for e in entries),
+            loops=loops,
+            sequential=closed.visual.sequential if self._tracks else graph.poses,
+            optimisation=closed.visual.optimisation,
+            cross_view=cross_view,
+            accuracy=accuracy,
+            diagonal_m=model.cloud.diagonal_m,
+            tolerance_m=self.config.tolerance_m,
+            knows_errors=stored.knows_errors,
+            refinement=refined.refinement,
+            given=frozenset((g.i, g.j) for g in self.given if g.by_user),
+            depths=tuple(
+                d for index, d in stored.depths.items() if d > 0 and index in self.tracked.poses
+            ),
+            ambiguity_m=stored.ambiguity_m,
+            repeated=tuple(self.log.repeated),
+            interruptions=tuple(self.log.interruptions),
+            priors=closed.sensors.records,
+            components=components,
+            moving=tuple((e.record.index, e.moving) for e in posed if e.moving > 0),
+            doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
+            hanging=on_a_single_link(self.tracked, loops),
+        )
+        verdict, reasons = judge(evidence)
+        more = [*self._correction_reasons(), *self._surface_reasons(model)]
+        return Assessed(verdict, ranked([*reasons, *more]), accuracy, records, model)
+
+    @property
+    def _tracks(self) -> bool:
+        return not isinstance(self.config.odometry, GivenPoses)
+
+    def _accuracy(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        model: Model,
+        cross_view: CrossViewConsistency | None,
+    ) -> tuple[Accuracy, Float64]:
+        """Return the accuracy of the final poses, and their covariances (P, 6, 6).
+
+        Not assessed if covariances of registrations are unrealistic.
+        """
+        if not self.stored.knows_errors:
+            return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
+        refinement = refined.refinement
+        known = images_only = GraphCovariances(self._measured(refined.graph, refinement))
+        if closed.sensors:  # the accuracy rests on the images alone where they suffice
+            without_sensors = closed.visual.optimisation.graph
+            if refinement.kept:
+                without_sensors = self.tracked.build(
+                    closed.loops, refinement, confirmed=closed.confirmed
+                )
+            images_only = GraphCovariances(self._measured(without_sensors, refinement))
+        moved = 0.0, 0.0
+        if self._tracks:  # the initial error of given poses says nothing of the final one
+            moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        excess = 0.0 if cross_view is None else cross_view.excess_m()
+        calibration = self._by_calibration(refinement.calibration_check)
+        shown = Shown(*moved, excess, *calibration, refinement.split_m, refinement.split_rad)
+        covariances = covariances_of(known, shown)
+        del known  # only one large factor is in memory
+        accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
+        if accuracy.unbounded and closed.sensors.verified:
+            free = set(accuracy.unbounded)
+            bounded = with_sensors(images_only.graph, self._where_degenerate(closed.sensors))
+            accuracy = accuracy_of(GraphCovariances(bounded), shown, model.cloud.diagonal_m)
+            by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
+            accuracy = replace(accuracy, by_odometry=by_odometry)
+        return accuracy, covariances
+
+    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
+        return self.tracked.measured(graph, self.stored.views, refinement.stated)
+
+    def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
+        """Return how far (m, rad) the poses may be off by the calibration (95 %).
+
+        That is the gap of a loop that a better calibration would close, or the motion by one with
+        which views agree better, unless a loop contradicts; and the uncertainty of a correction.
+        """
+        if check is None:
+            return 0.0, 0.0
+        errors = [np.zeros(2)]
+        if check.alarm and check.gap is not None:
+            errors.append(np.array(check.gap.before))
+        elif check.unconfirmed:
+            errors.append(np.array(check.moved))
+        for part in self.config.corrections:
+            if isinstance(part, CameraErrors):
+                sigmas = part.sigmas
+                errors += [
+                    OF_95_PERCENT * sigmas[name] * np.array(motion)
+                    for name, motion in check.motion.items()
+                ]
+        m, rad = np.linalg.norm(errors, axis=0).tolist()
+        return m, rad
+
+    def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
+        """Return the steps of odometry from and to degenerate frames, and over gaps."""
+        ends = self.tracked.unobservable.keys()
+        gaps = self.tracked.gaps
+        steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
+        return SensorPriors(tuple(steps))
+
+    def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
+        """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
+        frames, at = self._checked_images(graph)
+        return with_pose_errors(model, frames, graph.poses[at], covariances[at])
+
+    def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
+        """Return the records with the covariances (P, 6, 6) of the frames with a pose here."""
+        known = dict(zip((e.record.index for e in self.tracked.posed), covariances, strict=True))
+        out = []
+        for entry in self.log.entries:
+            C = known.get(entry.record.index)
+            finite = C is not None and bool(np.isfinite(C).all())
+            out.append(replace(entry.record, covariance=C) if finite else entry.record)
+        return tuple(out)
+
+    def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
+        """Compare overlapping images at the final poses."""
+        frames, at = self._checked_images(graph)
+        return cross_view_consistency(frames, graph.poses[at]) if len(frames) > 1 else None
+
+    def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
+        """Return the images for the final comparison, and their positions in the graph."""
+        frames = [f for f in self.stored.checks if f.index in self.tracked.poses]
+        row = {int(frame): k for k, frame in enumerate(graph.ids)}
+        return frames, np.array([row[f.index] for f in frames], np.intp)
+
+    def _correction_reasons(self) -> tuple[Reason, ...]:
+        """Return the reason if a correction was left out."""
+        names = [name_of(c) for c in self.config.corrections if c.disabled]
+        if not names:
+            return ()
+        text = (
+            f"Correction not applied: {' and '.join(names)}. Overlapping views do not clearly show "
+            "the error that it compensates."
+        )
+        return (Reason("correction_left_out", self._whole_recording, text),)
+
+    @property
+    def _whole_recording(self) -> tuple[tuple[int, int], ...]:
+        entries = self.log.entries
+        return ((entries[0].record.index, entries[-1].record.index),)
+
+    def _surface_reasons(self, model: Model) -> tuple[Reason, ...]:
+        """Return the reason if there is no surface."""
+        if model.mesh is not None and len(model.mesh):
+            return ()
+        text = (
+            "No connected surface is left at this resolution (--voxel): mesh.ply and mesh.glb are "
+            "empty."
+        )
+        if model.mesh is None:
+            text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
+        return (Reason("no_surface", self._whole_recording, text),)
+
+
+def on_a_single_link(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
+    """Return the frames connected to the first one by a single, unconfirmed link."""
+    if not tracked.joins:
+        return ()
+    component_of = {e.record.index: e.step.component for e in tracked.posed if e.step is not None}
+    pairs = [(j.link.i, j.link.j) for j in tracked.joins]
+    # Another registration of the same two views is no confirmation.
+    known = {frozenset(pair) for pair in pairs}
+    pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in known]
+    edges = [(component_of[i], component_of[j]) for i, j in pairs]
+    first = component_of[tracked.posed[0].record.index]
+    hanging: set[int] = set()
+    for k, sides in cut_edges(edges).items():
+        if k < len(tracked.joins) and tracked.joins[k].how == "links":
+            hanging |= sides[1] if first in sides[0] else sides[0]
+    return tuple(index for index, c in component_of.items() if c in hanging)

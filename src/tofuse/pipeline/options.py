@@ -1,0 +1,131 @@
+"""The options of ``tofuse run``, and the configuration that they ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tofuse.corrections.raw_amplitude import range_and_amplitude
+from tofuse.errors import InputError
+from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
+from tofuse.pipeline.paint import TEXTURE
+from tofuse.pipeline.priors import Prior
+from tofuse.recordings.recording import Recording
+from tofuse.results.run_json import read_run_json
+
+_SAMPLED = 8  # frames that are checked for what --unwrap needs
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of ``tofuse run``; see its ``--help``."""
+
+    out: Path
+    method: str | None = None
+    config: Path | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    format: str | None = None
+    seed: int | None = None
+    threads: int | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    average_still: bool = False
+    min_depth: float | None = None
+    max_depth: float | None = None
+    guess: Literal["identity", "previous", "odometry"] | None = None
+    prior: Prior = "auto"
+    loops: Path | None = None
+    object: bool = False
+    unwrap: bool = False
+    tolerance: float | None = None
+    texture: bool = False
+    faces: int | None = None
+    voxel: float | None = None
+    memory: int | None = None
+    overwrite: bool = False
+
+
+def resolve(options: Options, kind: ViewKind = "range") -> Config:
+    """Return the configuration that the options ask for, for a kind of view."""
+    changes: dict[str, Any] = read_changes(options.config) if options.config else {}
+    method = options.method or changes.get("method") or "default"
+    if not isinstance(method, str):
+        raise InputError(f"is {method!r}", where=f"{options.config}: method")
+    config = from_method(method, kind)
+    config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
+    if options.guess:
+        config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
+    if options.texture and not config.fusion.texture:
+        config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
+    if options.faces is not None:
+        config = changed(config, {"fusion": {"faces": options.faces}}, where="--faces")
+    if options.voxel is not None:
+        config = changed(config, {"fusion": {"voxel_m": options.voxel}}, where="--voxel")
+    if options.memory is not None:
+        megabytes = options.memory // 1_000_000
+        config = changed(config, {"memory_mb": megabytes}, where="--memory")
+    if options.tolerance is not None:
+        config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
+    front: list[dict[str, Any]] = []
+    if options.min_depth is not None or options.max_depth is not None:
+        low = options.min_depth or 0.0
+        if options.max_depth is not None and options.max_depth <= low:
+            raise InputError(
+                f"is {options.max_depth} m and the minimum depth {low} m",
+                where="--max-depth",
+                remedy="use a larger one",
+            )
+        front.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
+    chosen = config.to_dict()
+    filters = {item["part"] for item in chosen["filters"]}
+    corrections = list(chosen["corrections"])
+    if options.object:
+        if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
+            front.append({"part": "background"})
+        # Scattered light of the background is fixed to the image, and drags the object along.
+        names = [item["part"] for item in corrections]
+        if "multipath" in names and "scattering" not in names:
+            corrections.insert(names.index("multipath"), {"part": "scattering"})
+        # Neither gravity nor the camera's odometry applies to the frame of a moving object.
+        config = changed(config, {"priors": []}, where="--object")
+    if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
+        corrections.insert(0, {"part": "unwrap"})
+    if front or corrections != chosen["corrections"]:
+        lists = {"filters": [*front, *chosen["filters"]], "corrections": corrections}
+        config = changed(config, lists, where="--object" if options.object else "--max-depth")
+    return config
+
+
+def check_unwrap(recording: Recording) -> None:
+    """Raise InputError if the recording can't be unwrapped."""
+    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_SAMPLED)):
+        raise InputError(
+            "the recording can't be unwrapped: that needs its amplitude, and the ambiguity range "
+            "of its camera",
+            where="--unwrap",
+            remedy='set "ambiguity_m" in a camera.json passed with --camera, or omit --unwrap',
+        )
+
+
+def seed_of(options: Options) -> int:
+    """Return the seed: as given, or that of the `run.json` given as configuration; else 0."""
+    if options.seed is not None:
+        return options.seed
+    if options.config is not None and options.config.suffix == ".json":
+        seed = read_run_json(options.config).get("seed", 0)
+        if isinstance(seed, int) and seed >= 0:
+            return seed
+    return 0
+
+
+def check_guess(options: Options, recording: Recording) -> None:
+    """Raise InputError if the recording lacks the odometry to start from."""
+    if options.guess == "odometry" and recording.odometry is None:
+        raise InputError(
+            "is odometry, and the recording has none",
+            where="--guess",
+            remedy="put an odometry.txt next to the images, or use --guess previous",
+        )
