@@ -14,7 +14,7 @@ from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.view_store import KeptView
 
 

@@ -25,7 +25,7 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view
 

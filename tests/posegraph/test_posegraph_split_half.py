@@ -10,7 +10,7 @@ import pytest
 from aligned_surfaces import OPTIONS, SHARP, corner, path
 from tofuse.evaluation.trajectory import displacement
 from tofuse.posegraph.joint_alignment import refine
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view

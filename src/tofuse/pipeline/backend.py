@@ -63,8 +63,8 @@ class BackEnd:
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
-        self._config, self._log, self._poses, self._joins = config, log, poses, joins
-        self._given, self._stored, self._progress, self._watch = given, stored, progress, watch
+        self._config, self._log, self._given = config, log, given
+        self._stored, self._progress, self._watch = stored, progress, watch
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
@@ -91,10 +91,13 @@ class BackEnd:
     def _close_loops(self) -> Optimised:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
+            tracked = self._tracked.build(())
             # For the search, motion in degenerate directions may differ from that elsewhere.
-            covariances = _covariances(self._tracked.build((), cautious=True))
-            loops = with_joins(self._stored.loops.finish(self._poses, covariances), self._joins)
-            del covariances
+            degenerate = bool(self._tracked.unobservable)
+            cautious = self._tracked.build((), cautious=True) if degenerate else tracked
+            found = self._stored.loops.finish(self._tracked.poses, _covariances(cautious))
+            loops = with_joins(found, self._tracked.joins)
+            del cautious
             loops = self._search_loops_again(loops)
             graph = self._tracked.build(loops)
         # Without loops: with and without external sensors.
@@ -102,7 +105,7 @@ class BackEnd:
         sensors = SensorPriors()
         if self._config.priors:
             sensed = self._log.sensed(graph.ids.tolist())
-            measured = self._tracked.measured(self._tracked.build(()), self._stored.views)
+            measured = self._tracked.measured(tracked, self._stored.views)
             sensors = measure_all(self._config.priors, sensed, measured)
         optimisation = Optimisation(with_sensors(graph, sensors), (), True)
         confirmed: frozenset[int] = frozenset()
@@ -111,7 +114,7 @@ class BackEnd:
             with self._watch.timing("optimisation"):
                 optimisation, confirmed = self._optimise(graph, loops, sensors)
                 if sensors and graph.loop.any():  # the poses that loops are compared with
-                    without_loops = with_sensors(self._tracked.build(()), sensors)
+                    without_loops = with_sensors(tracked, sensors)
                     guided = self._config.optimiser.optimise(without_loops).graph.poses
             loops = _without_rejected(loops, optimisation)
             optimisation = accepted_only(optimisation)
@@ -165,7 +168,7 @@ class BackEnd:
             if not self._stored.loops.candidates_change(poses):
                 break
             found = self._stored.loops.finish(poses, _covariances(graph))
-            loops = with_joins(found, self._joins)
+            loops = with_joins(found, self._tracked.joins)
         return loops
 
     def _refine(self, closed: Optimised) -> Refined:
@@ -228,7 +231,7 @@ class BackEnd:
                 parts=closed.optimisation.parts,
                 priors=closed.sensors.records,
                 accuracy=assessed.accuracy,
-                joins=tuple(self._joins),
+                joins=tuple(self._tracked.joins),
             ),
             config=self._config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(entries)},
@@ -240,7 +243,7 @@ class BackEnd:
 
     def _scatter(self, poses: Float64) -> Float64:
         out = np.full((len(self._log.entries), 4, 4), np.nan)
-        out[[e.record.index in self._poses for e in self._log.entries]] = poses
+        out[[e.record.index in self._tracked.poses for e in self._log.entries]] = poses
         return out
 
 

@@ -30,7 +30,7 @@ from tofuse.posegraph.joint_alignment import (
     spread_evenly,
 )
 from tofuse.posegraph.pair_equations import RefineOptions, Round
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import aligned_motion
 from tofuse.posegraph.view_store import KeptView
 

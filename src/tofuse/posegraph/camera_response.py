@@ -17,7 +17,7 @@ from tofuse.posegraph.pair_equations import (
     rescale,
     without_exposure,
 )
-from tofuse.posegraph.priors import DAMPING, Priors, weak_prior
+from tofuse.posegraph.pose_priors import DAMPING, Priors, weak_prior
 from tofuse.posegraph.view_store import KeptView
 
 

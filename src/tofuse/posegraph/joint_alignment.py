@@ -31,7 +31,7 @@ from tofuse.posegraph.pair_equations import (
     rescale,
     without_exposure,
 )
-from tofuse.posegraph.priors import DAMPING, UNITS, WEAK, Priors, weak_prior
+from tofuse.posegraph.pose_priors import DAMPING, UNITS, WEAK, Priors, weak_prior
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.view_store import KeptView, overlaps
 

@@ -25,7 +25,7 @@ from tofuse.posegraph.calibration_check import (
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.joint_alignment import Refined, refine
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors
 from tofuse.posegraph.submaps import RefinedSubmap, fell, refine_submaps
 from tofuse.posegraph.view_store import KeptView, Outline, PosedView, Spilled, ViewStore

@@ -23,7 +23,7 @@ from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.posegraph.joint_alignment import Refined, align_views
 from tofuse.posegraph.pair_equations import RefineOptions, Round
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.shared_error import ACROSS, DOWN
 from tofuse.posegraph.view_store import KeptView
 

@@ -23,7 +23,7 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_evenly, support_of
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.priors import UNITS, Priors
+from tofuse.posegraph.pose_priors import UNITS, Priors
 from tofuse.posegraph.view_store import KeptView, Outlined, looked_at, overlaps
 
 A = TypeVar("A")

@@ -11,7 +11,7 @@ from tofuse.geometry.cameras import Camera, range_from_z, z_from_range
 from tofuse.recordings.frames import DepthKind
 from tofuse.sensor.depth_correction import DepthCorrection
 
-MAX_CORRECTION_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 
 
 def read_correction(path: Path) -> DepthCorrection:
@@ -22,7 +22,7 @@ def read_correction(path: Path) -> DepthCorrection:
     except (OSError, ValueError, zipfile.BadZipFile):
         size = 0  # reported by the loader
     try:
-        if size <= MAX_CORRECTION_BYTES:
+        if size <= _MAX_BYTES:
             return DepthCorrection.load(path)
     except MemoryError:
         pass

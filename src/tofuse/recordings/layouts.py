@@ -16,13 +16,13 @@ from tofuse.files.trajectory import write_log, write_tum
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.camera_file import SCHEMA, camera_fields
 from tofuse.recordings.convert import Conversion
+from tofuse.recordings.depth_counts import MAX_COUNTS
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 
 Layout = Literal["tum", "open3d"]
 COUNTS_PER_M: dict[Layout, int] = {"tum": 5000, "open3d": 1000}
-_MAX_COUNTS = 65535
 _WHITE_PERCENTILE = 99.0  # of the amplitude that is shown as white
 
 
@@ -85,8 +85,8 @@ def _write(recording: Recording, folder: Path, layout: Layout) -> tuple[int, lis
                 white = float(np.percentile(positive, _WHITE_PERCENTILE))
         frame = rectifier(item)
         counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
-        beyond += int((counts >= _MAX_COUNTS).sum())
-        counts[counts >= _MAX_COUNTS] = 0
+        beyond += int((counts >= MAX_COUNTS).sum())
+        counts[counts >= MAX_COUNTS] = 0
         name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
         write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
         write_png(make_folder(folder / colors) / name, _color(frame, white))
@@ -94,7 +94,7 @@ def _write(recording: Recording, folder: Path, layout: Layout) -> tuple[int, lis
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     if beyond:
-        farthest = _MAX_COUNTS / COUNTS_PER_M[layout]
+        farthest = MAX_COUNTS / COUNTS_PER_M[layout]
         warnings.append(f"{beyond} pixels beyond {farthest:.1f} m don't fit, and are dropped")
     finish = _finish_tum if layout == "tum" else _finish_open3d
     finish(recording, folder, rectifier.pinhole, written)

@@ -20,7 +20,7 @@ from tofuse.kernels import rig as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
-from tofuse.posegraph.priors import UNITS
+from tofuse.posegraph.pose_priors import UNITS
 from tofuse.posegraph.view_store import KeptView
 from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 

@@ -18,7 +18,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.priors import Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.refinement import followed
 from tofuse.posegraph.split_half import refined_by_halves
 from tofuse.posegraph.view_store import KeptView
