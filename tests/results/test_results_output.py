@@ -230,11 +230,6 @@ def test_components_are_in_run_json(tmp_path) -> None:
     assert all(set(c) == {"frames", "T_main_component", "joined"} for c in data["components"])
     assert [frame["component"] for frame in data["frames"]] == [0, 1, 2, None]
     assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1]
-    # Results of version 0.1 have no components.
-    del data["components"]
-    for frame in data["frames"]:
-        del frame["component"]
-    assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1, 2]
 
 
 def test_exit_status_counts_frames_outside_main_model() -> None:

@@ -181,12 +181,18 @@ def test_colour_of_phones_keeps_recorded_size(tmp_path: Path) -> None:
     result = tmp_path / "result"
     result.mkdir()
     frames = [
-        {"index": k, "timestamp": 5 + 0.25 * k, "status": "tracked", "covariance": None}
+        {
+            "index": k,
+            "timestamp": 5 + 0.25 * k,
+            "status": "tracked",
+            "component": None,
+            "covariance": None,
+        }
         for k in range(3)
     ]
     about = {"path": str(recording), "opening": Opening((recording,)).to_dict()}
     run = {"schema": 1, "version": "0", "verdict": "good", "frames": frames, "input": about}
-    (result / "run.json").write_text(json.dumps(run | {"config": {}}))
+    (result / "run.json").write_text(json.dumps(run | {"components": [], "config": {}}))
     write_tum(result / "trajectory.txt", 5 + 0.25 * np.arange(3), POSES[:3])
     write_ply(result / "cloud.ply", GeometryRecord(np.zeros((1, 3), np.float32)))
     (folder,) = export(result, ["nerfstudio"])

@@ -119,6 +119,19 @@ def test_invalid_result_is_reported_in_one_line(folder, tmp_path, how, capsys):
     assert re.fullmatch(r"tofuse: .*out.*\n", message)
 
 
+@pytest.mark.parametrize("field", ["frames", "components", "reasons", "loops", "T_up_world"])
+@pytest.mark.parametrize("value", [None, 3, [1]])
+def test_damaged_run_json_is_reported_in_one_line(folder, tmp_path, field, value, capsys):
+    out = shutil.copytree(folder, tmp_path / "out")
+    run = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(run | {field: value}))
+    assert main(["view", str(out), "--no-open"]) == 2
+    assert re.fullmatch(r"tofuse: .*run\.json: is damaged.*\n", capsys.readouterr().err)
+    if field in ("frames", "T_up_world"):
+        assert main(["export", str(out), "log", "3dtiles"]) == 2
+        assert re.fullmatch(r"tofuse: .*run\.json: is damaged.*\n", capsys.readouterr().err)
+
+
 def test_view_file_is_reproducible(tmp_path):
     made, _ = make_room()
     pictures = draw(made.diagnostics.samples)

@@ -23,7 +23,7 @@ from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
-from tofuse.results.run_json import main_poses, read_run_json
+from tofuse.results.run_json import damage_reported, main_poses, read_run_json
 
 _REMEDY = "pass the --out of `tofuse run`"
 
@@ -128,15 +128,11 @@ def _read_parts(
     if not folder.is_dir() or not is_result(folder):
         raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
-    try:
+    with damage_reported(folder / "run.json"):
         stated = _stated(folder, run, components)
         parts = list(stored_recordings(folder, run))
         posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
         return posed, _links(run, parts)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            "is damaged, or not a run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
-        ) from error
 
 
 def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tuple[int, int], ...]:

@@ -23,7 +23,6 @@ from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion import exchange
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import baked
-from tofuse.fusion.upright import upright
 from tofuse.results.colmap import write_colmap
 from tofuse.results.folder import (
     RESULT,
@@ -35,7 +34,7 @@ from tofuse.results.folder import (
     lock_folder,
 )
 from tofuse.results.nerfstudio import write_nerfstudio
-from tofuse.results.run_json import read_run_json
+from tofuse.results.run_json import damage_reported, read_run_json, rotation_up_world
 from tofuse.results.tiles import is_tiles, write_tiles
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
@@ -94,11 +93,10 @@ class _Result:
     @cached_property
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
-        T = read_run_json(self.folder / "run.json").get("T_up_world")
-        if T is None:  # written by version 0.1
-            return upright(self.mesh, self.trajectory[1])
-        R: Float64 = np.array(T, float)[:3, :3]
-        return R
+        path = self.folder / "run.json"
+        run = read_run_json(path)
+        with damage_reported(path):
+            return rotation_up_world(run)
 
     @cached_property
     def textured(self) -> GeometryRecord:
@@ -121,9 +119,11 @@ class _Result:
     @cached_property
     def frame_numbers(self) -> Intp:
         """(N,) frame index of each pose."""
-        frames = read_run_json(self.folder / "run.json")["frames"]
-        index = np.array([frame["index"] for frame in frames], np.intp)
-        times = np.array([frame["timestamp"] for frame in frames], float)
+        path = self.folder / "run.json"
+        run = read_run_json(path)
+        with damage_reported(path):
+            index = np.array([frame["index"] for frame in run["frames"]], np.intp)
+            times = np.array([frame["timestamp"] for frame in run["frames"]], float)
         return index[associate(self.trajectory[0], times, limit=1e-6)]
 
 

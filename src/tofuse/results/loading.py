@@ -16,7 +16,12 @@ from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.results.folder import component_name, finish_interrupted, is_result
-from tofuse.results.run_json import main_poses, read_run_json
+from tofuse.results.run_json import (
+    damage_reported,
+    main_poses,
+    read_run_json,
+    rotation_up_world,
+)
 from tofuse.results.types import (
     Component,
     Diagnostics,
@@ -47,14 +52,8 @@ def load_result(folder: str | Path) -> Reconstruction:
             "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
-    try:
+    with damage_reported(folder / "run.json"):
         return _reconstruction(folder, run)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise InputError(
-            f"is not a valid run.json ({type(error).__name__}: {error})",
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
-        ) from error
 
 
 def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
@@ -99,7 +98,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
         tuple(_session(each) for each in run.get("sessions", ())),
         tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
-        up=np.array(run["T_up_world"], float)[1, :3] if "T_up_world" in run else None,
+        up=rotation_up_world(run)[1],
     )
 
 

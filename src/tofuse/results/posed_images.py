@@ -24,7 +24,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
 from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
-from tofuse.results.run_json import main_poses, read_run_json
+from tofuse.results.run_json import damage_reported, main_poses, read_run_json
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
@@ -93,13 +93,9 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
     run = read_run_json(folder / "run.json")
     indices, poses = main_poses(folder, run)
     chosen = dict(zip(indices[::every], poses[::every], strict=True))
-    try:
+    with damage_reported(folder / "run.json"):
         covariances = {f["index"]: f["covariance"] for f in run["frames"]}
         parts = list(stored_recordings(folder, run))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            "is damaged, or not a run.json of tofuse", where=folder / "run.json", remedy="run again"
-        ) from error
     skipped: list[str] = []
     n_images = 0
     for part in parts:

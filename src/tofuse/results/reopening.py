@@ -69,7 +69,7 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
     several = run.get("sessions") or []
     alone = {
         "name": folder.resolve().name,
-        "opening": run["input"].get("opening") or _opening_before_version_0_2(run["input"]),
+        "opening": run["input"]["opening"] or _opening_of_path(run["input"]),
         "config": run["config"],
         "first": 0,
         "count": max(times) + 1,
@@ -87,8 +87,8 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
         )
 
 
-def _opening_before_version_0_2(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """How the recording of a result of version 0.1 was opened, as far as `run.json` states it."""
+def _opening_of_path(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """How to open the recording of a result written from Python, which states only its path."""
     return Opening((Path(stated["path"]),)).to_dict()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -192,12 +193,11 @@ def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
     """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
     if not is_result(folder):
         return None
-    frames = read_run_json(folder / "run.json").get("frames", [])
-    try:
+    path = folder / "run.json"
+    frames = read_run_json(path).get("frames", [])
+    with damage_reported(path):
         times = np.array([frame["timestamp"] for frame in frames], float)
         return times, np.array([frame["index"] for frame in frames], np.intp)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError("has no times of frames", where=folder / "run.json") from error
 
 
 def accuracy_json(a: Accuracy) -> dict[str, Any]:
@@ -324,6 +324,27 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     return data
 
 
+@contextmanager
+def damage_reported(path: Path) -> Iterator[None]:
+    """Turn errors of a block that reads fields of a `run.json` into InputError."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise InputError(
+            f"is damaged, or not a run.json of tofuse ({type(error).__name__}: {error})",
+            where=path,
+            remedy="copy the whole folder, or run again",
+        ) from error
+
+
+def rotation_up_world(run: dict[str, Any]) -> Float64:
+    """Return the rotation (3, 3) of a result's `T_up_world`; ValueError if it is not a pose."""
+    T = np.array(run["T_up_world"], float)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError("T_up_world is not a pose")
+    return T[:3, :3]
+
+
 def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
 
@@ -337,9 +358,10 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     Raises
     ------
     InputError
-        If `run.json` and `trajectory.txt` are of different runs.
+        If `run.json` is damaged, or `trajectory.txt` is of another run.
     """
-    indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
+    with damage_reported(folder / "run.json"):
+        indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
     _, poses = read_tum(folder / "trajectory.txt")
     if len(indices) != len(poses):
         raise InputError(
@@ -353,12 +375,12 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
 def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the entries of `run.json` for the frames with a line in `trajectory.txt`, in order.
 
-    Results of version 0.1 have no components: every pose is in the main model.
+    See `types.in_main_model`.
     """
-    connected = [c["T_main_component"] is not None for c in run.get("components", ())]
+    connected = [c["T_main_component"] is not None for c in run["components"]]
     return [
         frame
         for frame in run["frames"]
         if frame["status"] in ("tracked", "predicted")
-        and (frame.get("component") is None or connected[frame["component"]])
+        and (frame["component"] is None or connected[frame["component"]])
     ]

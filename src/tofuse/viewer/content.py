@@ -18,14 +18,18 @@ from tofuse.files.ply import read_ply
 from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.upright import upright
 from tofuse.normal import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
-from tofuse.results.run_json import main_poses, read_run_json
+from tofuse.results.run_json import (
+    damage_reported,
+    main_poses,
+    read_run_json,
+    rotation_up_world,
+)
 from tofuse.viewer.level_of_detail import OVERVIEW_FACES, select_tiles
 from tofuse.viewer.view_file import read_view_file
 
@@ -253,35 +257,30 @@ def read_content(folder: Path) -> ViewContent:
     model_before = None
     if kept is not None and len(kept.points):
         model_before = Layer(kept.points, None, None, kept.color, None, None)
-    return ViewContent(
-        folder,
-        run,
-        cloud,
-        mesh,
-        after,
-        {} if kept is None else kept.before,
-        model_before,
-        () if kept is None else kept.pictures,
-        _up(run, mesh, poses),
-        tiled,
-    )
+    with damage_reported(folder / "run.json"):
+        content = ViewContent(
+            folder,
+            run,
+            cloud,
+            mesh,
+            after,
+            {} if kept is None else kept.before,
+            model_before,
+            () if kept is None else kept.pictures,
+            rotation_up_world(run)[1],
+            tiled,
+        )
+        _check_fields(content)
+    return content
 
 
-def _up(run: dict[str, Any], mesh: Layer | None, poses: Float64) -> Float64:
-    if "T_up_world" in run:
-        stated: Float64 = np.array(run["T_up_world"], float)[1, :3]
-        return stated
-    n = 0 if mesh is None else len(mesh.points)
-    if mesh is not None and n and mesh.normals is not None and mesh.faces is not None:
-        nothing = np.zeros(n, np.int32)
-        shape = Mesh(
-            mesh.points, mesh.faces, mesh.normals, None, nothing.astype(np.float32), nothing,
-            np.zeros(3),
-        )  # fmt: skip
-        return upright(shape, poses)[1]
-    up = -poses[:, :3, 1].mean(0) if len(poses) else np.zeros(3)
-    length = float(np.linalg.norm(up))
-    return up / length if length > 0.1 else np.array([0.0, -1.0, 0.0])
+def _check_fields(content: ViewContent) -> None:
+    """Read the fields that the viewer shows; KeyError, TypeError or the like if one is damaged."""
+    for frame in content.frames:
+        int(frame["index"]), str(frame["status"]), str(frame["reason"])
+    for reason in content.run["reasons"]:
+        str(reason["text"])
+    len(content.run["components"]), str(content.run["verdict"]), content.loops, content.rig
 
 
 # What the model can be coloured by.
