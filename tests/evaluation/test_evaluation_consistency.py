@@ -91,7 +91,7 @@ def test_images_use_self_calibrated_camera_of_result(tmp_path: Path) -> None:
         assert alone.consistency.rms_m == pytest.approx(found[-1])
     assert found[0] == found[1] > 3 * found[2] == 3 * found[3]
     (tmp_path / "run.json").write_text(json.dumps(run | {"config": {"corrections": [7]}}))
-    with pytest.raises(InputError, match="contains no config"):
+    with pytest.raises(InputError, match="is damaged"):
         evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 
 

@@ -229,12 +229,19 @@ def _damaged(result: Path) -> None:
     path.write_text(json.dumps(run))
 
 
+def _with_invalid_corrections(result: Path) -> None:
+    path = result / "run.json"
+    run = json.loads(path.read_text())
+    path.write_text(json.dumps(run | {"config": {"corrections": [3]}}))
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
         (_gone, "which doesn't exist"),
         (_longer, "does not match the frames"),
         (_damaged, "is damaged"),
+        (_with_invalid_corrections, "is damaged"),
     ],
 )
 def test_impossible_exports_are_refused(

@@ -19,7 +19,7 @@ from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
-from tofuse.results.run_json import frame_clock, read_run_json
+from tofuse.results.run_json import damage_reported, frame_clock, read_run_json
 
 Poses = str | Path | Float64
 
@@ -132,10 +132,9 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
     if not is_result(folder):
         return ()
     path = folder / "run.json"
-    try:
-        return CameraErrors.made_with(read_run_json(path)["config"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError("contains no config", where=path, remedy="copy it again") from error
+    run = read_run_json(path)
+    with damage_reported(path):
+        return CameraErrors.made_with(run["config"])
 
 
 def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

@@ -9,8 +9,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.odometry.base import Status
@@ -23,7 +21,7 @@ from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
-from tofuse.results.run_json import damage_reported, main_poses, read_run_json
+from tofuse.results.run_json import damage_reported, frame_covariance, main_poses, read_run_json
 
 _REMEDY = "pass the --out of `tofuse run`"
 
@@ -167,7 +165,7 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
     """Return the pose and status that a result states for each frame, by index."""
     poses = _poses(folder, dict(run))
     main = {k: (T, components) for k, T in poses.items()}
-    apart = [k for k, c in enumerate(run.get("components", ())) if c["T_main_component"] is None]
+    apart = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
     for number, k in enumerate(apart, components + 1):
         own = folder / component_name(k)
         if is_result(own):
@@ -179,19 +177,12 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
             raise ValueError(f"frame {index} is {status!r}")
         if index in main:
             T, component = main[index]
-            C = _covariance(frame) if component == components else None
+            C = frame_covariance(frame) if component == components else None
             found[index] = StatedPose(status, str(frame["reason"]), T, component, C)
         else:
             reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
             found[index] = StatedPose("lost", reason)
     return found
-
-
-def _covariance(frame: Mapping[str, Any]) -> Float64 | None:
-    """Return the (6, 6) covariance of a frame's pose; None if it is unknown."""
-    stated = frame.get("covariance")
-    C = None if stated is None else np.array(stated, float).reshape(6, 6)
-    return None if C is None or not np.isfinite(C).all() else C
 
 
 def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:

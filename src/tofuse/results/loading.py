@@ -18,6 +18,7 @@ from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.run_json import (
     damage_reported,
+    frame_covariance,
     main_poses,
     read_run_json,
     rotation_up_world,
@@ -103,9 +104,8 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
 
 
 def _frame(data: dict[str, Any]) -> FrameRecord:
-    C = data["covariance"]
     unobservable = np.array(data["unobservable"], float).reshape(-1, 6)
-    known = {"covariance": None if C is None else np.array(C, float).reshape(6, 6)}
+    known = {"covariance": frame_covariance(data)}
     stated = {name: data[name] for name in data if name != "session"}
     return FrameRecord(**{**stated, **known, "unobservable": unobservable})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8, UInt16
+from tofuse.corrections.base import Corrector
 from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder
@@ -24,7 +25,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
 from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
-from tofuse.results.run_json import damage_reported, main_poses, read_run_json
+from tofuse.results.run_json import damage_reported, frame_covariance, main_poses, read_run_json
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
@@ -94,16 +95,19 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
     indices, poses = main_poses(folder, run)
     chosen = dict(zip(indices[::every], poses[::every], strict=True))
     with damage_reported(folder / "run.json"):
-        covariances = {f["index"]: f["covariance"] for f in run["frames"]}
+        covariances = {
+            f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in chosen
+        }
         parts = list(stored_recordings(folder, run))
+        correctors = [CameraErrors.made_with(part.config) for part in parts]
     skipped: list[str] = []
     n_images = 0
-    for part in parts:
+    for part, applied in zip(parts, correctors, strict=True):
         recording = reopen(part, folder)
         renderer = _ImageRenderer(recording)
         camera: Camera | None = None
         rectifier: Rectifier | None = None
-        for frame in _frames(part, recording, chosen):
+        for frame in _frames(part, recording, chosen, applied):
             image = renderer.image(frame)
             if image is None:
                 skipped.append(f"{recording.path}: frame {frame.index}")
@@ -121,7 +125,6 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
                 assert seen.color_image is not None
                 image = seen.color_image
             index = part.first + frame.index
-            C = covariances.get(index)
             assert seen.sigma_image is not None
             yield PosedImage(
                 index,
@@ -130,7 +133,7 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
                 image,
                 np.where(seen.valid, seen.sigma_image / ray_lengths(seen.camera), np.float32(0)),
                 chosen[index],
-                None if C is None else np.array(C, float).reshape(6, 6),
+                covariances.get(index),
             )
             n_images += 1
     if skipped and not n_images:
@@ -142,11 +145,13 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
 
 
 def _frames(
-    part: StoredRecording, recording: Recording, chosen: dict[int, Float64]
+    part: StoredRecording,
+    recording: Recording,
+    chosen: dict[int, Float64],
+    correctors: Sequence[Corrector],
 ) -> Iterator[RangeFrame]:
     """The chosen readable frames of a recording, with the camera as it was calibrated."""
     wanted = [k + part.first in chosen for k in recording.indices.tolist()]
-    correctors = CameraErrors.made_with(part.config)
     recording = replace(recording, indices=recording.indices[wanted])
     for item in recording.read_all():
         if isinstance(item, UnreadableFrameError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -343,6 +343,13 @@ def rotation_up_world(run: dict[str, Any]) -> Float64:
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError("T_up_world is not a pose")
     return T[:3, :3]
+
+
+def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:
+    """Return the (6, 6) covariance of the pose of an entry of `frames`; None if it is unknown."""
+    stated = frame["covariance"]
+    C = None if stated is None else np.array(stated, float).reshape(6, 6)
+    return None if C is None or not np.isfinite(C).all() else C
 
 
 def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
