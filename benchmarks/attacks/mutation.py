@@ -37,6 +37,7 @@ _FORKED = multiprocessing.get_context("forkserver")
 _FORKED.set_forkserver_preload(["attacks.loaded"])
 _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
           b"0", b"9" * 5000, b"[", b'{"a":', b"null")  # fmt: skip
+_VALUES = (None, 3, -1, 1e308, 10**30, True, "", "x", "nan", [], [1], [[None]], {}, {"a": 1})
 _CAMERA = {"schema": 1, "model": "brown", "width": 40, "height": 30, "fx": 40.0, "fy": 40.0,
            "cx": 19.5, "cy": 14.5, "distortion": [0.1, 0.01, 0, 0, 0], "depth_unit_m": 0.001,
            "depth_kind": "z", "frame_rate_hz": 30.0, "ambiguity_m": 7.5}  # fmt: skip
@@ -337,6 +338,7 @@ def _results() -> dict[str, Subject]:
     """Output folders."""
     return {
         "a result": _file("out", _result, _load),
+        "a result with images": _file("all", _with_images, _export),
         "a plan": _file("out", _stopped, _settle),
         "tiles": _file("tiles", _tiles, _load_tiles),
         "a session": _file("out", _session, _load_session),
@@ -357,6 +359,20 @@ def _load(out: Path) -> None:
 
     load_result(out)
     read_content(out)
+
+
+def _with_images(folder: Path) -> None:
+    """A recording, and a result with the poses of its images."""
+    import posed_results
+
+    folder.mkdir()
+    posed_results.made_result(folder, posed_results.BROWN)
+
+
+def _export(folder: Path) -> None:
+    from tofuse.results.export import export
+
+    export(folder / "result", ["log", "nerfstudio"], folder / "exported", overwrite=True)
 
 
 def _tiles(folder: Path) -> None:
@@ -430,6 +446,9 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
     path = files[rng.integers(len(files))]
     data = bytearray(path.read_bytes())
     size = max(1, len(data))
+    if path.suffix == ".json" and rng.integers(2):
+        path.write_bytes(_with_changed_value(bytes(data), rng))
+        return
 
     def at(limit: int = size) -> int:
         return int(rng.integers(max(1, min(size, limit))))
@@ -480,6 +499,27 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
         case _:
             data[:] = rng.bytes(int(rng.integers(3000)))
     path.write_bytes(data)
+
+
+def _with_changed_value(data: bytes, rng: np.random.Generator) -> bytes:
+    """Remove or replace one value of a JSON document, at any depth."""
+    try:
+        document = parent = json.loads(data)
+    except (ValueError, RecursionError):  # damaged before
+        return data
+    while isinstance(parent, dict | list) and parent:
+        keys = list(parent) if isinstance(parent, dict) else range(len(parent))
+        key = keys[rng.integers(len(keys))]
+        child = parent[key]
+        if isinstance(child, dict | list) and child and rng.integers(4):
+            parent = child
+        elif rng.integers(4):
+            parent[key] = _VALUES[rng.integers(len(_VALUES))]
+            break
+        else:
+            del parent[key]
+            break
+    return json.dumps(document).encode()
 
 
 def _odd(path: Path, rng: np.random.Generator) -> None:

@@ -113,6 +113,7 @@ def test_orthonormalise_gives_nearest_rotation(xi: np.ndarray, noise: np.ndarray
         lambda T: T[:3],
         lambda T: T * np.nan,
         lambda T: T * 2,
+        lambda T: T * 1e300,
         lambda T: T @ np.diag([1, 1, -1, 1]),
         lambda T: T + np.array([[0] * 4] * 3 + [[1, 0, 0, 0]]),
     ],

@@ -162,7 +162,7 @@ def test_tiled_result_is_read_with_its_overview(folder, layer) -> None:
     np.testing.assert_array_equal(same, lone)
 
 
-@pytest.mark.parametrize("how", ["missing", "cut", "turned"])
+@pytest.mark.parametrize("how", ["missing", "cut", "turned", "an object", "empty"])
 def test_damaged_tiles_are_reported_in_one_line(folder, tmp_path, how) -> None:
     import shutil
 
@@ -176,7 +176,11 @@ def test_damaged_tiles_are_reported_in_one_line(folder, tmp_path, how) -> None:
         largest.write_bytes(largest.read_bytes()[:500])
     else:
         document = json.loads(path.read_text())
-        document["extras"]["T_up_world"] = [[1]]
+        if how == "empty":
+            document["root"].pop("content", None)
+            document["root"]["children"] = []
+        else:
+            document["extras"]["T_up_world"] = [[1]] if how == "turned" else {"a": 1}
         path.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
         read_content(out)

@@ -238,7 +238,8 @@ def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError("is not a finite 4x4 matrix", where=where)
     R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+    # The first condition excludes overflow in the others.
+    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError("has no rotation in its upper left 3x3 block", where=where)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError("has a last row other than 0 0 0 1", where=where)

@@ -94,9 +94,7 @@ class _Result:
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
         path = self.folder / "run.json"
-        run = read_run_json(path)
-        with damage_reported(path):
-            return rotation_up_world(run)
+        return rotation_up_world(read_run_json(path), path)
 
     @cached_property
     def textured(self) -> GeometryRecord:

@@ -99,7 +99,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
         tuple(_session(each) for each in run.get("sessions", ())),
         tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
-        up=rotation_up_world(run)[1],
+        up=rotation_up_world(run, folder / "run.json")[1],
     )
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
-from tofuse.files.reading import parsed, read_text
+from tofuse.files.reading import MALFORMED, parsed, read_text
 from tofuse.files.trajectory import read_tum
+from tofuse.geometry import se3
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.refinement import Refinement
@@ -326,23 +327,27 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
 
 @contextmanager
 def damage_reported(path: Path) -> Iterator[None]:
-    """Turn errors of a block that reads fields of a `run.json` into InputError."""
+    """Turn errors of a block that reads fields of a JSON file of a result into InputError."""
     try:
         yield
-    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise InputError(
-            f"is damaged, or not a run.json of tofuse ({type(error).__name__}: {error})",
+            f"is damaged, or not written by tofuse ({type(error).__name__}: {error})",
             where=path,
             remedy="copy the whole folder, or run again",
         ) from error
 
 
-def rotation_up_world(run: dict[str, Any]) -> Float64:
-    """Return the rotation (3, 3) of a result's `T_up_world`; ValueError if it is not a pose."""
-    T = np.array(run["T_up_world"], float)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError("T_up_world is not a pose")
-    return T[:3, :3]
+def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
+    """Return the rotation (3, 3) of `T_up_world` in data from a file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, or not a pose.
+    """
+    with damage_reported(path):
+        return se3.check_pose(data["T_up_world"], where=f"{path}: T_up_world")[:3, :3]
 
 
 def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:

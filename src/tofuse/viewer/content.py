@@ -119,10 +119,7 @@ class TiledLayer:
         """Read the tree of tiles in a folder; InputError if it is damaged."""
         path = folder / TILESET
         root, extras = read_tileset(path)
-        T = np.array(extras.get("T_up_world", np.eye(4)), float)
-        if T.shape != (4, 4) or not np.isfinite(T).all():
-            raise InputError("has no T_up_world", where=path, remedy="copy the whole folder")
-        return cls(folder, root, T[:3, :3])
+        return cls(folder, root, rotation_up_world(extras, path))
 
     def layer(self, tile: Tile) -> Layer:
         """Read a tile with content, in the world frame."""
@@ -140,10 +137,13 @@ class TiledLayer:
         )
 
     def overview(self) -> Layer:
-        """The whole surface with few triangles."""
-        return merge_layers(
-            [self.layer(tile) for tile in select_tiles(self.root, None, OVERVIEW_FACES)]
-        )
+        """The whole surface with few triangles; InputError if tiles are missing or damaged."""
+        layers = [self.layer(tile) for tile in select_tiles(self.root, None, OVERVIEW_FACES)]
+        if not layers:
+            raise InputError(
+                "has no tiles", where=self.folder / TILESET, remedy="copy the whole folder"
+            )
+        return merge_layers(layers)
 
 
 def merge_layers(layers: Sequence[Layer]) -> Layer:
@@ -267,7 +267,7 @@ def read_content(folder: Path) -> ViewContent:
             {} if kept is None else kept.before,
             model_before,
             () if kept is None else kept.pictures,
-            rotation_up_world(run)[1],
+            rotation_up_world(run, folder / "run.json")[1],
             tiled,
         )
         _check_fields(content)
