@@ -310,7 +310,7 @@ def _small() -> dict[str, Subject]:
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),
-        "jobs": ("a.toml", jobs, lambda path: read_jobs(path, run_arguments)),
+        "jobs": ("a.toml", jobs, lambda path: read_jobs([path], run_arguments)),
         "noise.json": ("noise.json", json.dumps(noise), NoiseModel.load),
     }  # fmt: skip
     found = {}

@@ -14,7 +14,7 @@ from tofuse.errors import InputError
 def jobs_of(folder: Path, text: str, name: str = "list.txt") -> tuple[Job, ...]:
     path = folder / name
     path.write_text(text)
-    return read_jobs(path, run_arguments)
+    return read_jobs([path], run_arguments)
 
 
 @pytest.fixture
@@ -119,12 +119,27 @@ def test_invalid_lists_are_rejected(name: str, text: str, message: str, recordin
 
 def test_unreadable_lists_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="doesn't exist"):
-        read_jobs(tmp_path / "none.txt", run_arguments)
-    with pytest.raises(InputError, match="is a folder"):
-        read_jobs(tmp_path, run_arguments)
+        read_jobs([tmp_path / "none.txt"], run_arguments)
+    with pytest.raises(InputError, match="nothing matches"):
+        read_jobs([tmp_path / "*.bag"], run_arguments)
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is not text"):
-        read_jobs(tmp_path / "list.txt", run_arguments)
+        read_jobs([tmp_path / "list.txt"], run_arguments)
+
+
+def test_recordings_globs_and_lists_are_given_together(
+    recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Arguments are relative to the current folder, lines of a list to that of the list."""
+    monkeypatch.chdir(recordings / "a")
+    (recordings / "one.bag").write_bytes(b"#ROSBAG\0")
+    (recordings / "list").write_text("b/*\na/frames9\n")
+    given = map(Path, ("frames9", "frames1*", "../one.bag", "../list"))
+    found = read_jobs(list(given), run_arguments)
+    assert [job.name for job in found] == ["frames9", "frames10", "one.bag", "b-frames9"]
+    assert [Path(job.recording).resolve() for job in found] == [
+        recordings / name for name in ("a/frames9", "a/frames10", "one.bag", "b/frames9")
+    ]
 
 
 def test_job_key_depends_on_recording_and_options(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The list of a batch: paths and globs, one per line, or a table with options."""
+"""The jobs of a batch: recordings, and lists of them with options."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import escape, glob, has_magic
 from pathlib import Path
 from typing import Any
 
 from tofuse.errors import InputError
-from tofuse.files.reading import name_order, parse_toml, read_text
+from tofuse.files.reading import name_order, parse_toml, read_head, read_text
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # other names in the output folder
+_LISTS = (".csv", ".toml", ".txt")  # other files are lists unless they are binary
+_HEAD_BYTES = 4096
 _MAX_NAME_LENGTH = 100  # characters of a name
 # Files that readers use in the folder of a single file, whatever its name.
 _SIDECARS = ("camera.json", "rays.npy", "correction.npz")
@@ -75,23 +77,24 @@ def _stamps(path: Path, out: Path) -> list[Stamp]:
 
 @dataclass(frozen=True)
 class _Row:
-    """A line or row of a list: its pattern, and its options."""
+    """A line or row of a list, or an argument: its pattern, and its options."""
 
     where: str
     pattern: str
     options: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_jobs(path: Path, run_arguments: RunArguments) -> tuple[Job, ...]:
-    """Read a list of jobs: a table (.csv, .toml), or text with one path per line.
+def read_jobs(given: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, ...]:
+    """Return the jobs of recordings, globs of recordings, and lists.
 
-    Relative paths refer to the list's folder. Duplicates of a recording with the same options are
-    ignored.
+    A list is a table (.csv, .toml), or text with one path or glob per line; relative ones refer to
+    its folder. Folders and binary files are recordings. Duplicates of a recording with the same
+    options are ignored.
 
     Parameters
     ----------
-    path
-        The list.
+    given
+        Paths of lists and of recordings, and globs of recordings.
     run_arguments
         Converts the options of a row to arguments of `tofuse run`; it also gets the folder that
         relative paths refer to, and the row for error messages.
@@ -99,15 +102,11 @@ def read_jobs(path: Path, run_arguments: RunArguments) -> tuple[Job, ...]:
     Raises
     ------
     InputError
-        If the list can't be read, names no recording, or a row can't be a job.
+        If a list can't be read, there is no recording, or a row can't be a job.
     """
-    text = read_text(path)
-    readers = {".csv": _csv_rows, ".toml": _toml_rows}
-    rows = readers.get(path.suffix.lower(), _text_rows)(text, path)
-    base = path.absolute().parent
     jobs: dict[str, Job] = {}  # by the name in lower case, as some systems ignore case
-    seen: dict[tuple[object, ...], str] = {}
-    for row in rows:
+    seen: set[tuple[object, ...]] = set()
+    for base, row in (each for path in given for each in _rows(path)):
         options = dict(row.options)
         name, memory = options.pop("name", ""), options.pop("memory", "")
         wanted = _bytes_of(memory, row.where) if memory else None
@@ -120,14 +119,32 @@ def read_jobs(path: Path, run_arguments: RunArguments) -> tuple[Job, ...]:
                 remedy="leave out the name, or list the recordings one by one",
             )
         for recording in found:
-            if (recording, arguments, name) in seen:
+            same = os.path.realpath(recording), arguments, name
+            if same in seen:
                 continue
             called = _check_name(name, jobs, row.where) if name else _unique_name(recording, jobs)
-            seen[recording, arguments, name] = called
+            seen.add(same)
             jobs[called.lower()] = Job(called, recording, arguments, wanted)
     if not jobs:
-        raise InputError("lists no recording", where=path, remedy="add a path or glob per line")
+        names = ", ".join(map(str, given))
+        raise InputError("lists no recording", where=names, remedy="add a path or glob per line")
     return tuple(jobs.values())
+
+
+def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
+    """Yield the rows of a list, or one for a recording or glob, and what they are relative to."""
+    if not _is_list(path):
+        yield Path.cwd(), _Row(str(path), str(path))
+        return
+    readers = {".csv": _csv_rows, ".toml": _toml_rows}
+    for row in readers.get(path.suffix.lower(), _text_rows)(read_text(path), path):
+        yield path.absolute().parent, row
+
+
+def _is_list(path: Path) -> bool:
+    if os.path.isdir(path) or (has_magic(str(path)) and not os.path.exists(path)):
+        return False
+    return path.suffix.lower() in _LISTS or b"\0" not in read_head(path, _HEAD_BYTES)
 
 
 def _text_rows(text: str, path: Path) -> Iterator[_Row]:

@@ -26,7 +26,7 @@ _MAX_LISTED = 10  # recordings without a result that the summary names
 
 def batch(arguments: argparse.Namespace) -> int:
     """Do all pending jobs, and print a summary."""
-    jobs = read_jobs(arguments.list, run_arguments)
+    jobs = read_jobs(arguments.recordings, run_arguments)
     jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
     chosen = _chosen(jobs, arguments)
     folder = BatchFolder(arguments.out.absolute())
@@ -64,7 +64,7 @@ def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
         if name not in names:
             near = get_close_matches(name, names, 1)
             raise InputError(
-                f"{arguments.list} has no job {name}",
+                f"there is no job {name}",
                 where="--only",
                 remedy=f"did you mean {near[0]}?" if near else "see --print-jobs",
             )
@@ -73,7 +73,7 @@ def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
 
 def _command_line(arguments: argparse.Namespace, job: Job) -> str:
     """A command that does a single job, from any folder."""
-    command = ["tofuse", "batch", str(arguments.list.absolute())]
+    command = ["tofuse", "batch", *(str(path.absolute()) for path in arguments.recordings)]
     command += ["--out", str(arguments.out.absolute()), "--only", job.name]
     for option in ("threads", "retries"):
         value = getattr(arguments, option)

@@ -34,7 +34,7 @@ _EXIT = _exit_status(
     "a result was written, but some readable frame has no pose",
 )
 _BATCH = """\
-LIST is a text file with one path or glob per line, or a table (.csv, .toml) with a column
+A list is a text file with one path or glob per line, or a table (.csv, .toml) with a column
 `recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
 command again to resume.
 
@@ -357,7 +357,13 @@ def _batch(commands: Any) -> None:
     p = _command(
         commands, "batch", "reconstruct many recordings, each as a separate job", epilog=_BATCH
     )
-    p.add_argument("list", type=Path, metavar="LIST", help="the recordings, with their options")
+    p.add_argument(
+        "recordings",
+        nargs="+",
+        type=Path,
+        metavar="LIST",
+        help="a list of recordings, a recording, or a glob",
+    )
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the results")
     _overwrite(p, "results made with other options; up-to-date results are kept")
     _json(p, "jobs and outcome as JSON lines")
