@@ -387,7 +387,7 @@ def test_missing_dask_is_reported(tmp_path: Path, monkeypatch, capsys) -> None:
         (["--workers", "0"], "'0' is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
         (["--memory", "much"], "not an amount of memory"),
-        (["--only", "b"], "has no job b"),
+        (["--only", "b"], "there is no job b"),
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],
 )
