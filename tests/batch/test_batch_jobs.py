@@ -142,6 +142,16 @@ def test_recordings_globs_and_lists_are_given_together(
     ]
 
 
+def test_file_that_reader_recognises_is_recording(tmp_path: Path) -> None:
+    """Even if it is text."""
+    path = tmp_path / "scan.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    path.write_text(f"{header}end_header\n0 0 1\n")
+    (job,) = read_jobs([path], run_arguments)
+    assert job.recording == str(path)
+
+
 def test_job_key_depends_on_recording_and_options(tmp_path: Path) -> None:
     out = tmp_path / "out"
     bag, other = tmp_path / "one.bag", tmp_path / "two.bag"

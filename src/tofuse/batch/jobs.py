@@ -19,7 +19,8 @@ from tofuse.files.reading import name_order, parse_toml, read_head, read_text
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # other names in the output folder
-_LISTS = (".csv", ".toml", ".txt")  # other files are lists unless they are binary
+# Other files are recordings if they are binary, or a reader recognises them.
+_LISTS = (".csv", ".toml", ".txt")
 _HEAD_BYTES = 4096
 _MAX_NAME_LENGTH = 100  # characters of a name
 # Files that readers use in the folder of a single file, whatever its name.
@@ -88,8 +89,8 @@ def read_jobs(given: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, 
     """Return the jobs of recordings, globs of recordings, and lists.
 
     A list is a table (.csv, .toml), or text with one path or glob per line; relative ones refer to
-    its folder. Folders and binary files are recordings. Duplicates of a recording with the same
-    options are ignored.
+    its folder. Folders, binary files and files that a reader recognises are recordings. Duplicates
+    of a recording with the same options are ignored.
 
     Parameters
     ----------
@@ -144,7 +145,13 @@ def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
 def _is_list(path: Path) -> bool:
     if os.path.isdir(path) or (has_magic(str(path)) and not os.path.exists(path)):
         return False
-    return path.suffix.lower() in _LISTS or b"\0" not in read_head(path, _HEAD_BYTES)
+    if path.suffix.lower() in _LISTS:
+        return True
+    if b"\0" in read_head(path, _HEAD_BYTES):
+        return False
+    from tofuse.recordings.open import is_recording  # loads all readers
+
+    return not is_recording(path)
 
 
 def _text_rows(text: str, path: Path) -> Iterator[_Row]:

@@ -197,6 +197,11 @@ def _sniff(path: Path) -> dict[str, Sniff]:
     return {name: sniff for name, sniff in found.items() if sniff is not None}
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a reader recognises a file or folder as a recording of its format."""
+    return any(sniff.confidence >= SURE for sniff in _sniff(path).values())
+
+
 def _parts(path: Path) -> list[_Located]:
     """The recordings in a folder, if any; InputError if they can't be joined."""
     if not is_folder(path):
