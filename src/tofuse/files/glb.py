@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.arrays import UInt8, UInt16
-from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes, write_text
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.reading import MALFORMED, read_bytes
+from tofuse.files.reading import damage_reported, read_bytes
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -207,7 +206,7 @@ def read_glb(path: str | Path) -> GeometryRecord:
         If it can't be read, is damaged, or was written by another program.
     """
     data = read_bytes(path)
-    try:
+    with damage_reported(path, "a mesh"):
         document, body = _chunks(data)
         if "meshes" not in document:
             return GeometryRecord(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
@@ -236,12 +235,6 @@ def read_glb(path: str | Path) -> GeometryRecord:
                 if name.startswith("_")
             },
         )
-    except (*MALFORMED, struct.error) as error:
-        raise InputError(
-            f"is not a mesh written by tofuse, or is damaged ({error})",
-            where=path,
-            remedy="copy it again, or create it again",
-        ) from error
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import importlib
 import re
+import struct
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,14 @@ MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
 _MAX_DOTS = 1000  # on a line of TOML
 # Errors that malformed data cause in code that takes it apart.
-MALFORMED = (
+_MALFORMED = (
     ArithmeticError,
     AttributeError,
     LookupError,
     RecursionError,
     TypeError,
     ValueError,
+    struct.error,
 )
 
 _REASONS = {
@@ -97,6 +100,27 @@ def read_head(path: str | Path, size: int) -> bytes:
             return file.read(size)
     except OSError as error:
         raise input_error(error, path) from error
+
+
+@contextmanager
+def damage_reported(path: str | Path, what: str) -> Iterator[None]:
+    """Turn errors of a block that takes apart a file of tofuse's own into InputError.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        Its kind, such as "a tileset".
+    """
+    try:
+        yield
+    except _MALFORMED as error:
+        raise InputError(
+            f"is damaged, or not {what} written by tofuse ({type(error).__name__}: {error})",
+            where=path,
+            remedy="copy the whole folder again, or create it again",
+        ) from error
 
 
 def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: str) -> Any:

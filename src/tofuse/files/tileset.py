@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
-from tofuse.files.reading import MALFORMED, read_bytes
+from tofuse.files.reading import damage_reported, read_bytes
 
 # Tiles have z up; renderers rotate the y axis of glTF there: (x, y, z) becomes (x, -z, y).
 R_TILES_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -100,17 +99,11 @@ def read_tileset(path: str | Path) -> tuple[Tile, dict[str, Any]]:
     InputError
         If it can't be read, is damaged, or was written by another program.
     """
-    try:
+    with damage_reported(path, "a tileset"):
         document = json.loads(read_bytes(path))
         if document["asset"]["version"] != "1.1":
             raise ValueError(f"version {document['asset']['version']}")
         return _read(document["root"], 0), dict(document["extras"])
-    except MALFORMED as error:
-        raise InputError(
-            f"is not a tileset written by tofuse, or is damaged ({error})",
-            where=path,
-            remedy="copy the whole folder, or create it again",
-        ) from error
 
 
 def _read(data: dict[str, Any], depth: int) -> Tile:

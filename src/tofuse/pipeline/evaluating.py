@@ -19,7 +19,7 @@ from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
-from tofuse.results.run_json import damage_reported, frame_clock, read_run_json
+from tofuse.results.run_json import frame_clock, read_run_json, run_json_checked
 
 Poses = str | Path | Float64
 
@@ -133,7 +133,7 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
         return ()
     path = folder / "run.json"
     run = read_run_json(path)
-    with damage_reported(path):
+    with run_json_checked(path):
         return CameraErrors.made_with(run["config"])
 
 

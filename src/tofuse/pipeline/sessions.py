@@ -21,7 +21,7 @@ from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
-from tofuse.results.run_json import damage_reported, frame_covariance, main_poses, read_run_json
+from tofuse.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
 
 _REMEDY = "pass the --out of `tofuse run`"
 
@@ -126,7 +126,7 @@ def _read_parts(
     if not folder.is_dir() or not is_result(folder):
         raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
-    with damage_reported(folder / "run.json"):
+    with run_json_checked(folder / "run.json"):
         stated = _stated(folder, run, components)
         parts = list(stored_recordings(folder, run))
         posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]

@@ -34,7 +34,7 @@ from tofuse.results.folder import (
     lock_folder,
 )
 from tofuse.results.nerfstudio import write_nerfstudio
-from tofuse.results.run_json import damage_reported, read_run_json, rotation_up_world
+from tofuse.results.run_json import read_run_json, rotation_up_world, run_json_checked
 from tofuse.results.tiles import is_tiles, write_tiles
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
@@ -119,7 +119,7 @@ class _Result:
         """(N,) frame index of each pose."""
         path = self.folder / "run.json"
         run = read_run_json(path)
-        with damage_reported(path):
+        with run_json_checked(path):
             index = np.array([frame["index"] for frame in run["frames"]], np.intp)
             times = np.array([frame["timestamp"] for frame in run["frames"]], float)
         return index[associate(self.trajectory[0], times, limit=1e-6)]

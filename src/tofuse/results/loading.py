@@ -17,11 +17,11 @@ from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.run_json import (
-    damage_reported,
     frame_covariance,
     main_poses,
     read_run_json,
     rotation_up_world,
+    run_json_checked,
 )
 from tofuse.results.types import (
     Component,
@@ -53,7 +53,7 @@ def load_result(folder: str | Path) -> Reconstruction:
             "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
-    with damage_reported(folder / "run.json"):
+    with run_json_checked(folder / "run.json"):
         return _reconstruction(folder, run)
 
 

@@ -25,7 +25,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
 from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
-from tofuse.results.run_json import damage_reported, frame_covariance, main_poses, read_run_json
+from tofuse.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
@@ -94,7 +94,7 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
     run = read_run_json(folder / "run.json")
     indices, poses = main_poses(folder, run)
     chosen = dict(zip(indices[::every], poses[::every], strict=True))
-    with damage_reported(folder / "run.json"):
+    with run_json_checked(folder / "run.json"):
         covariances = {
             f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in chosen
         }

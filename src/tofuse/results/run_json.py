@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -14,7 +14,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
-from tofuse.files.reading import MALFORMED, parsed, read_text
+from tofuse.files.reading import damage_reported, parsed, read_text
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.posegraph.accuracy import Accuracy
@@ -196,7 +196,7 @@ def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
         return None
     path = folder / "run.json"
     frames = read_run_json(path).get("frames", [])
-    with damage_reported(path):
+    with run_json_checked(path):
         times = np.array([frame["timestamp"] for frame in frames], float)
         return times, np.array([frame["index"] for frame in frames], np.intp)
 
@@ -325,17 +325,9 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     return data
 
 
-@contextmanager
-def damage_reported(path: Path) -> Iterator[None]:
-    """Turn errors of a block that reads fields of a JSON file of a result into InputError."""
-    try:
-        yield
-    except MALFORMED as error:
-        raise InputError(
-            f"is damaged, or not written by tofuse ({type(error).__name__}: {error})",
-            where=path,
-            remedy="copy the whole folder, or run again",
-        ) from error
+def run_json_checked(path: Path) -> AbstractContextManager[None]:
+    """Turn errors of a block that reads fields of a `run.json` into InputError."""
+    return damage_reported(path, "a run.json")
 
 
 def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
@@ -346,7 +338,7 @@ def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
     InputError
         If it is missing, or not a pose.
     """
-    with damage_reported(path):
+    with damage_reported(path, f"a {path.name}"):
         return se3.check_pose(data["T_up_world"], where=f"{path}: T_up_world")[:3, :3]
 
 
@@ -372,7 +364,7 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     InputError
         If `run.json` is damaged, or `trajectory.txt` is of another run.
     """
-    with damage_reported(folder / "run.json"):
+    with run_json_checked(folder / "run.json"):
         indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
     _, poses = read_tum(folder / "trajectory.txt")
     if len(indices) != len(poses):

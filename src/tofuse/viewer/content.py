@@ -25,10 +25,10 @@ from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.run_json import (
-    damage_reported,
     main_poses,
     read_run_json,
     rotation_up_world,
+    run_json_checked,
 )
 from tofuse.viewer.level_of_detail import OVERVIEW_FACES, select_tiles
 from tofuse.viewer.view_file import read_view_file
@@ -257,19 +257,19 @@ def read_content(folder: Path) -> ViewContent:
     model_before = None
     if kept is not None and len(kept.points):
         model_before = Layer(kept.points, None, None, kept.color, None, None)
-    with damage_reported(folder / "run.json"):
-        content = ViewContent(
-            folder,
-            run,
-            cloud,
-            mesh,
-            after,
-            {} if kept is None else kept.before,
-            model_before,
-            () if kept is None else kept.pictures,
-            rotation_up_world(run, folder / "run.json")[1],
-            tiled,
-        )
+    content = ViewContent(
+        folder,
+        run,
+        cloud,
+        mesh,
+        after,
+        {} if kept is None else kept.before,
+        model_before,
+        () if kept is None else kept.pictures,
+        rotation_up_world(run, folder / "run.json")[1],
+        tiled,
+    )
+    with run_json_checked(folder / "run.json"):
         _check_fields(content)
     return content
 
