@@ -32,7 +32,7 @@ class Problem:
         rotation: Rotation,
     ) -> None:
         self.fixed, self.information, self.gravity = fixed, information, gravity
-        self.pairs = pairs
+        self.pairs, self.measurements = pairs, measurements
         self.chart: Chart = CHARTS[rotation]()
         self._Z_inverse = se3.inverse(measurements)
         n = len(fixed)

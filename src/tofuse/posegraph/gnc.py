@@ -14,6 +14,8 @@
    with m the loop's error, W its information, C the covariance of the relative pose that it
    measures, all in the same tangent space. The worst loops are rejected, the rest is solved again,
    and loops that fit after all are accepted.
+4. A descent from odometry that drifted far may end in a wrong minimum. So if a loop does not fit,
+   all of it is repeated from chordal initialisation, and the lower objective counts.
 
 Stated information is often too large. So the threshold grows with the errors of the better half of
 the loops, up to a limit.
@@ -26,21 +28,58 @@ import numpy as np
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
+from tofuse.posegraph.chordal import chordal_poses
 from tofuse.posegraph.descent import Descent, Problem
 from tofuse.posegraph.robust import Settings
 
 _QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom
 _MAX_ROUNDS = 20  # of accepting and rejecting loops
 _DENSE = 3.0  # edges per pose, above which no single loop can bend the others
-# Fraction of the objective that rejecting loops must save; otherwise all are accepted.
+# Fraction of the objective that rejecting loops must save, otherwise all are accepted; and that
+# another start must save.
 _MIN_SAVING = 0.01
+
+
+def truncated_least_squares(
+    problem: Problem, poses: Float64, loop: Bool, settings: Settings
+) -> GraduatedNonConvexity:
+    """Select among the loops (m,) and solve for the poses.
+
+    The given poses (n, 4, 4) are the first start. If they are better than anything found, they are
+    kept, without the loops that contradict them.
+    """
+    found = GraduatedNonConvexity(problem, poses, loop, settings)
+    if found.fits_all():
+        found.select()
+        return found
+    again = chordal_poses(
+        poses, problem.pairs, problem.measurements, problem.information, problem.fixed
+    )
+    if again is not None:
+        other = GraduatedNonConvexity(problem, again, loop, settings)
+        other.descent.log[:0] = found.descent.log[:1]  # of the given poses
+        if other.fits_all():
+            other.select()
+            return other
+        found.select()
+        other.select()
+        if other.objective() < (1 - _MIN_SAVING) * found.objective():
+            found = other
+    else:
+        found.select()
+    given = GraduatedNonConvexity(problem, poses, loop, settings)
+    if given.objective() <= found.objective():
+        given.keep_start()
+        return given
+    return found
 
 
 class GraduatedNonConvexity:
     """Selection of the loops that are accepted.
 
-    After `run`, `descent` has the poses, `weights` (m,) is 1 or 0 for each edge, and `limit` (m,)
-    is the largest contribution of an edge's squared error to the objective.
+    After `select`, `descent` has the poses, `weights` (m,) is 1 or 0 for each edge, `limit` (m,) is
+    the largest contribution of an edge's squared error to the objective, and `converged` is whether
+    the last descent met its stopping rule.
     """
 
     def __init__(self, problem: Problem, poses: Float64, loop: Bool, settings: Settings) -> None:
@@ -48,31 +87,48 @@ class GraduatedNonConvexity:
         self.descent = Descent(problem, problem.start(poses))
         self.weights = np.ones(len(loop))
         self.limit = np.full(len(loop), np.inf)
+        self.converged = True
 
-    def run(self) -> bool:
-        """Select loops and solve for the poses; whether the last descent met its stopping rule."""
+    def objective(self) -> float:
+        """The sum of squared errors, those of loops truncated at the threshold of the settings."""
+        x = self.descent.chi2
+        squares = np.where(self.loop, np.minimum(x, self.settings.gate), x).sum()
+        return float(squares) + self.problem.gravity_cost(self.descent.down)
+
+    def keep_start(self) -> None:
+        """Keep the poses of the start; loops that contradict them are rejected."""
+        self.limit = np.where(self.loop, self.settings.gate, np.inf)
+        self.weights = np.where(self.descent.chi2 > self.limit, 0.0, 1.0)
+
+    def fits_all(self) -> bool:
+        """Solve with all loops; whether each of them fits."""
+        self.converged = self._with(self.weights)
+        x = self.descent.chi2[self.loop]
+        return self.converged and bool((x <= self._gate(x)).all())
+
+    def select(self) -> None:
+        """Select loops and solve for the poses, after `fits_all`."""
         loop, descent = self.loop, self.descent
-        converged = self._with(self.weights)
         plain, everything = descent.state(), float(descent.chi2.sum())
         if everything <= self.settings.gate:
-            return converged  # no single loop can exceed the gate
+            return  # no single loop can exceed the gate
         gate = self._gate(descent.chi2[loop])
         if not (descent.chi2[loop] <= gate).all():
             self._graduate()
             accepted = descent.chi2[loop] <= self.settings.gate * self.settings.max_inflation**2
             gate = self._gate(descent.chi2[loop][accepted])
-            converged = self._iterate(gate)
+            self.converged = self._iterate(gate)
         if len(loop) <= _DENSE * len(self.problem.fixed):
-            converged = self._unmask(converged)
+            self.converged = self._unmask(self.converged)
         if (self.weights == 1).all():
-            return converged
+            return
         limit = np.where(loop, gate, np.inf)
         if np.minimum(descent.chi2, limit).sum() > (1 - _MIN_SAVING) * everything:
             descent.restore(plain)
             self.weights = np.ones(len(loop))
-            return True
+            self.converged = True
+            return
         self.limit = limit
-        return converged
 
     def _with(self, weights: Float64) -> bool:
         settings = self.settings

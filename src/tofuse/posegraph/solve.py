@@ -18,7 +18,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.posegraph import robust
 from tofuse.posegraph.descent import Descent, Problem
-from tofuse.posegraph.gnc import GraduatedNonConvexity
+from tofuse.posegraph.gnc import truncated_least_squares
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.robust import Settings
 from tofuse.posegraph.sparse import Factor, first_of_parts
@@ -92,11 +92,10 @@ def solve(
     fixed = first_of_parts(len(poses), pairs) if fixed is None else np.asarray(fixed, bool)
     problem = Problem(pairs, measurements, information, fixed, gravity, settings.rotation)
     if settings.robust == "truncated" and loop.any():
-        found = GraduatedNonConvexity(problem, poses, loop, settings)
-        converged = found.run()
+        found = truncated_least_squares(problem, poses, loop, settings)
         log = found.descent.log
         history = tuple(float(np.minimum(x, found.limit).sum()) + extra for x, extra in log)
-        return _solution(problem, found.descent, found.weights, history, converged)
+        return _solution(problem, found.descent, found.weights, history, found.converged)
     kernel = settings.robust if settings.robust != "truncated" else "none"
 
     def total(x: Float64) -> Float64:

@@ -1,0 +1,167 @@
+"""Chordal initialisation, and the optimiser where a descent from the given poses fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.arrays import Bool, Float64, Intp
+from tofuse.geometry import se3
+from tofuse.posegraph.chordal import chordal_poses
+from tofuse.posegraph.descent import Problem
+from tofuse.posegraph.gnc import GraduatedNonConvexity
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
+from tofuse.posegraph.robust import Settings
+from walked_graph import SIGMA, walk
+
+SOMEWHERE = se3.exp(np.array([3.0, -1, 2, 0.5, -2, 1]))
+
+
+def first_only(n: int) -> Bool:
+    return np.arange(n) == 0
+
+
+def laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, Float64]:
+    """A camera that walks in circles: poses of odometry with drift, and the true poses.
+
+    One step of each lap is uncertain, and wrong by 1.1 m and some degrees. Loops to earlier laps
+    are accurate: half of them, of views from the same pose, to 0.1 mm.
+    """
+    rng = np.random.default_rng(0)
+    turn = np.zeros((per_lap, 6))
+    turn[:, 5] = 2 * np.pi * np.arange(per_lap) / per_lap
+    lap = se3.exp(turn)
+    lap[:, :3, 3] = 2.0 * np.stack([np.cos(turn[:, 5]), np.sin(turn[:, 5]), 0 * turn[:, 5]], 1)
+    n = count * per_lap
+    truth = lap[np.arange(n) % per_lap]
+    wrong = np.arange(n - 1) % per_lap == per_lap // 3
+    noise = rng.normal(size=(n - 1, 6)) * 2e-3
+    noise[wrong] = [0.6, 0, 0.9, 0, np.radians(degrees), 0]
+    steps = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(noise)
+    poses = [truth[0]]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+
+    j = np.arange(per_lap, n, per_lap // 4)
+    i = j - per_lap * np.array([rng.integers(1, min(k, 12) + 1) for k in j // per_lap])
+    sigma = np.where(rng.random(len(j)) < 0.5, 3e-3, 1e-4)
+    loops = se3.inverse(truth[i]) @ truth[j]
+    loops = loops @ se3.exp(rng.normal(size=(len(j), 6)) * sigma[:, None])
+    sigma = np.concatenate([np.where(wrong, 0.3, 2e-3), sigma])
+    graph = PoseGraph(
+        np.arange(n),
+        se3.orthonormalise(np.array(poses)),
+        np.concatenate([np.stack([np.arange(n - 1), np.arange(1, n)], 1), np.stack([i, j], 1)]),
+        np.concatenate([steps, loops]),
+        np.eye(6) / sigma[:, None, None] ** 2,
+        np.arange(len(sigma)) >= n - 1,
+    )
+    return graph, truth
+
+
+def chordal(graph: PoseGraph, fixed: Bool) -> Float64 | None:
+    return chordal_poses(graph.poses, graph.edges, graph.measurements, graph.information, fixed)
+
+
+def test_exact_measurements_give_exact_poses_from_any_start():
+    graph, truth, _ = walk(30, 12)
+    i, j = graph.edges.T
+    n = len(truth)
+    rng = np.random.default_rng(0)
+    anywhere = se3.exp(rng.normal(size=(n, 6)))
+    anywhere[0] = SOMEWHERE @ truth[0]
+    exact = se3.inverse(truth[i]) @ truth[j]
+    found = chordal_poses(anywhere, graph.edges, exact, graph.information, first_only(n))
+    assert found is not None
+    np.testing.assert_allclose(found, SOMEWHERE @ truth, atol=1e-9)
+
+
+def test_each_part_starts_at_its_fixed_pose():
+    graph, truth, _ = walk(20, 8)
+    n = len(truth)
+    edges: Intp = np.concatenate([graph.edges, graph.edges + n])
+    i, j = graph.edges.T
+    exact = np.tile(se3.inverse(truth[i]) @ truth[j], (2, 1, 1))
+    poses = np.concatenate([truth, SOMEWHERE @ truth])
+    information = np.tile(graph.information, (2, 1, 1))
+    found = chordal_poses(poses, edges, exact, information, np.arange(2 * n) % n == 0)
+    assert found is not None
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
+def test_weights_are_those_of_the_edges():
+    """Of two measurements of one motion, the certain one counts."""
+    T = se3.exp(np.array([[0.1, 0, 0, 0, 0, 0.1], [0.5, 0, 0, 0, 0, 0.3]]))
+    pairs = np.array([[0, 1], [0, 1]])
+    information = np.stack([np.eye(6) * 1e8, np.eye(6)])
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    found = chordal_poses(poses, pairs, T, information, first_only(2))
+    assert found is not None
+    np.testing.assert_allclose(found[1], T[0], atol=1e-6)
+
+
+def test_result_is_near_the_minimum():
+    """With the noise of a usual graph, a descent from it ends in the least squares solution."""
+    graph, _, _ = walk(40, 20)
+    found = chordal(graph, first_only(40))
+    assert found is not None
+    best = minimise(graph, Settings("none", tolerance=1e-12)).graph
+    off = se3.log(se3.inverse(best.poses) @ found)
+    assert np.abs(off / SIGMA).max() < 3
+    again = minimise(graph.with_poses(found), Settings("none", tolerance=1e-12)).graph
+    np.testing.assert_allclose(again.poses, best.poses, atol=1e-6)
+
+
+def test_undetermined_poses_give_none():
+    graph, _, _ = walk(10, 4)
+    information = graph.information.copy()
+    information[(graph.edges == 5).any(1)] = 0.0
+    poses, edges = graph.poses, graph.edges
+    assert chordal_poses(poses, edges, graph.measurements, information, first_only(10)) is None
+
+
+def test_nothing_to_solve():
+    graph, _, _ = walk(8, 2)
+    found = chordal(graph, np.ones(8, bool))
+    np.testing.assert_array_equal(found, graph.poses)
+
+
+def test_optimiser_finds_the_minimum_where_descent_from_odometry_does_not():
+    graph, truth = laps(30, 12, 60.0)
+    n = len(truth)
+    problem = Problem(
+        graph.edges, graph.measurements, graph.information, first_only(n), None, "tangent"
+    )
+    alone = GraduatedNonConvexity(problem, graph.poses, graph.loop, Settings())
+    assert not alone.fits_all()
+    alone.select()
+    assert np.linalg.norm((alone.descent.poses - truth)[:, :3, 3], axis=1).max() > 1
+
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.converged
+    assert done.weights is not None
+    assert (done.weights == 1).all()
+    assert np.linalg.norm((done.graph.poses - truth)[:, :3, 3], axis=1).max() < 0.05
+    best = LevenbergMarquardt().optimise(graph.with_poses(truth))
+    assert done.objective[-1] == pytest.approx(best.objective[-1], rel=1e-6)
+
+
+def test_loops_are_rejected_if_the_given_poses_are_better():
+    """Two loops contradict odometry, and each other: the poses stay, without both."""
+    graph, truth, _ = walk(12, 0)
+    wrong = se3.exp(np.array([[0.8, 0, 0, 0, 0, 0], [-0.8, 0, 0, 0, 0, 0]]))
+    loops = np.array([[0, 8], [1, 9]])
+    measured = se3.inverse(truth[loops[:, 0]]) @ truth[loops[:, 1]] @ wrong
+    graph = PoseGraph(
+        graph.ids,
+        graph.poses,
+        np.concatenate([graph.edges, loops]),
+        np.concatenate([graph.measurements, measured]),
+        np.concatenate([graph.information, np.tile(np.eye(6) * 1e4, (2, 1, 1))]),
+        np.append(graph.loop, [True, True]),
+    )
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.graph.poses, graph.poses)
+    assert done.weights is not None
+    np.testing.assert_array_equal(done.weights[-2:], 0)
