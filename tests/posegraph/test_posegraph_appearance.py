@@ -203,8 +203,10 @@ def test_candidates_require_leaving_and_returning(full_turn):
     views, _truth = full_turn
     descriptors = [view_descriptor(view) for view in views]
 
-    def candidates(descriptors, possible=lambda i, j: True, known=(), **options):
-        return Appearance(**options).candidates(descriptors, possible, known)
+    def candidates(
+        descriptors, possible=lambda i, j: True, known=(), gain=lambda i, j: 0, **options
+    ):
+        return Appearance(**options).candidates(descriptors, possible, known, gain)
 
     pairs, refused = candidates(descriptors, pairs=10)
     assert (0, 18) in pairs
@@ -217,6 +219,9 @@ def test_candidates_require_leaving_and_returning(full_turn):
     assert candidates([descriptors[0]] * 8) == ([], [])
     assert all(j < 16 or i > 3 for i, j in candidates(descriptors, known=[(0, 18)], pairs=10)[0])
     assert len(candidates(descriptors, pairs=1)[0]) == 1
+    # The one that adds most information comes first, then the most similar ones.
+    assert candidates(descriptors, gain=lambda i, j: i, pairs=10)[0][0] == max(pairs)
+    assert candidates(descriptors, gain=lambda i, j: 1, pairs=10)[0] == pairs
     # Pairs that the trajectory forbids do not count towards the limit.
     kept, refused = candidates(descriptors, lambda i, j: i > 0, pairs=1)
     assert kept == [(1, 19)]

@@ -13,8 +13,8 @@ from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
 from tofuse.posegraph import revisits
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.view_store import ViewStore
+from tofuse.posegraph.revisits import Revisits, information_gain
+from tofuse.posegraph.view_store import KeptView, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import ACCEPTED
 from tofuse.registration.prepared_view import prepare_view
@@ -48,6 +48,34 @@ def test_continuously_overlapping_views_are_no_loop(turn):
     # A static camera sees the same all the time, and never left it.
     still = [replace(frames[0], index=k) for k in range(5)]
     assert pushed(Revisits(), still, np.stack([np.eye(4)] * 5)) == []
+
+
+def test_loop_to_the_least_certain_view_is_tried_as_well():
+    """Laps that agree overlap most, but what connects them with the first one is unknown."""
+    places = [0.0, 1.2] * 4  # yaw: the camera looks at one place, then at another
+    aside = [0.15, 0.15, 0.1, 0.1, 0, 0, 0, 0]  # of the poses on the trajectory, m
+    truth, poses = (
+        se3.exp(np.array([[x, 0, 0, 0, yaw, 0] for x, yaw in zip(shift, places, strict=True)]))
+        for shift in ([0.0] * 8, aside)
+    )
+    options = SurfaceOptions(radii=(2,))
+    views = [KeptView.of(prepare_view(corner(T), options), 600) for T in truth]
+    assert Revisits(per_view=1).candidates(views, poses, first=6) == [(4, 6), (5, 7)]
+    variance = np.array([0.0, 0.0, 0.3, 0.3, 1.0, 1.0, 1.1, 1.1])
+    found = Revisits(per_view=1).candidates(views, poses, first=6, variance=variance)
+    assert found == [(0, 6), (4, 6), (1, 7), (5, 7)]
+    # Differences within the accuracy of a loop don't count.
+    found = Revisits(per_view=1).candidates(views, poses, first=6, variance=1e-5 * variance)
+    assert found == [(4, 6), (5, 7)]
+    assert Revisits(per_view=0).candidates(views, poses, variance=variance) == []
+
+
+def test_information_gain_is_that_of_the_relative_position():
+    assert information_gain(4.0, 4.0) == 0
+    assert information_gain(0.0, 4.0) == information_gain(4.0, 0.0)
+    of_others = information_gain(np.array([0.0, 3.0]), 4.0)
+    # Half the standard deviation, a bit less.
+    assert of_others[0] - of_others[1] == 1
 
 
 def test_view_of_another_place_is_rejected_with_reason(turn):

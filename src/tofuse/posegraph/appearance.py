@@ -35,7 +35,7 @@ class Appearance:
     Attributes
     ----------
     pairs
-        Maximum number of pairs of a recording, the most similar first; 0 disables appearance.
+        Maximum number of pairs of a recording; 0 disables appearance.
     max_difference, min_difference
         Maximum difference of the two views of a pair, and minimum difference of a view in between
         from both: 0 for equal images, 1 for nothing in common.
@@ -57,6 +57,7 @@ class Appearance:
         descriptors: Sequence[Float32],
         possible: Callable[[int, int], bool],
         known: Collection[tuple[int, int]] = (),
+        gain: Callable[[int, int], float] = lambda i, j: 0.0,
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Return pairs of views that look alike although the camera left in between.
 
@@ -68,17 +69,20 @@ class Appearance:
             Whether the trajectory allows that views i and j show the same place.
         known
             Pairs that are certain loops: none similar to them is returned.
+        gain
+            Information gain of a loop between views i and j.
 
         Returns
         -------
-        Positions (i, j), i < j, of the possible pairs and of the others, at most `pairs` of each,
-        the most similar first.
+        Positions (i, j), i < j, of the possible pairs and of the others, at most `pairs` of each:
+        those with the largest gain first, and of these the most similar.
         """
         chosen: list[tuple[int, int]] = []
         refused: list[tuple[int, int]] = []
         if self.pairs == 0 or len(descriptors) < 3:
             return chosen, refused
-        for _, i, j in self._most_alike(descriptors):
+        alike = self._most_alike(descriptors)
+        for _, i, j in sorted(alike, key=lambda pair: -gain(*pair[1:])):
             mine = chosen if possible(i, j) else refused
             full = len(mine) >= self.pairs or _similar(i, j, mine) >= _MAX_SIMILAR
             if not full and not _similar(i, j, known):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float32, Float64
 from tofuse.bounds import Bounded, Bounds
@@ -70,6 +71,8 @@ _MIN_OVERLAP = 0.3
 _LEARN = 40
 # Candidates are selected anew if poses have moved by more: fraction of the depth plus rad.
 _MAX_MOTION = 0.1
+# Approximate accuracy of a loop, m.
+_LOOP_SIGMA_M = 0.02
 # Number of views that the limits on searches refer to.
 _VIEWS_PER_BUDGET = 200
 
@@ -99,15 +102,21 @@ class Revisits(Bounded, LoopDetector):
     its margin is large enough or another loop nearby is consistent with it: places may look alike,
     but not twice in the same way.
 
+    Of more candidates than limits allow, those are tried first whose relative position the
+    trajectory determines least: loops with the largest information gain (Ila, Porta and
+    Andrade-Cetto, "Information-based compact pose SLAM", 2010). Otherwise the laps of a camera that
+    agree already, and so overlap most, would displace the one that does not.
+
     Attributes
     ----------
     overlap
         Minimum overlap of a candidate, as a fraction of its pixels.
     per_view
-        Maximum number of candidates of each view, those with the largest overlap.
+        Maximum number of candidates of each view with the largest overlap; unless it is 0, the one
+        with the largest gain is another candidate.
     searches
-        Maximum number of rejected candidates that are searched, those with the largest overlap,
-        for each 200 views.
+        Maximum number of rejected candidates that are searched for each 200 views: those with the
+        largest gain, then overlap.
     similar_pairs
         Maximum number of pairs with similar descriptors, wherever they are on the trajectory, that
         are searched for each 200 views; 0 disables place recognition by appearance.
@@ -140,7 +149,12 @@ class Revisits(Bounded, LoopDetector):
         return _RevisitLoops(self, given, views, search or SearchOptions(), spacing, appearance)
 
     def candidates(
-        self, views: Sequence[Outlined], poses: Float64, *, first: int = 0
+        self,
+        views: Sequence[Outlined],
+        poses: Float64,
+        *,
+        first: int = 0,
+        variance: Float64 | None = None,
     ) -> list[tuple[int, int]]:
         """Return the positions (i, j), i < j, of the views that may form a loop.
 
@@ -152,7 +166,11 @@ class Revisits(Bounded, LoopDetector):
             (N, 4, 4) T_world_camera.
         first
             Smallest j.
+        variance
+            (N,) of the positions, m^2, if it is known: see `information_gain`.
         """
+        if variance is None:
+            variance = np.zeros(len(views))
         pairs, overlap_of = overlaps(views, poses, _MAX_APART, first=first)
         found: list[tuple[int, int]] = []
         ends = np.searchsorted(pairs[:, 1], np.arange(len(views) + 1))
@@ -164,9 +182,26 @@ class Revisits(Bounded, LoopDetector):
             seen[partners], seen[j] = True, True
             start = int(np.flatnonzero(~seen)[-1]) if not seen.all() else -1
             again = (partners < start) & (overlap >= self.overlap)
-            order = np.argsort(-overlap[again], kind="stable")[: self.per_view]
-            found += [(int(i), j) for i in np.sort(partners[again][order])]
+            if not again.any():
+                continue
+            partners, overlap = partners[again], overlap[again]
+            chosen = np.argsort(-overlap, kind="stable")[: self.per_view]
+            gain = information_gain(variance[partners], variance[j])
+            largest = np.lexsort((-overlap, -gain))[: min(1, self.per_view)]
+            found += [(int(i), j) for i in partners[np.union1d(chosen, largest)]]
         return found
+
+
+def information_gain(variance: ArrayLike, other: ArrayLike) -> Float64:
+    """Return the information gain of loops between views, in bits per direction.
+
+    It is the logarithm of the uncertainty of their relative position, by the `variance` of both
+    positions in the trajectory, in m^2, relative to the accuracy of a loop; rounded, as it is not
+    known better. Along a chain of measurements, the variance of the relative position is the
+    difference of both.
+    """
+    relative = np.abs(np.subtract(variance, other)) / _LOOP_SIGMA_M**2
+    return np.asarray(np.round(0.5 * np.log2(1 + relative)), np.float64)
 
 
 class _RevisitLoops(Loops):
@@ -257,16 +292,22 @@ class _RevisitLoops(Loops):
         self._learn(posed)
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
         seen = self._views(posed)
-        pairs = self._options.candidates(seen, at)
+        variance = [np.trace(self._covariances[p.index][:3, :3]) for p in posed]
+        variance = np.nan_to_num(np.array(variance))  # unknown where not constrained
+        pairs = self._options.candidates(seen, at, variance=variance)
         found = self._confirm_all([(posed[i], posed[j]) for i, j in pairs])
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
+        variance_of = dict(zip(by_index, variance, strict=True))
         rejected = sorted(
             (pair for pair, loop in closed.items() if not loop.record.accepted),
-            key=lambda pair: -(closed[pair].record.overlap or 0.0),
+            key=lambda pair: (
+                -information_gain(*(variance_of[k] for k in pair)),
+                -(closed[pair].record.overlap or 0.0),
+            ),
         )
         times = max(1, -(-len(posed) // _VIEWS_PER_BUDGET))
-        alike, impossible = self._alike(posed, seen, closed, times)
+        alike, impossible = self._alike(posed, seen, variance, closed, times)
         closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
         asked = [*rejected[: self._options.searches * times], *alike]
         closed.update(self._searched(asked, by_index, closed, alike))
@@ -350,6 +391,7 @@ class _RevisitLoops(Loops):
         self,
         posed: Sequence[View],
         seen: Sequence[_Entry],
+        variance: Float64,
         closed: Mapping[tuple[int, int], ClosedLoop],
         times: int,
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -361,6 +403,7 @@ class _RevisitLoops(Loops):
             [s.descriptor for s in seen],
             lambda i, j: self._plausible(posed[i], posed[j], np.eye(4), ALIKE),
             known,
+            lambda i, j: float(information_gain(variance[i], variance[j])),
         )
         indices = [[(posed[i].index, posed[j].index) for i, j in pairs] for pairs in both]
         return (
