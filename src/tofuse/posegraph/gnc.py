@@ -50,28 +50,31 @@ def truncated_least_squares(
     """
     found = GraduatedNonConvexity(problem, poses, loop, settings)
     if found.fits_all():
-        found.select()
-        return found
-    again = chordal_poses(
+        return found.select()
+    chordal = _from_chordal(problem, poses, loop, settings)
+    if chordal is not None and chordal.fits_all():
+        return chordal.select()
+    found.select()
+    if chordal is not None:
+        chordal.select()
+        if chordal.objective() < (1 - _MIN_SAVING) * found.objective():
+            found = chordal
+    given = GraduatedNonConvexity(problem, poses, loop, settings)
+    return given.keep_start() if given.objective() <= found.objective() else found
+
+
+def _from_chordal(
+    problem: Problem, poses: Float64, loop: Bool, settings: Settings
+) -> GraduatedNonConvexity | None:
+    """Start from chordal initialisation; the objective of the given poses is logged first."""
+    start = chordal_poses(
         poses, problem.pairs, problem.measurements, problem.information, problem.fixed
     )
-    if again is not None:
-        other = GraduatedNonConvexity(problem, again, loop, settings)
-        other.descent.log[:0] = found.descent.log[:1]  # of the given poses
-        if other.fits_all():
-            other.select()
-            return other
-        found.select()
-        other.select()
-        if other.objective() < (1 - _MIN_SAVING) * found.objective():
-            found = other
-    else:
-        found.select()
-    given = GraduatedNonConvexity(problem, poses, loop, settings)
-    if given.objective() <= found.objective():
-        given.keep_start()
-        return given
-    return found
+    if start is None:
+        return None
+    chordal = GraduatedNonConvexity(problem, start, loop, settings)
+    chordal.descent.log[:0] = Descent(problem, problem.start(poses)).log
+    return chordal
 
 
 class GraduatedNonConvexity:
@@ -95,10 +98,11 @@ class GraduatedNonConvexity:
         squares = np.where(self.loop, np.minimum(x, self.settings.gate), x).sum()
         return float(squares) + self.problem.gravity_cost(self.descent.down)
 
-    def keep_start(self) -> None:
+    def keep_start(self) -> GraduatedNonConvexity:
         """Keep the poses of the start; loops that contradict them are rejected."""
         self.limit = np.where(self.loop, self.settings.gate, np.inf)
         self.weights = np.where(self.descent.chi2 > self.limit, 0.0, 1.0)
+        return self
 
     def fits_all(self) -> bool:
         """Solve with all loops; whether each of them fits."""
@@ -106,12 +110,12 @@ class GraduatedNonConvexity:
         x = self.descent.chi2[self.loop]
         return self.converged and bool((x <= self._gate(x)).all())
 
-    def select(self) -> None:
+    def select(self) -> GraduatedNonConvexity:
         """Select loops and solve for the poses, after `fits_all`."""
         loop, descent = self.loop, self.descent
         plain, everything = descent.state(), float(descent.chi2.sum())
         if everything <= self.settings.gate:
-            return  # no single loop can exceed the gate
+            return self  # no single loop can exceed the gate
         gate = self._gate(descent.chi2[loop])
         if not (descent.chi2[loop] <= gate).all():
             self._graduate()
@@ -121,14 +125,15 @@ class GraduatedNonConvexity:
         if len(loop) <= _DENSE * len(self.problem.fixed):
             self.converged = self._unmask(self.converged)
         if (self.weights == 1).all():
-            return
+            return self
         limit = np.where(loop, gate, np.inf)
         if np.minimum(descent.chi2, limit).sum() > (1 - _MIN_SAVING) * everything:
             descent.restore(plain)
             self.weights = np.ones(len(loop))
             self.converged = True
-            return
-        self.limit = limit
+        else:
+            self.limit = limit
+        return self
 
     def _with(self, weights: Float64) -> bool:
         settings = self.settings
