@@ -226,10 +226,12 @@ def test_foreign_result_is_not_replaced(folder: BatchFolder) -> None:
 @pytest.mark.parametrize(
     "damage", ["{", "[]", "null", '{"key": "", "state": "odd"}', '{"key": 1, "state": "done"}']
 )
-def test_damaged_record_is_ignored(damage: str, folder: BatchFolder) -> None:
+def test_damaged_record_is_named_or_replaced(damage: str, folder: BatchFolder) -> None:
     run(folder, Scripted())
     (folder.jobs / "a.json").write_text(damage)
     assert folder.record(JOBS[0]) is None
+    with pytest.raises(OutputError, match=r"a\.json, is damaged"):
+        pending(JOBS, folder, overwrite=False)
     assert pending(JOBS, folder, overwrite=True) == [JOBS[0]]
 
 

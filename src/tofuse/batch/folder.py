@@ -179,8 +179,11 @@ class BatchFolder:
         if all(p.name.startswith(_UNFINISHED) for p in folder.iterdir()):
             return
         if record is None or record.key != job.key(self.path):
+            damaged = record is None and self._record(job).exists()
             raise OutputError(
-                "contains the result of another recording, or of other options",
+                f"contains a result whose record, {self._record(job)}, is damaged"
+                if damaged
+                else "contains the result of another recording, or of other options",
                 where=folder,
                 remedy="pass --overwrite to replace it, or another --out",
             )
