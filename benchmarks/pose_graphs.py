@@ -29,6 +29,7 @@ from tofuse.evaluation.trajectory import align
 from tofuse.geometry import quaternion, se3
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios
+from tofuse.lab.simulation.laps import drifting_laps
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.charts import Quaternion
 from tofuse.posegraph.g2o import read_g2o, write_g2o
@@ -293,9 +294,12 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
         graphs = list(options.graphs)
-        for kind in ("sphere", "torus") if options.simulated else ():
-            graphs.append(Path(folder) / f"{kind}, simulated.g2o")
-            write_g2o(graphs[-1], simulated(kind))
+        if options.simulated:
+            laps, _ = drifting_laps(30, 12, 60.0)
+            made = {"sphere": simulated("sphere"), "torus": simulated("torus"), "laps": laps}
+            for kind, graph in made.items():
+                graphs.append(Path(folder) / f"{kind}, simulated.g2o")
+                write_g2o(graphs[-1], graph)
         if graphs:
             compare_with_gtsam(graphs)
             print()

@@ -7,6 +7,7 @@ import pytest
 
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
+from tofuse.lab.simulation.laps import drifting_laps
 from tofuse.posegraph.chordal import chordal_poses
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.gnc import GraduatedNonConvexity
@@ -20,44 +21,6 @@ SOMEWHERE = se3.exp(np.array([3.0, -1, 2, 0.5, -2, 1]))
 
 def first_only(n: int) -> Bool:
     return np.arange(n) == 0
-
-
-def laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, Float64]:
-    """A camera that walks in circles: poses of odometry with drift, and the true poses.
-
-    One step of each lap is uncertain, and wrong by 1.1 m and some degrees. Loops to earlier laps
-    are accurate: half of them, of views from the same pose, to 0.1 mm.
-    """
-    rng = np.random.default_rng(0)
-    turn = np.zeros((per_lap, 6))
-    turn[:, 5] = 2 * np.pi * np.arange(per_lap) / per_lap
-    lap = se3.exp(turn)
-    lap[:, :3, 3] = 2.0 * np.stack([np.cos(turn[:, 5]), np.sin(turn[:, 5]), 0 * turn[:, 5]], 1)
-    n = count * per_lap
-    truth = lap[np.arange(n) % per_lap]
-    wrong = np.arange(n - 1) % per_lap == per_lap // 3
-    noise = rng.normal(size=(n - 1, 6)) * 2e-3
-    noise[wrong] = [0.6, 0, 0.9, 0, np.radians(degrees), 0]
-    steps = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(noise)
-    poses = [truth[0]]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-
-    j = np.arange(per_lap, n, per_lap // 4)
-    i = j - per_lap * np.array([rng.integers(1, min(k, 12) + 1) for k in j // per_lap])
-    sigma = np.where(rng.random(len(j)) < 0.5, 3e-3, 1e-4)
-    loops = se3.inverse(truth[i]) @ truth[j]
-    loops = loops @ se3.exp(rng.normal(size=(len(j), 6)) * sigma[:, None])
-    sigma = np.concatenate([np.where(wrong, 0.3, 2e-3), sigma])
-    graph = PoseGraph(
-        np.arange(n),
-        se3.orthonormalise(np.array(poses)),
-        np.concatenate([np.stack([np.arange(n - 1), np.arange(1, n)], 1), np.stack([i, j], 1)]),
-        np.concatenate([steps, loops]),
-        np.eye(6) / sigma[:, None, None] ** 2,
-        np.arange(len(sigma)) >= n - 1,
-    )
-    return graph, truth
 
 
 def chordal(graph: PoseGraph, fixed: Bool) -> Float64 | None:
@@ -128,7 +91,7 @@ def test_nothing_to_solve():
 
 
 def test_optimiser_finds_the_minimum_where_descent_from_odometry_does_not():
-    graph, truth = laps(30, 12, 60.0)
+    graph, truth = drifting_laps(30, 12, 60.0)
     n = len(truth)
     problem = Problem(
         graph.edges, graph.measurements, graph.information, first_only(n), None, "tangent"
