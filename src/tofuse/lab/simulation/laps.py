@@ -43,7 +43,7 @@ def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, 
         poses.append(poses[-1] @ step)
 
     j = np.arange(per_lap, n, per_lap // 4)
-    i = j - per_lap * np.array([rng.integers(1, min(k, 12) + 1) for k in j // per_lap])
+    i = j - per_lap * np.array([rng.integers(1, min(k, 12) + 1) for k in (j // per_lap).tolist()])
     sigma = np.where(rng.random(len(j)) < 0.5, 3e-3, 1e-4)
     loops = se3.inverse(truth[i]) @ truth[j]
     loops = loops @ se3.exp(rng.normal(size=(len(j), 6)) * sigma[:, None])
