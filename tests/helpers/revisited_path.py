@@ -90,11 +90,11 @@ def turn():
     return frames, truth, np.stack(start)
 
 
-def pushed(options, frames, poses, given=()):
+def pushed(options, frames, poses, given=(), covariances=None):
     store = ViewStore(ALL)
     loops = options.start(0, given, store, spacing=ALL)
     for frame, T in zip(frames, poses, strict=True):
         store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
         loops.push(frame, T)
     known = {f.index: T for f, T in zip(frames, poses, strict=True)}
-    return loops.finish(known, dict.fromkeys(known, np.zeros((6, 6))))
+    return loops.finish(known, covariances or dict.fromkeys(known, np.zeros((6, 6))))

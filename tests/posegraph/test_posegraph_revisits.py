@@ -12,8 +12,9 @@ from corner_views import corner
 from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
 from tofuse.posegraph import revisits
+from tofuse.posegraph.information_gain import InformationGain
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.posegraph.revisits import Revisits, information_gain
+from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import KeptView, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import ACCEPTED
@@ -60,22 +61,41 @@ def test_loop_to_the_least_certain_view_is_tried_as_well():
     )
     options = SurfaceOptions(radii=(2,))
     views = [KeptView.of(prepare_view(corner(T), options), 600) for T in truth]
-    assert Revisits(per_view=1).candidates(views, poses, first=6) == [(4, 6), (5, 7)]
+    found = Revisits(per_view=1).candidates(views, poses, first=6)
+    assert list(found) == [(4, 6), (5, 7)]
+    assert all(overlap > 0.9 for overlap in found.values())
     variance = np.array([0.0, 0.0, 0.3, 0.3, 1.0, 1.0, 1.1, 1.1])
-    found = Revisits(per_view=1).candidates(views, poses, first=6, variance=variance)
-    assert found == [(0, 6), (4, 6), (1, 7), (5, 7)]
+    found = Revisits(per_view=1).candidates(views, poses, first=6, gain=InformationGain(variance))
+    assert list(found) == [(0, 6), (4, 6), (1, 7), (5, 7)]
+    assert found[0, 6] < found[4, 6]
     # Differences within the accuracy of a loop don't count.
-    found = Revisits(per_view=1).candidates(views, poses, first=6, variance=1e-5 * variance)
-    assert found == [(4, 6), (5, 7)]
-    assert Revisits(per_view=0).candidates(views, poses, variance=variance) == []
+    found = Revisits(per_view=1).candidates(
+        views, poses, first=6, gain=InformationGain(1e-5 * variance)
+    )
+    assert list(found) == [(4, 6), (5, 7)]
+    assert Revisits(per_view=0).candidates(views, poses) == {}
 
 
-def test_information_gain_is_that_of_the_relative_position():
-    assert information_gain(4.0, 4.0) == 0
-    assert information_gain(0.0, 4.0) == information_gain(4.0, 0.0)
-    of_others = information_gain(np.array([0.0, 3.0]), 4.0)
-    # Half the standard deviation, a bit less.
-    assert of_others[0] - of_others[1] == 1
+@pytest.mark.parametrize(("succeeding", "asked"), [(0, 2), (1, 3), (9, 4)])
+def test_failed_searches_are_limited(monkeypatch, succeeding, asked):
+    """Of four rejected candidates, each of which gains information."""
+    monkeypatch.setattr(revisits, "register_near", lambda *_: None)
+    searched = []
+
+    def scripted(source, target, usual, options):
+        searched.append(len(searched))
+        return registered(np.eye(4), 1.0 if len(searched) <= succeeding else 0.1)
+
+    monkeypatch.setattr(revisits, "register_anywhere", scripted)
+    yaw = [0.0, 1.2, 2.4, 3.6] * 2
+    poses = se3.exp(np.array([[0, 0, 0, 0, a, 0] for a in yaw]))
+    frames = [replace(corner(poses[0]), index=k) for k in range(8)]
+    variances = {k: np.eye(6) * k for k in range(8)}
+    found = pushed(
+        Revisits(per_view=1, searches=2, similar_pairs=0), frames, poses, covariances=variances
+    )
+    assert len(searched) == asked
+    assert sum(c.record.accepted for c in found) == min(succeeding, 4)
 
 
 def test_view_of_another_place_is_rejected_with_reason(turn):

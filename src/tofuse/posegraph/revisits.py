@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float32, Float64
 from tofuse.bounds import Bounded, Bounds
@@ -18,6 +17,7 @@ from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.covariances import relative_covariance
 from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.information_gain import InformationGain
 from tofuse.posegraph.loops import (
     ClosedLoop,
     GivenLoop,
@@ -71,8 +71,6 @@ _MIN_OVERLAP = 0.3
 _LEARN = 40
 # Candidates are selected anew if poses have moved by more: fraction of the depth plus rad.
 _MAX_MOTION = 0.1
-# Approximate accuracy of a loop, m.
-_LOOP_SIGMA_M = 0.02
 # Number of views that the limits on searches refer to.
 _VIEWS_PER_BUDGET = 200
 
@@ -102,10 +100,9 @@ class Revisits(Bounded, LoopDetector):
     its margin is large enough or another loop nearby is consistent with it: places may look alike,
     but not twice in the same way.
 
-    Of more candidates than limits allow, those are tried first whose relative position the
-    trajectory determines least: loops with the largest information gain (Ila, Porta and
-    Andrade-Cetto, "Information-based compact pose SLAM", 2010). Otherwise the laps of a camera that
-    agree already, and so overlap most, would displace the one that does not.
+    Of more candidates than limits allow, those with the largest information gain are tried first
+    (`information_gain`). Otherwise the laps of a camera that agree already, and so overlap most,
+    would displace the one that does not. Searches go on while they succeed and gain something.
 
     Attributes
     ----------
@@ -115,8 +112,8 @@ class Revisits(Bounded, LoopDetector):
         Maximum number of candidates of each view with the largest overlap; unless it is 0, the one
         with the largest gain is another candidate.
     searches
-        Maximum number of rejected candidates that are searched for each 200 views: those with the
-        largest gain, then overlap.
+        Maximum number of rejected candidates that are searched in vain, for each 200 views: those
+        with the largest gain, then overlap.
     similar_pairs
         Maximum number of pairs with similar descriptors, wherever they are on the trajectory, that
         are searched for each 200 views; 0 disables place recognition by appearance.
@@ -154,9 +151,9 @@ class Revisits(Bounded, LoopDetector):
         poses: Float64,
         *,
         first: int = 0,
-        variance: Float64 | None = None,
-    ) -> list[tuple[int, int]]:
-        """Return the positions (i, j), i < j, of the views that may form a loop.
+        gain: InformationGain | None = None,
+    ) -> dict[tuple[int, int], float]:
+        """Return the overlaps of the views that may form a loop, by their positions (i, j), i < j.
 
         Parameters
         ----------
@@ -166,13 +163,12 @@ class Revisits(Bounded, LoopDetector):
             (N, 4, 4) T_world_camera.
         first
             Smallest j.
-        variance
-            (N,) of the positions, m^2, if it is known: see `information_gain`.
+        gain
+            Information gain of loops between the views, if it is known.
         """
-        if variance is None:
-            variance = np.zeros(len(views))
+        gain = gain or InformationGain(np.zeros(len(views)))
         pairs, overlap_of = overlaps(views, poses, _MAX_APART, first=first)
-        found: list[tuple[int, int]] = []
+        found: dict[tuple[int, int], float] = {}
         ends = np.searchsorted(pairs[:, 1], np.arange(len(views) + 1))
         for j in range(first, len(views)):
             mine = slice(ends[j], ends[j + 1])
@@ -186,22 +182,10 @@ class Revisits(Bounded, LoopDetector):
                 continue
             partners, overlap = partners[again], overlap[again]
             chosen = np.argsort(-overlap, kind="stable")[: self.per_view]
-            gain = information_gain(variance[partners], variance[j])
-            largest = np.lexsort((-overlap, -gain))[: min(1, self.per_view)]
-            found += [(int(i), j) for i in partners[np.union1d(chosen, largest)]]
+            largest = np.lexsort((-overlap, -gain.of(partners, j)))[: min(1, self.per_view)]
+            both = np.union1d(chosen, largest)
+            found |= {(int(partners[k]), j): float(overlap[k]) for k in both}
         return found
-
-
-def information_gain(variance: ArrayLike, other: ArrayLike) -> Float64:
-    """Return the information gain of loops between views, in bits per direction.
-
-    It is the logarithm of the uncertainty of their relative position, by the `variance` of both
-    positions in the trajectory, in m^2, relative to the accuracy of a loop; rounded, as it is not
-    known better. Along a chain of measurements, the variance of the relative position is the
-    difference of both.
-    """
-    relative = np.abs(np.subtract(variance, other)) / _LOOP_SIGMA_M**2
-    return np.asarray(np.round(0.5 * np.log2(1 + relative)), np.float64)
 
 
 class _RevisitLoops(Loops):
@@ -230,6 +214,7 @@ class _RevisitLoops(Loops):
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
         self._path_length: dict[int, Float64] = {}
+        self._variance: dict[int, float] = {}  # of the positions by odometry, m^2
         # Of an earlier `finish`, at other poses.
         self._closed: dict[tuple[int, int], ClosedLoop] = {}
 
@@ -292,31 +277,51 @@ class _RevisitLoops(Loops):
         self._learn(posed)
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
         seen = self._views(posed)
-        variance = [np.trace(self._covariances[p.index][:3, :3]) for p in posed]
-        variance = np.nan_to_num(np.array(variance))  # unknown where not constrained
-        pairs = self._options.candidates(seen, at, variance=variance)
-        found = self._confirm_all([(posed[i], posed[j]) for i, j in pairs])
+        place = {p.index: k for k, p in enumerate(posed)}
+        known_loops = self._confirmed | self._closed
+        gain = self._gain(posed, known_loops)
+        overlap = self._options.candidates(seen, at, gain=gain)
+        found = self._confirm_all([(posed[i], posed[j]) for i, j in overlap])
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
-        variance_of = dict(zip(by_index, variance, strict=True))
-        rejected = sorted(
-            (pair for pair, loop in closed.items() if not loop.record.accepted),
-            key=lambda pair: (
-                -information_gain(*(variance_of[k] for k in pair)),
-                -(closed[pair].record.overlap or 0.0),
-            ),
-        )
+        rejected = []
+        for (i, j), found_loop in closed.items():
+            if not found_loop.record.accepted:
+                rejected.append((place[i], place[j]))
+            elif (i, j) not in known_loops:
+                gain.add(place[i], place[j])
         times = max(1, -(-len(posed) // _VIEWS_PER_BUDGET))
-        alike, impossible = self._alike(posed, seen, variance, closed, times)
+        alike, impossible = self._alike(posed, seen, gain, closed, times)
         closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
-        asked = [*rejected[: self._options.searches * times], *alike]
-        closed.update(self._searched(asked, by_index, closed, alike))
+        failures = self._options.searches * times
+        chosen = _largest_gain(rejected, overlap, gain, failures)
+        while chosen or alike:
+            asked = [*((posed[i].index, posed[j].index) for i, j in chosen), *alike]
+            closed.update(self._searched(asked, by_index, closed, alike))
+            failures -= sum(not closed[p].record.accepted for p in asked if p not in alike)
+            rejected = [p for p in rejected if p not in chosen]
+            chosen = _largest_gain(rejected, overlap, gain, failures, least=1.0)
+            alike = []
         self._closed = {p: c for p, c in closed.items() if c.record.accepted}
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
                 loop, known, lambda i, j: self._confirm(known[i], known[j])
             )
         return in_order(closed)
+
+    def _gain(
+        self, posed: Sequence[View], known: Mapping[tuple[int, int], ClosedLoop]
+    ) -> InformationGain:
+        """Information gain of loops between the views, given the `known` ones."""
+        for p in posed:  # the first covariances are those of odometry; NaN where not constrained
+            variance = np.trace(self._covariances[p.index][:3, :3])
+            self._variance.setdefault(p.index, float(np.nan_to_num(variance)))
+        gain = InformationGain(np.array([self._variance[p.index] for p in posed]))
+        place = {p.index: k for k, p in enumerate(posed)}
+        for (i, j), loop in known.items():
+            if loop.record.accepted and i in place and j in place:
+                gain.add(place[i], place[j])
+        return gain
 
     def _views(self, posed: Sequence[View]) -> list[_Entry]:
         """The entries of these views, each computed once."""
@@ -391,7 +396,7 @@ class _RevisitLoops(Loops):
         self,
         posed: Sequence[View],
         seen: Sequence[_Entry],
-        variance: Float64,
+        gain: InformationGain,
         closed: Mapping[tuple[int, int], ClosedLoop],
         times: int,
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -403,7 +408,7 @@ class _RevisitLoops(Loops):
             [s.descriptor for s in seen],
             lambda i, j: self._plausible(posed[i], posed[j], np.eye(4), ALIKE),
             known,
-            lambda i, j: float(information_gain(variance[i], variance[j])),
+            lambda i, j: float(gain.of(i, j)),
         )
         indices = [[(posed[i].index, posed[j].index) for i, j in pairs] for pairs in both]
         return (
@@ -517,6 +522,30 @@ def register_anywhere(
 ) -> Registration | None:
     """Register two views by exhaustive search, without a guess."""
     return register_pair(source, target, usual=usual, options=options, rival_m=DISTINCT_M)
+
+
+def _largest_gain(
+    pairs: Sequence[tuple[int, int]],
+    overlap: Mapping[tuple[int, int], float],
+    gain: InformationGain,
+    count: int,
+    *,
+    least: float = 0.0,
+) -> list[tuple[int, int]]:
+    """Choose pairs of views, each with the largest gain given those before, then overlap.
+
+    `least` is the smallest gain.
+    """
+    left = list(pairs)
+    chosen: list[tuple[int, int]] = []
+    while left and len(chosen) < count:
+        gains = gain.of(*np.transpose(left))
+        best = max(range(len(left)), key=lambda k: (gains[k], overlap[left[k]]))
+        if gains[best] < least:
+            break
+        chosen.append(left.pop(best))
+        gain.add(*chosen[-1])
+    return chosen
 
 
 def _path_lengths(poses: Mapping[int, Float64]) -> dict[int, Float64]:
