@@ -267,9 +267,8 @@ class _RevisitLoops(Loops):
     ) -> list[ClosedLoop]:
         """See `Loops.finish`. Given loops replace detected ones."""
         posed, path = self._chosen.of(poses), _path_lengths(poses)
-        by_index = {p.index: p for p in posed}
         known = {p.index: p for p in self._store.of(poses)}
-        views = by_index.keys() | known.keys()
+        views = {p.index for p in posed} | known.keys()
         self._poses = {index: poses[index].copy() for index in views}
         self._covariances = {index: covariances[index].copy() for index in views}
         self._path_length = {index: path[index].copy() for index in views}
@@ -277,31 +276,12 @@ class _RevisitLoops(Loops):
         self._learn(posed)
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
         seen = self._views(posed)
-        place = {p.index: k for k, p in enumerate(posed)}
-        known_loops = self._confirmed | self._closed
-        gain = self._gain(posed, known_loops)
+        gain = self._gain(posed, self._confirmed | self._closed)
         overlap = self._options.candidates(seen, at, gain=gain)
         found = self._confirm_all([(posed[i], posed[j]) for i, j in overlap])
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
-        rejected = []
-        for (i, j), found_loop in closed.items():
-            if not found_loop.record.accepted:
-                rejected.append((place[i], place[j]))
-            elif (i, j) not in known_loops:
-                gain.add(place[i], place[j])
-        times = max(1, -(-len(posed) // _VIEWS_PER_BUDGET))
-        alike, impossible = self._alike(posed, seen, gain, closed, times)
-        closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
-        failures = self._options.searches * times
-        chosen = _largest_gain(rejected, overlap, gain, failures)
-        while chosen or alike:
-            asked = [*((posed[i].index, posed[j].index) for i, j in chosen), *alike]
-            closed.update(self._searched(asked, by_index, closed, alike))
-            failures -= sum(not closed[p].record.accepted for p in asked if p not in alike)
-            rejected = [p for p in rejected if p not in chosen]
-            chosen = _largest_gain(rejected, overlap, gain, failures, least=1.0)
-            alike = []
+        self._search_rejected(posed, seen, overlap, closed)
         self._closed = {p: c for p, c in closed.items() if c.record.accepted}
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
@@ -309,10 +289,38 @@ class _RevisitLoops(Loops):
             )
         return in_order(closed)
 
+    def _search_rejected(
+        self,
+        posed: Sequence[View],
+        seen: Sequence[_Entry],
+        overlap: Mapping[tuple[int, int], float],
+        closed: dict[tuple[int, int], ClosedLoop],
+    ) -> None:
+        """Search rejected candidates and views that look alike; `closed` receives the results.
+
+        `overlap` is that of the candidates, by the positions of the views.
+        """
+        gain = self._gain(posed, closed)
+        times = max(1, -(-len(posed) // _VIEWS_PER_BUDGET))
+        alike, impossible = self._alike(posed, seen, gain, closed, times)
+        closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
+        frames = {pair: (posed[pair[0]].index, posed[pair[1]].index) for pair in overlap}
+        rejected = [pair for pair in overlap if not closed[frames[pair]].record.accepted]
+        failures = self._options.searches * times
+        chosen = _largest_gain(rejected, overlap, gain, failures)
+        by_index = {p.index: p for p in posed}
+        while chosen or alike:
+            asked = [frames[pair] for pair in chosen]
+            closed |= self._searched([*asked, *alike], by_index, closed, alike)
+            failures -= sum(not closed[pair].record.accepted for pair in asked)
+            rejected = [pair for pair in rejected if pair not in chosen]
+            chosen = _largest_gain(rejected, overlap, gain, failures, least=1.0)
+            alike = []
+
     def _gain(
         self, posed: Sequence[View], known: Mapping[tuple[int, int], ClosedLoop]
     ) -> InformationGain:
-        """Information gain of loops between the views, given the `known` ones."""
+        """Return the information gain of loops between the views, given the `known` ones."""
         for p in posed:  # the first covariances are those of odometry; NaN where not constrained
             variance = np.trace(self._covariances[p.index][:3, :3])
             self._variance.setdefault(p.index, float(np.nan_to_num(variance)))
