@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from tofuse.arrays import Float64
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation import mesh as meshes
@@ -22,7 +22,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.record import Plan
 from tofuse.lab.simulation.scenes.assembly import Assembly, placed, shell
-from tofuse.lab.simulation.scenes.furniture import chair
+from tofuse.lab.simulation.scenes.furniture import chair, plant
 from tofuse.lab.simulation.texture import Material
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
@@ -43,6 +43,8 @@ class Unusual:
     ----------
     scene, path
         Functions of the seed.
+    range_m
+        Depth beyond is missing.
     """
 
     scene: Callable[[int], scenes.Scene]
@@ -50,6 +52,7 @@ class Unusual:
     camera: CameraModel
     frames: int = 80
     rate_hz: float = 15.0
+    range_m: float = np.inf
 
 
 def pinhole(model: str, width: int, height: int, degrees: float) -> CameraModel:
@@ -193,6 +196,84 @@ def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
         chair(assembly, THINGS[k], placed(at, rng.uniform(0, 6)))
 
 
+def _chair_alone(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add a chair, nothing else."""
+    chair(assembly, THINGS[2], placed((0.0, 0.0), 0.3))
+
+
+def _stairwell(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add stairs that wind around a column through four identical storeys of 2.88 m."""
+    height = 4 * 2.88
+    assembly.add(WALL, meshes.box_between((-0.25, -0.25, 0), (0.25, 0.25, height)))
+    for T in (placed((0, 0), k * np.pi / 2) for k in range(4)):
+        wall = meshes.quad((-1.3, 1.3, 0), (2.6, 0, 0), (0, 0, height))
+        assembly.add(WALL, wall.moved(T))
+    for k in range(64):
+        T = placed((0, 0), 2 * np.pi * k / 16)
+        step = meshes.box((1.3, 0.45, 0.18), (0.85, 0, 0.18 * k - 0.09))
+        assembly.add(WOOD, step.moved(T))
+    for k in range(4):
+        low = 2.88 * k
+        assembly.add(THINGS[1], meshes.box_between((1.2, -0.5, low), (1.3, 0.5, low + 2.0)))
+        assembly.add(THINGS[3], meshes.box_between((-1.3, 0.2, low + 2.1), (-1.15, 0.8, low + 2.9)))
+
+
+def _up_the_stairwell(t: float) -> Float64:
+    """Walk up, one storey in 8 s."""
+
+    def at(a: float) -> Float64:
+        return np.array([0.8 * np.cos(a), 0.8 * np.sin(a), 2.88 * a / (2 * np.pi) + 1.5])
+
+    a = 2 * np.pi * t / 8
+    return paths.look_at(at(a), at(a + 0.9) - [0, 0, 0.5])
+
+
+def _aisle(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add an aisle between identical bays of shelves, 1.2 m wide."""
+    assembly.add(GROUND, meshes.quad((-3, -1, 0), (16, 0, 0), (0, 2, 0)))
+    assembly.add(WALL, meshes.quad((13, -1, 0), (0, 2, 0), (0, 0, 3)))
+    boxes = rng.uniform(0.2, 0.4, (6, 3))
+    for side in (-1, 1):
+        for bay in range(12):
+            x = -2.4 + 1.2 * bay
+            post = meshes.box((0.06, 0.54, 2.4), (x + 0.03, side * 1.25, 1.2))
+            assembly.add(WOOD, post)
+            for level in range(3):
+                z = 0.1 + 0.8 * level
+                assembly.add(WOOD, meshes.box((1.2, 0.5, 0.04), (x + 0.6, side * 1.25, z)))
+                size = boxes[level + (0 if side < 0 else 3)]
+                item = meshes.box(size, (x + 0.6, side * 1.25, z + 0.02 + size[2] / 2))
+                assembly.add(THINGS[level], item)
+
+
+def _plants(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add a room full of plants."""
+    shell(assembly, (-3, -2.5, 0), (3, 2.5, 2.5), [WALL] * 4, GROUND, WHITE)
+    for k in range(10):
+        a = 2 * np.pi * k / 10
+        at = (2.0 * np.cos(a) + rng.uniform(-0.2, 0.2), 1.8 * np.sin(a) + rng.uniform(-0.2, 0.2))
+        plant(assembly, placed(at, rng.uniform(0, 6)), rng)
+
+
+def _tunnel(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add a round tunnel along x with a rib every 2 m."""
+    profile = [(1.2, 0.0)]
+    for k in range(12):
+        z = 2.0 * k
+        profile += [(1.2, z + 1.7), (1.1, z + 1.72), (1.1, z + 1.9), (1.2, z + 1.92)]
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    T[0, 3] = -4
+    assembly.add(WALL, meshes.inside_out(meshes.lathe(profile, 48)).moved(T))
+
+
+def _pausing(seed: int) -> Path:
+    """Stand still for 4 s, then walk."""
+    rng = np.random.default_rng([seed, 14])
+    walk = together(paths.camera_turn(EYE, 12.0), calm(rng))
+    return lambda t: walk(max(t - 4.0, 0.0))
+
+
 IFM = camera_model("ifm-o3r")
 SR4000 = camera_model("sr4000")
 EYE = paths.look_at((0, 0, 1.1), (1, 0.2, 0.9))
@@ -225,6 +306,15 @@ up_the_stairs = straight(paths.look_at((0, -1.5, 1.5), (0, 0.6, 0.7)), (0, 0.5, 
 through_the_yard = straight(paths.look_at((-2, 0, 1.4), (1, 0.3, 1.0)), (0.6, 0, 0))
 over_the_floor = straight(paths.look_at((-1.5, -0.1, 1.6), (-0.9, 0.1, 0.0)), (0.4, 0.1, 0))
 below_the_ceiling = straight(paths.look_at((-1.5, 0.2, 1.0), (-1.1, 0.4, 2.5)), (0.4, 0, 0))
+
+
+def along_the_aisle(t: float) -> Float64:
+    """Walk 7 m along the aisle and back within 20 s, looking ahead and a little to the side."""
+    u = paths.smooth_step(t / 10) - paths.smooth_step((t - 10) / 10)
+    return paths.look_at((7 * u, 0.05, 1.4), (7 * u + 1, 0.25, 1.2))
+
+
+through_the_tunnel = straight(paths.look_at((0, 0, 0.1), (1, 0.1, 0)), (0.6, 0, 0))
 UNUSUAL: dict[str, Unusual] = {
     "field of view of 30 degrees": Unusual(
         known("room"), _in_room(calm), pinhole("sr4000", 176, 144, 30)
@@ -233,6 +323,11 @@ UNUSUAL: dict[str, Unusual] = {
         known("room"), _in_room(calm), pinhole("ifm-o3r", 224, 172, 100)
     ),
     "80 x 60 pixels": Unusual(known("room"), _in_room(calm), pinhole("ifm-o3r", 80, 60, 60)),
+    "54 x 42 pixels": Unusual(known("room"), _in_room(calm), pinhole("ifm-o3r", 54, 42, 60)),
+    "32 x 24 pixels": Unusual(known("room"), _in_room(calm), pinhole("ifm-o3r", 32, 24, 60)),
+    "54 x 42 pixels, flat": Unusual(
+        known("flat"), _elsewhere_in_flat, pinhole("ifm-o3r", 54, 42, 60)
+    ),
     "5 Hz": Unusual(known("room"), _in_room(calm), IFM, 50, 5.0),
     "jerks of 12 degrees": Unusual(
         known("room"), _in_room(calm, partial(jerks, degrees=12.0)), IFM
@@ -248,7 +343,30 @@ UNUSUAL: dict[str, Unusual] = {
         built("chairs", _chairs), _fixed(over_the_floor), SR4000
     ),
     "ceiling": Unusual(known("room"), _fixed(below_the_ceiling), SR4000),
+    "chair in empty space": Unusual(
+        built("chair", _chair_alone), _fixed(around(1.5, 0.9, (0, 0, 0.5), 8.0)), IFM, 120
+    ),
+    "stairwell": Unusual(
+        built("stairwell", _stairwell), _fixed(_up_the_stairwell, 0.01), IFM, 240, 10.0
+    ),
+    "aisle of identical shelves": Unusual(
+        built("aisle", _aisle), _fixed(along_the_aisle), IFM, 200, 10.0
+    ),
+    "plants": Unusual(built("plants", _plants), _in_room(calm), IFM, 120),
+    "tunnel": Unusual(built("tunnel", _tunnel), _fixed(through_the_tunnel), IFM),
+    "range of 1.5 m": Unusual(known("room"), _in_room(calm), IFM, range_m=1.5),
+    "1 Hz": Unusual(known("room"), _in_room(calm), IFM, 13, 1.0),
+    "field of view of 120 degrees": Unusual(
+        known("room"), _in_room(calm), pinhole("azure-nfov", 320, 288, 120), 60, 10.0
+    ),
+    "pause": Unusual(known("room"), _pausing, IFM, 150),
+    "60 Hz": Unusual(known("room"), _in_room(calm), IFM, 300, 60.0),
 }
+
+
+def _within(depth: Float32, range_m: float) -> Float32:
+    """Return depth (H, W) without what is farther."""
+    return np.where(depth > range_m, np.float32(np.nan), depth)
 
 
 def record(one: Unusual, seed: int, *without: str) -> Recording:
@@ -267,7 +385,10 @@ def record(one: Unusual, seed: int, *without: str) -> Recording:
     frames = [
         replace(
             r.frame,
-            depth=corrected_depth(factory, r.frame.camera, r.frame.depth, r.frame.depth_kind),
+            depth=_within(
+                corrected_depth(factory, r.frame.camera, r.frame.depth, r.frame.depth_kind),
+                one.range_m,
+            ),
         )
         for r in made.frames(None)
     ]

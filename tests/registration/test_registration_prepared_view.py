@@ -455,7 +455,8 @@ def test_shared_error_is_downsampled_with_image() -> None:
     added = np.sqrt((view.plane_variance - plain.plane_variance) / 100)
     seen = view.planes[..., 3] > 0
     lengths = np.sqrt(1 + (view.rays**2).sum(-1))
-    wanted = shared[::2, ::2] / lengths * view.planes[..., 3] ** 2
+    halved = np.sqrt((shared**2).reshape(36, 2, 44, 2).mean(axis=(1, 3)))
+    wanted = halved / lengths * view.planes[..., 3] ** 2
     np.testing.assert_allclose(added[seen], wanted[seen], rtol=0.15)
 
 
@@ -500,3 +501,14 @@ def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
     sigma = np.sqrt(more.plane_variance[6:-6][new]) * truth[6:-6][new] ** 2
     assert 0.5 < np.std(off / sigma) < 1.6
     assert np.median(sigma) > 1.2 * np.median(np.sqrt(view.plane_variance[before.nonzero()]) * 4)
+
+
+def test_windows_are_smaller_in_coarse_images():
+    fine, coarse = OPTIONS.for_image(0.005), OPTIONS.for_image(0.02)
+    assert fine == OPTIONS
+    assert coarse.radii == (1, 2)
+
+
+def test_windows_are_small_where_few_pixels_determine_a_slope():
+    assert OPTIONS.for_image(0.005, noise=0.002).radii == OPTIONS.radii
+    assert OPTIONS.for_image(0.01, noise=0.002).radii == OPTIONS.smoothed.radii

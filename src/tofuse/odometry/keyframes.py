@@ -45,7 +45,7 @@ class Keyframes(Bounded, Odometry):
     guess: Guess = "previous"
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
     keyframe_distance: Annotated[float, Bounds(0, exclusive=True)] = 0.1
-    minimum_points: Annotated[int, Bounds(1)] = 300
+    minimum_points: Annotated[int, Bounds(1)] = 100
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 

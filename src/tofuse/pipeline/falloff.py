@@ -52,8 +52,9 @@ _PHOTOMETRIC = replace(_GEOMETRIC, photometric=True)
 _MAX_ROUNDS, _CONVERGED = 5, 0.1
 # Corresponding points are within this distance of the surface: m, plus a fraction of the depth.
 _NEAR_M, _NEAR = 0.01, 0.01
-# Minimum numbers of points of a pair and of pairs, and the significance level.
-_MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 300, 3, 0.01
+# Minimum numbers of points of a pair (few, as pairs are weighted by their information, and some
+# cameras have few pixels) and of pairs, and the significance level.
+_MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 50, 3, 0.01
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def with_extended_planes(
     w = inverse(surface.z, known)
     noise = np.where(known, surface.sigma * w, np.float32(0))
     typical = median(noise[known])
-    options = options.for_noise(float(np.sqrt(2) * typical)).for_pitch(surface.projection.pitch)
+    options = options.for_image(surface.projection.pitch, float(np.sqrt(2) * typical))
     missing = known & (surface.planes[..., 3] == 0)
     quiet = surface.planes
     if np.count_nonzero(missing & (noise > _NOISY_RATIO * typical)) >= _MIN_NOISY * known.size:

@@ -232,7 +232,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     # d(1/z) = dz / z^2
     weight = inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = typical_noise(w, weight)
-    given, options = options, options.for_noise(noise).for_pitch(projection.pitch)
+    given, options = options, options.for_image(projection.pitch, noise)
     columns = _columns_without_gaps(frame, z, options)
     if columns < z.shape[1]:
         return prepare_view(frame, replace(given, columns=columns))

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 # Tangent of the incidence (80 degrees) up to which neighbouring pixels belong to one surface.
 _STEEPEST = 5.67
+# Difference of x/z between neighbouring pixels, above which windows have fewer pixels: windows as
+# wide would rarely contain a single surface.
+_COARSE = 0.01
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Preparation of views that the camera has smoothed, at a finer scale.
+    """Preparation of views with little noise, or smoothed by the camera, at a finer scale.
 
     In such views noise is no limit, and the structures that constrain the pose may be small.
 
     Attributes
     ----------
     noise
-        Applies to views whose noise between neighbouring pixels is below this fraction of the
-        depth.
+        Applies to views whose noise between neighbouring pixels, relative to the depth, is below
+        this fraction of the difference of their x/z: then few pixels determine a slope.
     radii, edge_margin, fill
         Replace the fields of `SurfaceOptions`.
     """
 
-    noise: float = 0.001
+    noise: float = 0.3
     radii: tuple[int, ...] = (1, 2)
     edge_margin: int = 0
     fill: float = 0.5
@@ -80,17 +84,25 @@ class SurfaceOptions:
     range_falloff: float | None = None
     smoothed: Smoothed = Smoothed()
 
-    def for_pitch(self, pitch: float) -> SurfaceOptions:
-        """Return the options for images with this difference of x/z between neighbouring pixels.
+    def for_image(self, pitch: float, noise: float = math.inf) -> SurfaceOptions:
+        """Return the options for an image with this resolution and noise.
 
-        In coarse images slanted surfaces have larger differences of depth, which are no edges.
+        In coarse images slanted surfaces have larger differences of depth, which are no edges, and
+        windows of as many pixels contain more surfaces.
+
+        Parameters
+        ----------
+        pitch
+            Difference of x/z between neighbouring pixels.
+        noise
+            Between neighbouring pixels, relative to the depth.
         """
-        jump = max(self.edge_jump, _STEEPEST * pitch)
-        return self if jump == self.edge_jump else replace(self, edge_jump=jump)
-
-    def for_noise(self, noise: float) -> SurfaceOptions:
-        """Return the options for a view with this noise between neighbours, relative to depth."""
-        s = self.smoothed
-        if noise >= s.noise:
-            return self
-        return replace(self, radii=s.radii, edge_margin=s.edge_margin, fill=s.fill)
+        s, options = self.smoothed, self
+        if noise < s.noise * pitch:
+            options = replace(self, radii=s.radii, edge_margin=s.edge_margin, fill=s.fill)
+        scale = min(1.0, _COARSE / pitch)
+        return replace(
+            options,
+            edge_jump=max(options.edge_jump, _STEEPEST * pitch),
+            radii=tuple(max(k, round(scale * r)) for k, r in enumerate(options.radii, start=1)),
+        )

@@ -1,0 +1,52 @@
+"""Whole reconstructions of recordings with few pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
+from tofuse.pipeline.adaptation import adapted
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.models import camera_model
+
+WIDTH, HEIGHT = 54, 42
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """A furnished room, with raw amplitude that falls off towards the corners."""
+    f = WIDTH / 2 / np.tan(np.radians(30))
+    camera = Pinhole(WIDTH, HEIGHT, f, f, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    model = replace(camera_model("ifm-o3r"), name="coarse", camera=camera)
+    scene, path = build("room", texture=True)
+    effects = Effects.none(shot_noise=True)
+    frames = [render(scene, path, model, k, effects=effects).frame for k in range(0, 120, 3)]
+    times = np.arange(0, 120, 3) / FRAME_RATE_HZ
+    frames = [
+        replace(frame, index=n, timestamp=t)
+        for n, (frame, t) in enumerate(zip(frames, times, strict=True))
+    ]
+    poses = np.stack([path.T_world_camera(t, 0.0) for t in times])
+    return Recording.of(ArraySource(tuple(frames), poses), "made", "arrays")
+
+
+def test_few_pixels_are_tracked(recording):
+    result = reconstruct(recording, "default", threads=1)
+    assert all(frame.status == "tracked" for frame in result.diagnostics.frames)
+    times = recording.timestamps
+    error = evaluate_trajectory(times, result.trajectory, times, recording.reference)
+    assert error.ate_rms_m < 0.015
+
+
+def test_falloff_is_estimated_from_few_pixels(recording):
+    config = adapted(from_method("default"), recording, threads=1)
+    assert config.odometry.views.falloff == pytest.approx(4.0, abs=1.0)
