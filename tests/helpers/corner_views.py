@@ -12,8 +12,9 @@ from tofuse.registration.surface_options import Smoothed, SurfaceOptions
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 
 
-# No plane fit bridges the edges of the corner, so that the fits are exact.
-SHARP = SurfaceOptions(radii=(2,), flatness=1e-5, smoothed=Smoothed(noise=0))
+# No plane fit bridges the edges of the corner, so that the fits are exact. In images as coarse as
+# these, the half width is 2 pixels.
+SHARP = SurfaceOptions(radii=(4,), flatness=1e-5, smoothed=Smoothed(noise=0))
 
 
 def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0) -> RangeFrame:

@@ -14,9 +14,10 @@ from tofuse.odometry.base import Step, Tracker
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.registration.surface_options import Smoothed, SurfaceOptions
 
 ALL = Spacing(angle=0, distance=0)
+OPTIONS = SurfaceOptions(radii=(4,), smoothed=Smoothed(noise=0))
 
 
 DRIFT = se3.exp(np.array([0.004, -0.003, 0.004, 0.002, -0.003, 0.002]))
@@ -63,7 +64,7 @@ class _Drifting(Tracker):
         options = self.options
         at = min(frame.index, options.count - 1)
         truth = away_and_back(options.count)
-        view = prepare_view(frame, SurfaceOptions(radii=(2,)))
+        view = prepare_view(frame, OPTIONS)
         if self.before is None:
             self.before = 0, np.eye(4)
             return Step("tracked", "", np.eye(4), surface=view)
@@ -94,7 +95,7 @@ def pushed(options, frames, poses, given=(), covariances=None):
     store = ViewStore(ALL)
     loops = options.start(0, given, store, spacing=ALL)
     for frame, T in zip(frames, poses, strict=True):
-        store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
+        store.push(prepare_view(frame, OPTIONS), T)
         loops.push(frame, T)
     known = {f.index: T for f, T in zip(frames, poses, strict=True)}
     return loops.finish(known, covariances or dict.fromkeys(known, np.zeros((6, 6))))
