@@ -235,3 +235,13 @@ def test_points_are_on_fitted_surface(room):
     assert len(some) == pytest.approx(len(every) / 16, rel=0.1)
     z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
     np.testing.assert_allclose(every[:, 2], z, rtol=1e-6)
+
+
+def test_all_pixels_of_a_small_image_are_sampled(room):
+    small = SurfaceOptions(columns=22)
+    target, source = (prepare_view(frame, small) for frame in room.frames[:2])
+    found = align(source, [Target(target, np.eye(4))], room.poses[1], OPTIONS)
+    assert found.points == np.count_nonzero(source.planes[..., 3] > 0)
+    assert align(room.views[1], [room.target], room.poses[1], OPTIONS).points == len(
+        points_of(room.views[1], OPTIONS.levels[-1].stride)
+    )

@@ -97,8 +97,8 @@ class RangeView:
         options = options or SurfaceOptions()
         if surface is None:
             surface = prepare_view(frame, options)
-        options = options.for_image(surface.projection.pitch)
         surface = with_extended_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
+        options = options.for_image(surface.projection.pitch)
         shape = surface.z.shape
         smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
         measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 # Tangent of the incidence (80 degrees) up to which neighbouring pixels belong to one surface.
 _STEEPEST = 5.67
-# Difference of x/z between neighbouring pixels, above which windows have fewer pixels: windows as
-# wide would rarely contain a single surface.
+# Above this difference of x/z between neighbouring pixels, windows shrink: one of the same number
+# of pixels would rarely cover a single surface.
 _COARSE = 0.01
 
 
@@ -88,7 +88,7 @@ class SurfaceOptions:
         """Return the options for an image with this resolution and noise.
 
         In coarse images slanted surfaces have larger differences of depth, which are no edges, and
-        windows of as many pixels contain more surfaces.
+        a window of the same number of pixels spans more surfaces.
 
         Parameters
         ----------
