@@ -20,6 +20,7 @@ from tofuse.results.types import Reconstruction
 MAX_POINTS = 150_000
 MAX_FACES = 300_000
 MAX_CAMERAS = 72
+_MAX_PATH = 1000  # segments of a trajectory
 _FAR = 1.8  # times the size of the model: then it is framed without the cameras
 _SAMPLED, _CLEARLY = 5000, 1.05  # sampled normals, and the ratio that decides
 _DIRECTIONS = 100  # in which the outermost points are framed
@@ -307,8 +308,13 @@ def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
 
 
 def path_lines(poses: Float64) -> Float64:
-    """Return ends of the lines (2 n, 3) that join the camera centres in order."""
+    """Return ends of the lines (2 n, 3) that join the camera centres in order.
+
+    Of long trajectories every k-th centre is joined: wide lines cost a browser more than triangles.
+    """
     centers = poses[:, :3, 3]
+    step = max(1, -(-len(centers) // _MAX_PATH))
+    centers = np.concatenate([centers[:-1:step], centers[-1:]])
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
 

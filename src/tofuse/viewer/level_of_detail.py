@@ -10,9 +10,6 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.files.tileset import Tile
 
-# 60 million triangles per second at 30 frames per second: a tenth or less of what integrated
-# graphics render by their data sheets.
-MAX_SHOWN_FACES = 2_000_000
 OVERVIEW_FACES = 250_000
 # Smaller errors on the screen need no more triangles: a cluster of merged vertices is then hardly
 # larger than a visible triangle.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ from tofuse.errors import InputError
 from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.viewer.content import Layer, TiledLayer, merge_layers
-from tofuse.viewer.level_of_detail import MAX_SHOWN_FACES, Eye, select_tiles
+from tofuse.viewer.frame_budget import MAX_SHOWN_FACES, FrameBudget
+from tofuse.viewer.level_of_detail import Eye, select_tiles
 from tofuse.viewer.tone_mapping import inverse_tone_mapping
 
 if TYPE_CHECKING:
@@ -24,8 +26,9 @@ if TYPE_CHECKING:
     from tofuse.files.tileset import Tile
 
 
-# Fractions of the budget of faces: a coarse surface is shown first, and then refined.
-_BUDGETS = (0.1, 0.3, 1.0)
+# Fractions of the budget of triangles: if tiles must be loaded, a coarse surface is shown first.
+_FRACTIONS = (0.1, 0.3, 1.0)
+_MAX_LOADED_FACES = 2 * MAX_SHOWN_FACES  # including hidden tiles
 _MARGIN = 0.01  # of a tile's size, within which a ray still hits it
 
 
@@ -111,7 +114,11 @@ class TiledSurface:
 
 
 class _Client:
-    """One client: a thread that follows its camera."""
+    """One client: a thread that follows its camera.
+
+    Tiles that are no longer shown stay loaded but hidden for a while: coarse tiles while the camera
+    moves and fine ones at rest alternate on slow machines.
+    """
 
     def __init__(
         self,
@@ -122,25 +129,28 @@ class _Client:
     ) -> None:
         self._client, self._layer, self._paint = client, layer, paint
         self._visible = visible
-        self._nodes: dict[str, tuple[Tile, Any]] = {}
+        self._nodes: dict[str, tuple[Tile, Any]] = {}  # the longest unused first
+        self._shown: frozenset[str] = frozenset()
+        self._budget = FrameBudget(layer.root.faces)
+        self._last_move = -np.inf
         self._lock = threading.Lock()
         self._moved = threading.Event()
         self._stopped = False
         self._moved.set()
-        client.camera.on_update(lambda _: self._moved.set())
+        client.camera.on_update(lambda _: self._on_move())
         threading.Thread(target=self._follow, name="tofuse-tiles", daemon=True).start()
 
     def tiles(self) -> list[Tile]:
         """The tiles that are shown."""
         with self._lock:
-            return [tile for tile, _ in self._nodes.values()]
+            return [self._nodes[name][0] for name in sorted(self._shown)]
 
     def show(self, visible: bool) -> None:
         """Show or hide them."""
         with self._lock:
             self._visible = visible
-            for _, node in self._nodes.values():
-                node.visible = visible
+            for name in self._shown:
+                self._nodes[name][1].visible = visible
 
     def stop(self, *, remove: bool) -> None:
         """End the thread."""
@@ -149,26 +159,40 @@ class _Client:
             if remove:
                 for _, node in self._nodes.values():
                     node.remove()
-            self._nodes = {}
+            self._nodes, self._shown = {}, frozenset()
+        self._moved.set()
+
+    def _on_move(self) -> None:
+        now = time.monotonic()
+        with self._lock:
+            self._budget.moved(now, sum(self._nodes[name][0].faces for name in self._shown))
+            self._last_move = now
         self._moved.set()
 
     def _follow(self) -> None:
-        while True:
-            self._moved.wait()
+        resting = True
+        while not self._stopped:
+            # At rest nothing changes; after a movement the finer surface follows.
+            self._moved.wait(None if resting else self._budget.rest_s)
             self._moved.clear()
-            for fraction in _BUDGETS:
-                if self._stopped:
-                    return
-                wanted = select_tiles(
-                    self._layer.root, self._eye(), int(fraction * MAX_SHOWN_FACES)
-                )
-                try:
-                    self._exchange(wanted)
-                except InputError as error:  # the folder has changed
-                    print(f"tofuse: {error}", file=sys.stderr, flush=True)
-                    return
-                if self._moved.is_set():  # start again for the new view
-                    break
+            resting = time.monotonic() - self._last_move >= self._budget.rest_s
+            try:
+                self._refine(self._budget.resting if resting else self._budget.moving)
+            except InputError as error:  # the folder has changed
+                print(f"tofuse: {error}", file=sys.stderr, flush=True)
+                return
+
+    def _refine(self, max_faces: int) -> None:
+        """Show the surface at increasing detail until the camera moves again."""
+        eye = self._eye()
+        final = select_tiles(self._layer.root, eye, max_faces)
+        if all(str(tile.content) in self._nodes for tile in final):
+            self._exchange(final)
+            return
+        for fraction in _FRACTIONS:
+            self._exchange(select_tiles(self._layer.root, eye, int(fraction * max_faces)))
+            if self._stopped or self._moved.is_set():
+                return
 
     def _eye(self) -> Eye:
         camera = self._client.camera
@@ -183,9 +207,9 @@ class _Client:
         )
 
     def _exchange(self, wanted: list[Tile]) -> None:
-        """Show these tiles and no others; new ones are added before old ones are removed."""
-        names = {str(tile.content) for tile in wanted}
-        new = [tile for tile in wanted if tile.content not in self._nodes]
+        """Show these tiles and no others; new ones are added before old ones are hidden."""
+        names = frozenset(str(tile.content) for tile in wanted)
+        new = [tile for tile in wanted if str(tile.content) not in self._nodes]
         ready = [(tile, self._packed(tile)) for tile in new]
         with self._lock, self._client.atomic():
             if self._stopped:
@@ -199,9 +223,23 @@ class _Client:
                     receive_shadow=False,
                 )
                 self._nodes[str(tile.content)] = tile, node
-            for name in [name for name in self._nodes if name not in names]:
-                _, node = self._nodes.pop(name)
-                node.remove()
+            for name in names - self._shown:
+                self._nodes[name] = self._nodes.pop(name)  # the last used
+                self._nodes[name][1].visible = self._visible
+            for name in self._shown - names:
+                self._nodes[name][1].visible = False
+            self._shown = names
+            self._unload()
+
+    def _unload(self) -> None:
+        """Remove hidden tiles while too many triangles are loaded."""
+        loaded = sum(tile.faces for tile, _ in self._nodes.values())
+        for name in [name for name in self._nodes if name not in self._shown]:
+            if loaded <= _MAX_LOADED_FACES:
+                return
+            tile, node = self._nodes.pop(name)
+            node.remove()
+            loaded -= tile.faces
 
     def _packed(self, tile: Tile) -> bytes:
         part = self._layer.layer(tile)
