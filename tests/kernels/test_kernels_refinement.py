@@ -101,6 +101,27 @@ def test_focal_length_error_is_compensated(pair, kind):
     assert corrected - true < 0.3 * (wrong - true)
 
 
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize("error", range(kernels.ERRORS))
+def test_known_errors_are_corrected_as_if_they_were_unknowns(pair, kind, error):
+    *_, T = pair
+    views = [as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4))]
+    wide = (0.0, 1.0, 0.1, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
+    errors = np.zeros(kernels.ERRORS)
+    errors[error] = 0.01
+    unknown = KNOWN.copy()
+    unknown[error] = 0
+
+    def step(assumed, known=KNOWN):
+        H, g = unpack(evaluate(*views, T, assumed, known, wide))
+        return np.linalg.solve(H[:7, :7], g[:7])
+
+    effect = step(errors, unknown) - step(np.zeros(kernels.ERRORS))
+    assert np.abs(effect[:6]).max() > 5e-5
+    found = step(errors) - step(errors, unknown)
+    assert np.abs(found[:6]).max() < 0.2 * np.abs(effect[:6]).max()
+
+
 def test_fixed_unknowns_have_no_equations(pair):
     source, target, T = pair
     H, g = unpack(evaluate(source, target, T))

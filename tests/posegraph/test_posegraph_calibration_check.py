@@ -121,9 +121,11 @@ def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
     drift[kernels.FOCAL] = -0.06
 
     def drifting(views, pairs, T_i_j, options, errors):
-        right = align_pairs(views, pairs, T_i_j, options, errors)
+        # The last one closes the loop. It is measured by views that hardly differ, so an error of
+        # the camera does not matter there.
+        right = align_pairs(views, pairs, T_i_j, options, np.zeros_like(errors))
         drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
-        return np.concatenate([drifted[:-1], right[-1:]])  # the last one closes the loop
+        return np.concatenate([drifted[:-1], right[-1:]])
 
     monkeypatch.setattr("tofuse.posegraph.calibration_check.align_pairs", drifting)
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm

@@ -65,7 +65,7 @@ SIZE = HISTOGRAM + BINS
 # variances; and the root of w of the distance.
 LANES = 128
 _MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
-_XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
+XN, YN, Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
 SEEN = _PIXEL + PIXEL_SIZE
 FITS = SEEN + 1
 JACOBIAN = FITS + 1
@@ -206,9 +206,9 @@ def transform_block(block: Float32, T: Float64) -> None:
         pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
         per_z = 1 / z if z > _MIN_DEPTH else 0.0
-        block[_XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
-        block[_YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
-        block[_Z * LANES + k] = z
+        block[XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
+        block[YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
+        block[Z * LANES + k] = z
 
 
 @kernel
@@ -218,13 +218,13 @@ def project_block(
     """Fetch the target pixels that the points of a block project to; returns how many have one."""
     rows, columns = target.shape[0], target.shape[1]
     u, v = np.empty(LANES), np.empty(LANES)
-    xn, yn = block[_XN * LANES : (_XN + 1) * LANES], block[_YN * LANES : (_YN + 1) * LANES]
+    xn, yn = block[XN * LANES : (XN + 1) * LANES], block[YN * LANES : (YN + 1) * LANES]
     project_rays(xn, yn, lookup, lookup_frame, u, v)
     landed = 0
     for k in range(LANES):
         block[SEEN * LANES + k] = 0
     for k in range(count):
-        if not block[_Z * LANES + k] > _MIN_DEPTH:
+        if not block[Z * LANES + k] > _MIN_DEPTH:
             continue
         if not (u[k] > -0.5 and v[k] > -0.5 and u[k] < columns - 0.5 and v[k] < rows - 0.5):
             continue
@@ -263,8 +263,8 @@ def compare_planes(
         n0 = block[(_PIXEL + PLANE) * LANES + k]
         n1 = block[(_PIXEL + PLANE + 1) * LANES + k]
         n2 = block[(_PIXEL + PLANE + 2) * LANES + k]
-        z = block[_Z * LANES + k]
-        r = z * (n0 * block[_XN * LANES + k] + n1 * block[_YN * LANES + k] + n2)
+        z = block[Z * LANES + k]
+        r = z * (n0 * block[XN * LANES + k] + n1 * block[YN * LANES + k] + n2)
         r -= block[(_PIXEL + DISTANCE) * LANES + k]
         # m = R^T n, the target's normal in the source frame (away from the camera).
         m0 = r00 * n0 + r10 * n1 + r20 * n2
@@ -310,7 +310,7 @@ def compare_albedos(
         px = block[POINT * LANES + k]
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
-        xn, yn = block[_XN * LANES + k], block[_YN * LANES + k]
+        xn, yn = block[XN * LANES + k], block[YN * LANES + k]
         tx = block[(_PIXEL + ALBEDO_SLOPE) * LANES + k]
         ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
         r = block[(_PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
@@ -330,7 +330,7 @@ def compare_albedos(
         block[(STAT + WEIGHT_P - INLIERS) * LANES + k] = weight
         block[(STAT + SQUARES_P - INLIERS) * LANES + k] = weight * r * r
         # Derivative of (x/z, y/z) by the transformed point, rotated back into the source frame.
-        per_z = one / block[_Z * LANES + k] if fits else none
+        per_z = one / block[Z * LANES + k] if fits else none
         d0, d1, d2 = tx * per_z, ty * per_z, -(tx * xn + ty * yn) * per_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2

@@ -38,7 +38,10 @@ from tofuse.kernels.alignment import (
     STAT,
     VARIANCE,
     WEIGHT_G,
+    XN,
+    YN,
     Residuals,
+    Z,
     TargetImage,
     add_products,
     compare_albedos,
@@ -88,7 +91,7 @@ class CameraErrors(NamedTuple):
     Attributes
     ----------
     errors
-        (ERRORS,) current estimate, by which points and planes are displaced.
+        (ERRORS,) assumed errors, by which points and planes are displaced.
     known
         (ERRORS,) non-zero for errors that are not estimated.
     radial_source, radial_target
@@ -144,32 +147,24 @@ class PairResiduals(NamedTuple):
 
 
 @kernel
-def displacement(B: Float64, x: float, y: float, z: float, radial: bool, known: Int64) -> None:
+def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None:
     """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
 
-    Errors that are flagged in `known` (ERRORS,) get 0. `radial` tells whether the camera measures
-    the distance along the ray, and not z.
+    `radial` tells whether the camera measures the distance along the ray, and not z.
     """
-    for k in range(ERRORS):
-        B[k, 0] = B[k, 1] = B[k, 2] = 0.0
-    if not known[OFFSET]:
-        r = np.sqrt(x * x + y * y + z * z)
-        B[OFFSET, 0] = x / r
-        B[OFFSET, 1] = y / r
-        B[OFFSET, 2] = z / r
-    if not known[SCALE]:
-        B[SCALE, 0] = x
-        B[SCALE, 1] = y
-        B[SCALE, 2] = z
-    if not known[FOCAL]:
-        B[FOCAL, 0] = x
-        B[FOCAL, 1] = y
-        if radial:
-            side2 = x * x + y * y
-            shorter = side2 / (side2 + z * z)
-            B[FOCAL, 0] -= shorter * x
-            B[FOCAL, 1] -= shorter * y
-            B[FOCAL, 2] -= shorter * z
+    side2 = x * x + y * y
+    r2 = side2 + z * z
+    r = np.sqrt(r2)
+    B[OFFSET, 0] = x / r
+    B[OFFSET, 1] = y / r
+    B[OFFSET, 2] = z / r
+    B[SCALE, 0] = x
+    B[SCALE, 1] = y
+    B[SCALE, 2] = z
+    shorter = side2 / r2 if radial else 0.0
+    B[FOCAL, 0] = x - shorter * x
+    B[FOCAL, 1] = y - shorter * y
+    B[FOCAL, 2] = -shorter * z
 
 
 @kernel
@@ -191,7 +186,7 @@ def _pair_equations(
         unknowns -= 1
     asked = unknowns - 7
     if asked == 0:
-        _pose_equations(points, patches, target, T, residuals, out, sums)
+        _pose_equations(points, patches, target, T, residuals, camera, out, sums)
         return
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
@@ -211,12 +206,11 @@ def _pair_equations(
         px = np.float64(point[POINT])
         py = np.float64(point[POINT + 1])
         pz = np.float64(point[POINT + 2])
-        if asked:
-            displacement(Bp, px, py, pz, radial_source, known)
-            for p in range(asked):
-                px += errors[p] * Bp[p, 0]
-                py += errors[p] * Bp[p, 1]
-                pz += errors[p] * Bp[p, 2]
+        displacement(Bp, px, py, pz, radial_source)
+        for p in range(ERRORS):
+            px += errors[p] * Bp[p, 0]
+            py += errors[p] * Bp[p, 1]
+            pz += errors[p] * Bp[p, 2]
         z = r20 * px + r21 * py + r22 * pz + t2
         if z <= 0.02:
             continue
@@ -241,10 +235,9 @@ def _pair_equations(
         n2 = np.float64(pixel[PLANE + 2])
         across = n0 * x + n1 * y + n2 * z
         r = across - distance
-        if asked:
-            displacement(Bq, x, y, z, radial_target, known)
-            for p in range(asked):
-                r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
+        displacement(Bq, x, y, z, radial_target)
+        for p in range(ERRORS):
+            r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
         along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
         own = along * along + np.float64(pixel[VARIANCE])
         variance = own * scale_g * scale_g + inflation * inflation
@@ -279,6 +272,8 @@ def _pair_equations(
             J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
                 n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
             )
+            if known[p]:
+                J[7 + p] = 0.0
         _add(A, g, J, r, f * f / variance, unknowns)
 
         tx = np.float64(pixel[ALBEDO_SLOPE])
@@ -310,7 +305,7 @@ def _pair_equations(
         jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
         for p in range(asked):
-            J[7 + p] = m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
+            J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
         if asked > FOCAL:
             # Of the camera errors only the focal length changes the rays of the target's pixels.
             J[7 + FOCAL] -= (r00 * m0 + r01 * m1 + r02 * m2) * x
@@ -381,10 +376,13 @@ def _pose_equations(
     target: TargetImage,
     T: Float64,
     residuals: Residuals,
+    camera: CameraErrors,
     out: Float64,
     sums: Float64,
 ) -> None:
-    """Do the same without camera errors, vectorised in blocks as in `alignment`."""
+    """Do the same with known camera errors, vectorised in blocks as in `alignment`."""
+    errors, _, radial_source, radial_target = camera
+    wrong = (errors != 0).any()
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
     block = np.zeros(ROWS * LANES, np.float32)
@@ -394,7 +392,11 @@ def _pose_equations(
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
+        if wrong:
+            _correct_points(block, errors, radial_source)
         transform_block(block, T)
+        if wrong:
+            _distort_projection(block, errors, radial_target)
         project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
@@ -437,6 +439,42 @@ def _pose_equations(
     out[SQUARES_P] = total[products + ALBEDO_SQUARES - INLIERS, 0]
     out[TERMS] = out[COMPARED] + total[products + COUNT_P - INLIERS, 0]
     out[SUPPORT] = total[support, 0]
+
+
+@kernel
+def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
+    """Displace the points of a block by errors of the camera, see `displacement`."""
+    x = block[POINT * LANES : (POINT + 1) * LANES]
+    y = block[(POINT + 1) * LANES : (POINT + 2) * LANES]
+    z = block[(POINT + 2) * LANES : (POINT + 3) * LANES]
+    for k in range(LANES):
+        side2 = x[k] * x[k] + y[k] * y[k]
+        r2 = side2 + z[k] * z[k]
+        shorter = side2 / r2 if radial else 0.0
+        along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - errors[FOCAL] * shorter
+        x[k] *= along + errors[FOCAL]
+        y[k] *= along + errors[FOCAL]
+        z[k] *= along
+
+
+@kernel
+def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
+    """Move the transformed points of a block to where the target with its errors measures them.
+
+    To first order in the errors this is the opposite of `_correct_points`.
+    """
+    xn = block[XN * LANES : (XN + 1) * LANES]
+    yn = block[YN * LANES : (YN + 1) * LANES]
+    z = block[Z * LANES : (Z + 1) * LANES]
+    for k in range(LANES):
+        side2 = xn[k] * xn[k] + yn[k] * yn[k]
+        r2 = side2 + 1
+        shorter = side2 / r2 if radial else 0.0
+        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + errors[FOCAL] * shorter
+        wider = 1 + errors[FOCAL]
+        xn[k] /= wider
+        yn[k] /= wider
+        z[k] *= along
 
 
 @kernel

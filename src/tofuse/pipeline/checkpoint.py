@@ -32,7 +32,7 @@ from tofuse.results.folder import CHECKPOINT
 
 # The state of tracking, which is large, is saved at this interval, and at most at this fraction of
 # the time.
-_EVERY_S, _TIME_FRACTION = 10.0, 0.03
+_EVERY_S, _TIME_FRACTION = 30.0, 0.03
 # Free space to leave for the result: a multiple of the state, and bytes.
 _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
 # A failure after this time keeps the states, for when there is space or memory again.

@@ -38,7 +38,9 @@ from tofuse.posegraph.view_store import KeptView, overlaps
 _ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
 # Overlaps are computed anew after a larger motion, in units of 1 cm and 1 degree.
 _MAX_MOTION = 2.0
-_PAIR_ITERATIONS = 8  # of Gauss-Newton
+# Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
+# it has converged: small, as the errors of the pairs of a loop add up.
+_PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,19 +298,27 @@ def align_pairs(
         (ERRORS,) assumed errors of the camera.
     """
     count = len(pairs)
-    both = [views[int(k)] for k in pairs.ravel()]
+    views = [views[int(k)] for k in pairs.ravel()]
+    ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    state = directed_pairs(both, np.arange(2 * count).reshape(-1, 2), options)
-    priors = Priors.none()
-    system = _system(state, len(both), priors)
-    known, stage = (errors == 0).astype(np.int64), options.rounds[-1]
+    state = directed_pairs(views, ends, options)
+    known, stage = np.ones(len(errors), np.int64), options.rounds[-1]
+    active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
-        evaluate(both, poses, errors, known, state, stage, options)
-        step, _ = _solve(poses, state, system, np.ones_like(known), priors)
-        poses = se3.orthonormalise(poses @ se3.exp(step))
-        rescale(state, stage)
-    return np.asarray(se3.inverse(poses[::2]) @ poses[1::2], np.float64)
+        both = np.concatenate([active, active + count])
+        part = state.of(both)
+        evaluate(views, poses, errors, known, part, stage, options)
+        aligned, _ = _pairwise_measurements(poses, ends[active], part)
+        rescale(part, stage)
+        state.put(both, part)
+        at = 2 * active + 1
+        step = se3.log(se3.inverse(poses[at]) @ aligned) / UNITS
+        poses[at] = se3.orthonormalise(aligned)
+        active = active[np.abs(step).max(1) >= _PAIR_CONVERGED]
+        if not len(active):
+            break
+    return poses[1::2]
 
 
 def spread_evenly(pairs: Intp, neighbours: int) -> Intp:

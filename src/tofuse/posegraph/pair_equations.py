@@ -107,6 +107,19 @@ class DirectedPairs:
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
     sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
 
+    def of(self, which: Intp) -> DirectedPairs:
+        """Return some of the pairs, without their normal equations."""
+        columns = self.target, self.source, *self._scales(), self.max_scale
+        return DirectedPairs(*(column[which] for column in columns), self.sources)
+
+    def put(self, which: Intp, part: DirectedPairs) -> None:
+        """Take over the exposure and scales of some of the pairs."""
+        for mine, changed in zip(self._scales(), part._scales(), strict=True):
+            mine[which] = changed
+
+    def _scales(self) -> tuple[Float64, Float64, Float64]:
+        return self.exposure, self.scale_g, self.scale_p
+
 
 def directed_pairs(
     views: Sequence[KeptView],
