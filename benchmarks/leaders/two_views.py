@@ -15,6 +15,7 @@ import numpy as np
 import pairs
 from cloud_pairs import OBJECT_M
 from leaders import Board, Score, default_made
+from peers import kiss_global, o3d_global
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
@@ -261,7 +262,24 @@ def peers() -> dict[str, Callable[[Float64, Float64, Float64, float], Float64]]:
     else:
         for kind in ("ICP", "PLANE_ICP", "GICP", "VGICP"):
             out[f"small_gicp {kind}"] = _small_gicp(small, kind)
+    for name, module in (("Open3D FPFH, RANSAC", o3d_global), ("KISS-Matcher", kiss_global)):
+        if module.method(1.0) is not None:
+            out[name] = _global(module.method)
     return out
+
+
+def _global(
+    method: Callable[[float], Callable[[Frame, Frame], Float64] | None],
+) -> Callable[[Float64, Float64, Float64, float], Float64]:
+    """Return a registration that uses no guess; its voxels are a hundredth of the scene."""
+
+    def align(source: Float64, target: Float64, guess: Float64, unit: float) -> Float64:
+        clouds = [CloudFrame(k, 0.0, p.astype(np.float32)) for k, p in enumerate((source, target))]
+        registered = method(float(np.ptp(target, 0).max()) / 100)
+        assert registered is not None
+        return registered(*clouds)
+
+    return align
 
 
 def _open3d(o3d: Any, way: Any) -> Callable[[Float64, Float64, Float64, float], Float64]:
