@@ -168,26 +168,20 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
 
 
 @kernel
-def _pair_equations(
+def _all_equations(
     points: Float32,
-    patches: Int64,
     target: TargetImage,
     T: Float64,
     residuals: Residuals,
     camera: CameraErrors,
     out: Float64,
-    sums: Float64,
 ) -> None:
-    """Sum the normal equations of one pair, see `target_equations`."""
+    """Add the normal equations of one pair, with errors of the camera among its unknowns."""
     errors, known, radial_source, radial_target = camera
-    out[:] = 0.0
     unknowns = UNKNOWNS
     while unknowns > 7 and known[unknowns - 8]:
         unknowns -= 1
     asked = unknowns - 7
-    if asked == 0:
-        _pose_equations(points, patches, target, T, residuals, camera, out, sums)
-        return
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
     rows, columns = image.shape[0], image.shape[1]
@@ -353,20 +347,19 @@ def target_equations(
         patch. With 0 patches, and with errors of the camera, they are not computed.
     """
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    out[:] = 0.0
     sums[:] = 0.0
     for k in range(len(which)):
         view = which[k]
         begin, end = sources.begin[view], sources.end[view]
-        _pair_equations(
-            sources.points[begin:end],
-            sources.patches[begin:end],
-            target,
-            T[k],
-            Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine),
-            CameraErrors(errors, known, sources.measures_range[view], radial_target),
-            out[k],
-            sums[k],
-        )
+        points = sources.points[begin:end]
+        pair = Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine)
+        camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
+        if known.all():
+            patches = sources.patches[begin:end]
+            _pose_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
+        else:
+            _all_equations(points, target, T[k], pair, camera, out[k])
 
 
 @kernel
