@@ -6,8 +6,8 @@ how many are accepted and wrong; also for Open3D's RANSAC over FPFH with point-t
 KISS-Matcher, if installed, with voxels of 1/100 of the target's extent. Clouds have at most 20,000
 points. "moved" clouds were transformed into another frame, so that their viewpoint is unknown; in
 "sparse" pairs the source has a tenth of the target's points. `fit` fits the logistic models of
-`tofuse.registration.confidence` to simulated pairs. `viewpoints` counts the clouds whose origin is
-taken for the viewpoint.
+`tofuse.registration.pose_probability` to simulated pairs. `viewpoints` counts the clouds whose
+origin is taken for the viewpoint.
 
     python benchmarks/cloud_pairs.py table [--data ../shared/data] [--kinds scans]
     python benchmarks/cloud_pairs.py fit
@@ -42,7 +42,7 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
-from tofuse.registration.confidence import CLOUDS, Evidence
+from tofuse.registration.pose_probability import CLOUDS, Evidence
 from tofuse.registration.viewpoint import viewpoint_of
 
 POINTS = 20_000

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64
-from tofuse.evaluation.surface import Surface, distances
+from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.files.ply import read_ply
 from tofuse.fusion.mesh import Mesh
 from tofuse.kernels.kdtree import KdTree

@@ -38,7 +38,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.corrections.multipath import Multipath
-from tofuse.evaluation.surface import Surface, compare_surfaces, distances
+from tofuse.evaluation.surface_error import Surface, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.layout import Layout
@@ -46,8 +46,8 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import RangeView
+from tofuse.fusion.stored_views import StoredViews
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
-from tofuse.fusion.view_store import StoredViews
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects

@@ -27,7 +27,7 @@ import numpy as np
 
 import sequences
 from tofuse.arrays import Bool, Float64
-from tofuse.evaluation.surface import Surface, distances
+from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.evaluation.trajectory import align
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.range_view import RangeView

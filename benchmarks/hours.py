@@ -43,7 +43,7 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Scene
 from tofuse.lab.simulation.scenes import furniture, household
-from tofuse.lab.simulation.scenes.assembly import Assembly, placed
+from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.texture import Material
 from tofuse.recordings.convert import convert
 from tofuse.recordings.frames import RangeFrame

@@ -24,8 +24,8 @@ from tofuse.lab.experiments.recorded import Recorded
 from tofuse.lab.simulation.record import plan, simulate_recording
 from tofuse.lab.simulation.scenes import box
 from tofuse.pipeline.config import Config
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 

@@ -39,8 +39,8 @@ from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.render import render
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording

@@ -3,10 +3,11 @@
 `table` prints, by the gap in frames, how many poses are right (within 0.1 m and 4 degrees), how
 many of those are accepted, and how many are accepted and wrong; also for Open3D's RANSAC over FPFH
 with point-to-plane ICP, if installed. `fit` fits the logistic models of
-`tofuse.registration.confidence` to simulated pairs, some of them without overlap, and prints their
-coefficients, with area under the ROC curve and calibration on held-out scenes. For these models a
-pose is right within 5 % of the depth and 4 degrees. `cameras` tests the models on the other cameras
-and scenes of `pair_views`, compared with models fitted on all of these except the camera itself.
+`tofuse.registration.pose_probability` to simulated pairs, some of them without overlap, and prints
+their coefficients, with area under the ROC curve and calibration on held-out scenes. For these
+models a pose is right within 5 % of the depth and 4 degrees. `cameras` tests the models on the
+other cameras and scenes of `pair_views`, compared with models fitted on all of these except the
+camera itself.
 `methods` compares the choice of `tofuse.register` for each pair with each of its candidate methods,
 and with an oracle that picks a right one if there is any.
 
@@ -51,7 +52,7 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.confidence import (
+from tofuse.registration.pose_probability import (
     ACCEPTED,
     IMAGES,
     RIGHT_FRACTION,

@@ -32,8 +32,8 @@ from scoring import Part, Score, Truth
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import map_consistency
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 

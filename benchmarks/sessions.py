@@ -31,11 +31,11 @@ from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan, write
 from tofuse.lab.simulation.scenes import flat, furniture
-from tofuse.lab.simulation.scenes.assembly import Assembly, placed
+from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.pipeline.merging import MergeOptions, merge_files
-from tofuse.pipeline.options import Options
 from tofuse.pipeline.run import run
-from tofuse.results.sessions import probability_text
+from tofuse.pipeline.run_options import Options
+from tofuse.results.session_words import probability_text
 from tofuse.results.types import Reconstruction
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"

@@ -40,8 +40,8 @@ from tofuse.live.recorder import record
 from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.options import Options
 from tofuse.pipeline.run import run
+from tofuse.pipeline.run_options import Options
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording

@@ -21,7 +21,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.record import Plan
-from tofuse.lab.simulation.scenes.assembly import Assembly, placed, shell
+from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
 from tofuse.lab.simulation.scenes.furniture import chair, plant
 from tofuse.lab.simulation.texture import Material
 from tofuse.recordings.correction_file import corrected_depth

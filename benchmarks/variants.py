@@ -38,9 +38,9 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.inspection.inspect import inspect_recording
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import with_findings
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.recordings.frames import IMAGES, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 

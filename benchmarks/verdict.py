@@ -37,9 +37,9 @@ from tofuse.inspection.inspect import inspect_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.checks import tolerance_of
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import with_findings
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording

@@ -24,8 +24,8 @@ from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.lab.demo import simulate_to
-from tofuse.pipeline.options import Options
 from tofuse.pipeline.run import run
+from tofuse.pipeline.run_options import Options
 from tofuse.results.run_json import frames_in_main_model, read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]

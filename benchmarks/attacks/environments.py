@@ -103,7 +103,7 @@ STAGES = (
     ("a model", "tofuse.pipeline.backend:BackEnd.run"),
     ("writing", "tofuse.results.output:_write_files"),
     ("moving", "tofuse.results.folder:move_all"),
-    ("moves", "tofuse.files.moving:_Plan.carry_out"),
+    ("moves", "tofuse.files.staging:_Plan.carry_out"),
     ("the end", "tofuse.pipeline.checkpoint:Checkpoints.finish"),
 )
 _SIGNALS = ("SIGINT", "SIGTERM")

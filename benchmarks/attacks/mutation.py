@@ -233,16 +233,16 @@ def _small() -> dict[str, Subject]:
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
-    from tofuse.files.arrays import read_npz, write_npz
     from tofuse.files.geometry_record import GeometryRecord
     from tofuse.files.glb import read_glb, write_glb
+    from tofuse.files.npz import read_npz, write_npz
     from tofuse.files.pose import read_pose
     from tofuse.files.tables import read_columns
     from tofuse.files.trajectory_formats import read_poses
     from tofuse.pipeline.config import changed, from_method, read_changes
     from tofuse.pipeline.states import StateError, decode, encode
     from tofuse.posegraph.g2o import read_g2o
-    from tofuse.posegraph.given import read_loops
+    from tofuse.posegraph.given_loops import read_loops
     from tofuse.recordings.camera_file import read_camera_file
     from tofuse.recordings.cwipc import read_cameras
     from tofuse.recordings.open import read_reference
@@ -410,7 +410,7 @@ def _stopped(out: Path) -> None:
     """A result, and an interrupted replacement by another one."""
     import made_results
     from attacks.power import Power, PowerCut
-    from tofuse.files import moving
+    from tofuse.files import staging
     from tofuse.results.folder import OutputFolder
     from tofuse.results.output import write_result
 
@@ -420,9 +420,9 @@ def _stopped(out: Path) -> None:
         power = Power(calls)
         with power.connected(), suppress(PowerCut):
             write_result(made_results.torn(seed=2), OutputFolder(out, overwrite=True))
-        if moving.is_interrupted(out / ".tofuse-unfinished"):
+        if staging.is_interrupted(out / ".tofuse-unfinished"):
             break
-    assert moving.is_interrupted(out / ".tofuse-unfinished")
+    assert staging.is_interrupted(out / ".tofuse-unfinished")
 
 
 def _settle(out: Path) -> None:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from tofuse.pipeline.mapper import Mapper
     from tofuse.posegraph.accuracy import Accuracy
     from tofuse.posegraph.graph import LoopRecord, PoseGraph
-    from tofuse.recordings.arrays import from_arrays
     from tofuse.recordings.frames import CloudFrame, RangeFrame
+    from tofuse.recordings.from_arrays import from_arrays
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
     from tofuse.registration.base import Registration
@@ -84,7 +84,7 @@ _HOMES = {
     "SessionRecord": "tofuse.results.types",
     "TofuseError": "tofuse.errors",
     "evaluate": "tofuse.pipeline.evaluating",
-    "from_arrays": "tofuse.recordings.arrays",
+    "from_arrays": "tofuse.recordings.from_arrays",
     "inspect": "tofuse.inspection.inspect",
     "judge": "tofuse.pipeline.judging",
     "load": "tofuse.api.result",

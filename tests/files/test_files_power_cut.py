@@ -18,7 +18,7 @@ from tofuse.batch.jobs import Job
 from tofuse.batch.table import write_table
 from tofuse.errors import OutputError
 from tofuse.files.atomic import new_folder, write_text
-from tofuse.files.moving import is_interrupted
+from tofuse.files.staging import is_interrupted
 from tofuse.pipeline.checkpoint import Checkpoints
 from tofuse.recordings.rig import Rig, RigCamera, write_rig
 from tofuse.results.folder import STAGING, OutputFolder, finish_interrupted, is_result

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.evaluation.surface import Surface, distances
+from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.fusion import mesh as mesh_module
 from tofuse.fusion.edge_collapse import collapse_edges
 from tofuse.fusion.mesh import Mesh

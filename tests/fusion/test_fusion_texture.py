@@ -23,9 +23,9 @@ from tofuse.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.atlas import UNOWNED, draw_triangles
-from tofuse.pipeline import options as options_module
 from tofuse.pipeline import paint
 from tofuse.pipeline import run as run_module
+from tofuse.pipeline import run_options as options_module
 from tofuse.recordings.frames import RangeFrame
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.surface_options import Smoothed, SurfaceOptions
 

@@ -67,7 +67,11 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
     words = [sys.executable, "-c", program, str(room_recording)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     called = done.stdout.split()
-    for name in ("steps.iterate_level", "surface.fit_planes", "refinement.target_equations"):
+    for name in (
+        "steps.iterate_level",
+        "view_planes.fit_planes",
+        "pair_equations.target_equations",
+    ):
         assert name in called
     assert len(called) > 40
 

@@ -8,7 +8,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole
 from tofuse.kernels import alignment as kernels
-from tofuse.kernels import motion, steps
+from tofuse.kernels import rigid_motions, steps
 from tofuse.registration.projection import Projection
 
 CAMERA = Pinhole(24, 18, 30.0, 30.0, 11.5, 8.5)
@@ -254,13 +254,13 @@ def test_retract_is_exponential_map(size):
     rng = np.random.default_rng(5)
     T = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
-    np.testing.assert_allclose(motion.retract(T, xi), T @ se3.exp(xi), atol=1e-9)
+    np.testing.assert_allclose(rigid_motions.retract(T, xi), T @ se3.exp(xi), atol=1e-9)
 
 
 def test_retract_orthonormalises_rotations():
     T = se3.exp([1, 2, 3, 0.5, -0.2, 0.3])
     T[:3, :3] *= 1 + 1e-5
-    out = motion.retract(T, np.zeros(6))
+    out = rigid_motions.retract(T, np.zeros(6))
     np.testing.assert_allclose(out[:3, :3].T @ out[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(out[3], [0, 0, 0, 1])
 
@@ -271,8 +271,8 @@ def test_twist_between_is_logarithm(size):
     A = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
     B = A @ se3.exp(xi)
-    np.testing.assert_allclose(motion.twist_between(A, B), xi, atol=1e-9)
-    found = motion.distance_and_angle(A, B)
+    np.testing.assert_allclose(rigid_motions.twist_between(A, B), xi, atol=1e-9)
+    found = rigid_motions.distance_and_angle(A, B)
     wanted = np.linalg.norm(B[:3, 3] - A[:3, 3]), np.linalg.norm(xi[3:])
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 

@@ -10,7 +10,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.scene import SCENES, Scene, build
 from tofuse.lab.simulation.scenes import furniture
-from tofuse.lab.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.scenes.composition import Assembly
 
 
 def sr4000_rays(step=4):

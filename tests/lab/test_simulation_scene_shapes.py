@@ -8,7 +8,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation.scene import Scene
-from tofuse.lab.simulation.scenes import implicit, torso
+from tofuse.lab.simulation.scenes import blends, torso
 from tofuse.lab.simulation.texture import Material
 
 
@@ -67,8 +67,8 @@ def test_joined_meshes_keep_surfaces_and_positions():
 
 
 def test_surface_net_of_ball_is_closed_and_accurate():
-    ball = implicit.surface_net(
-        implicit.ellipsoid((0.1, 0, 0), (0.5, 0.5, 0.5)), (-1, -1, -1), (1, 1, 1), 0.08
+    ball = blends.surface_net(
+        blends.ellipsoid((0.1, 0, 0), (0.5, 0.5, 0.5)), (-1, -1, -1), (1, 1, 1), 0.08
     )
     assert is_closed(ball)
     radius = np.linalg.norm(ball.vertices - (0.1, 0, 0), axis=1)
@@ -77,9 +77,9 @@ def test_surface_net_of_ball_is_closed_and_accurate():
 
 
 def test_blending_is_local():
-    a = implicit.ellipsoid((-0.5, 0, 0), (0.4, 0.4, 0.4))
-    b = implicit.limb((0.5, 0, 0), (1.0, 0, 0), 0.4, 0.2)
-    both = implicit.blend([(a, 0.0), (b, 0.3)])
+    a = blends.ellipsoid((-0.5, 0, 0), (0.4, 0.4, 0.4))
+    b = blends.limb((0.5, 0, 0), (1.0, 0, 0), 0.4, 0.2)
+    both = blends.blend([(a, 0.0), (b, 0.3)])
     gap = np.array([[0.0, 0.0, 0.0]])
     assert a(gap)[0] > 0
     assert b(gap)[0] > 0

@@ -11,7 +11,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels import moving_objects as kernels
-from tofuse.kernels.motion import distance_and_angle
+from tofuse.kernels.rigid_motions import distance_and_angle
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render

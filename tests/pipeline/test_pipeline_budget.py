@@ -10,7 +10,7 @@ from tofuse.errors import InputError
 from tofuse.fusion.options import Fusion
 from tofuse.pipeline.budget import views_bytes, voxels_mb
 from tofuse.pipeline.config import changed, from_method
-from tofuse.pipeline.options import Options, resolve
+from tofuse.pipeline.run_options import Options, resolve
 
 
 def test_memory_budget_is_divided_consistently() -> None:

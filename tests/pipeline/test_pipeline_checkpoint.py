@@ -22,7 +22,7 @@ from kept_stages import Kept, Stopped
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
 from tofuse.files import spill as spill_module
-from tofuse.files.arrays import read_npz, write_npz
+from tofuse.files.npz import read_npz, write_npz
 from tofuse.files.spill import Spill
 from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline import checkpoint, reconstruct, run

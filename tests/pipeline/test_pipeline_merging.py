@@ -31,7 +31,7 @@ from tofuse.recordings.opening import Opening
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.run_json import read_run_json
-from tofuse.results.sessions import session_sentences
+from tofuse.results.session_words import session_sentences
 from written_run_json import run_json
 
 TRUE = np.array([*HERE, *THERE])

@@ -84,7 +84,7 @@ def test_missing_sensor_files_change_nothing(room_recording):
 
 
 def test_rotating_object_has_no_gravity(tmp_path):
-    from tofuse.pipeline.options import Options, resolve
+    from tofuse.pipeline.run_options import Options, resolve
 
     assert resolve(Options(tmp_path)).priors == (GravityEdges(),)
     assert resolve(Options(tmp_path, object=True)).priors == ()

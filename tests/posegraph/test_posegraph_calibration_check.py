@@ -10,7 +10,7 @@ import pytest
 from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine

@@ -10,7 +10,7 @@ import pytest
 
 from corner_views import SHARP, corner
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.external_sensors import (

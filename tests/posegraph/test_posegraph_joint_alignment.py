@@ -10,7 +10,7 @@ import pytest
 from aligned_surfaces import OPTIONS, away, drifted, path, surfaces
 from corner_views import SHARP, corner
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph

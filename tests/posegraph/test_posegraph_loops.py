@@ -13,7 +13,7 @@ from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
-from tofuse.posegraph.given import read_loops
+from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import Confirmation, GivenLoop, LoopDetector, mean_error
 from tofuse.posegraph.nearby import Nearby, yaw
 from tofuse.posegraph.view_store import Spacing, ViewStore

@@ -17,7 +17,7 @@ from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import KeptView, ViewStore
 from tofuse.registration.base import Registration
-from tofuse.registration.confidence import ACCEPTED
+from tofuse.registration.pose_probability import ACCEPTED
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.verification import Assessment

@@ -11,7 +11,7 @@ from aligned_surfaces import path
 from corner_views import SHARP, corner, unpack
 from pair_equations import pair_equations
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import refine

@@ -24,7 +24,7 @@ from tofuse.registration import cloud_pair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.confidence import CLOUDS, Evidence
+from tofuse.registration.pose_probability import CLOUDS, Evidence
 from tofuse.registration.reduce import averaged
 from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 

@@ -5,7 +5,7 @@ import pytest
 
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels import tiles
+from tofuse.kernels import tile_sums
 from tofuse.kernels.alignment import POINT_SIZE, Residuals
 from tofuse.kernels.spurious_information import spurious_information
 from tofuse.recordings.frames import RangeFrame
@@ -221,11 +221,11 @@ def test_tile_sums_match_numpy():
     sigma = (np.sqrt(source.plane_variance) * z * z).astype(np.float32)
 
     residuals = Residuals(0.0, 1.0, 0.0, 0.0, 3.5, np.cos(0.7))
-    found, whole = tiles.tile_sums(source.images, target.target_image, T, residuals, 2, 4, 3)
-    found = found.reshape(3, 4, tiles.SIZE)
-    expected = np.zeros((3, 4, tiles.SIZE))
+    found, whole = tile_sums.tile_sums(source.images, target.target_image, T, residuals, 2, 4, 3)
+    found = found.reshape(3, 4, tile_sums.SIZE)
+    expected = np.zeros((3, 4, tile_sums.SIZE))
     upper = np.triu_indices(7)
-    products, weighed, cross = np.zeros((3, tiles.UPPER))
+    products, weighed, cross = np.zeros((3, tile_sums.UPPER))
     for i in range(1, CAMERA.height, 2):
         for j in range(1, CAMERA.width, 2):
             if z[i, j] <= 0:
@@ -256,20 +256,20 @@ def test_tile_sums_match_numpy():
             weighed += w * both
             cross += slope * both
             out = expected[i * 3 // CAMERA.height, j * 4 // CAMERA.width]
-            out[tiles.A : tiles.A + 7] += w * mean
-            out[tiles.WEIGHT] += w
-            out[tiles.RESIDUAL] += w * r
-            out[tiles.COUNT] += 1
+            out[tile_sums.A : tile_sums.A + 7] += w * mean
+            out[tile_sums.WEIGHT] += w
+            out[tile_sums.RESIDUAL] += w * r
+            out[tile_sums.COUNT] += 1
     for sums, wanted in (
-        (whole[tiles.GEOMETRY], products),
-        (whole[tiles.WEIGHED], weighed),
-        (whole[tiles.CROSS], cross),
+        (whole[tile_sums.GEOMETRY], products),
+        (whole[tile_sums.WEIGHED], weighed),
+        (whole[tile_sums.CROSS], cross),
     ):
         np.testing.assert_allclose(sums, wanted, rtol=0.02, atol=0.002 * np.abs(wanted).max())
-    np.testing.assert_array_equal(whole[tiles.PHOTO], 0)
-    assert expected[..., tiles.COUNT].sum() > 500
+    np.testing.assert_array_equal(whole[tile_sums.PHOTO], 0)
+    assert expected[..., tile_sums.COUNT].sum() > 500
     # A pixel that projects onto the border of two may be assigned to either.
-    assert np.abs(found[..., tiles.COUNT] - expected[..., tiles.COUNT]).sum() <= 4
+    assert np.abs(found[..., tile_sums.COUNT] - expected[..., tile_sums.COUNT]).sum() <= 4
     scale = np.abs(expected).max((0, 1))
     assert np.abs(found - expected).max((0, 1)) == pytest.approx(0 * scale, abs=0.02 * scale.max())
     same = scale > 0

@@ -16,7 +16,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.coarse_to_fine import CoarseToFine
-from tofuse.registration.confidence import ACCEPTED, Evidence
+from tofuse.registration.pose_probability import ACCEPTED, Evidence
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions

@@ -13,8 +13,8 @@ import pytest
 from browser import changed, chromium, watched
 from report_results import make_room
 from tofuse.report.html import write_report
-from tofuse.report.images import viridis
 from tofuse.report.pictures import draw
+from tofuse.report.thumbnails import viridis
 from tofuse.results.samples import FrameSample, FrameSamples
 
 DESK, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 800}

@@ -23,7 +23,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.report import images, plots
+from tofuse.report import plots, thumbnails
 from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
@@ -375,7 +375,7 @@ def test_initial_view_shows_most_of_the_surface():
     scene = make_scene(room()[0], {})
     for k in (0, 2, 5):
         yaw = YAW + k * np.pi / 4
-        facing = -images.view_rotation(yaw, PITCH)[2]
+        facing = -thumbnails.view_rotation(yaw, PITCH)[2]
         normals = np.tile(facing, (len(scene.points), 1))
         found = opening_yaw(replace(scene, normals=normals))
         assert np.cos(found - yaw) == pytest.approx(1)

@@ -9,7 +9,7 @@ from registration_scenes import relief, view
 from tofuse.geometry import se3
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
-from tofuse.report import images
+from tofuse.report import thumbnails
 from tofuse.report.packing import unpack
 from tofuse.report.pair_scene import (
     MAX_POINTS,
@@ -57,7 +57,7 @@ def test_colors_saturate_at_end_of_bar_and_turn_grey() -> None:
     colors = distance_colors(np.array([0, 0.005, 0.01, 0.03, 0.05, np.inf]), 0.01)
     assert len(np.unique(colors[:3], axis=0)) == 3
     assert (colors[3] == colors[2]).all()
-    assert (colors[4:] == images.GONE).all()
+    assert (colors[4:] == thumbnails.GONE).all()
 
 
 def decoded(data: dict, mode: str, which: str) -> np.ndarray:
@@ -95,7 +95,7 @@ def test_wrong_pose_is_visible() -> None:
     drawn = render_modes(right)
     assert set(drawn) == {"before", "after", "distance"}
     for image in drawn.values():
-        filled = (image != images.BACKGROUND).any(-1)
+        filled = (image != thumbnails.BACKGROUND).any(-1)
         assert 0.1 < filled.mean() < 0.95
         assert not filled[[0, -1]].all(1).any()
 

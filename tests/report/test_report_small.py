@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.report.images import BACKGROUND
 from tofuse.report.scene import Scene, render_thumbnail
+from tofuse.report.thumbnails import BACKGROUND
 
 SIZE = (160, 100)
 

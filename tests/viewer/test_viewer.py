@@ -23,12 +23,12 @@ from tofuse.cli import main
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
-from tofuse.pipeline.options import Options
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.run import run
+from tofuse.pipeline.run_options import Options
 from tofuse.recordings.frames import CloudFrame
-from tofuse.report.images import viridis
 from tofuse.report.pictures import draw
+from tofuse.report.thumbnails import viridis
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.viewer.content import Layer, colorings, layer_colors, read_content

@@ -199,7 +199,7 @@ class Result(Reconstruction):
         )
 
     def _repr_html_(self) -> str:
-        from tofuse.report import images
+        from tofuse.report import thumbnails
         from tofuse.report.scene import make_scene, render
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
@@ -208,7 +208,7 @@ class Result(Reconstruction):
         verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""
         if len(scene.points):
-            source = images.data_uri(render(scene, _THUMBNAIL))
+            source = thumbnails.data_uri(render(scene, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
 

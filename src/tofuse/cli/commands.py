@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from viser import ViserServer
 
-    from tofuse.pipeline.options import Options
+    from tofuse.pipeline.run_options import Options
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_options(arguments: argparse.Namespace) -> Options:
     """Return the options of ``tofuse run``."""
-    from tofuse.pipeline.options import Options
+    from tofuse.pipeline.run_options import Options
 
     return from_arguments(Options, arguments)
 
@@ -381,7 +381,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     from tofuse.results.folder import component_name
     from tofuse.results.ranges import in_words
     from tofuse.results.run_json import accuracy_json, plain, reasons_json
-    from tofuse.results.sessions import session_sentences
+    from tofuse.results.session_words import session_sentences
 
     d = result.diagnostics
     sessions = session_sentences(result)

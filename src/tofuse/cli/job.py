@@ -49,8 +49,8 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.cli.progress import QuietProgress, emit
     from tofuse.files.atomic import write_bytes
     from tofuse.pipeline.run import exit_status, run
-    from tofuse.report.images import encode
     from tofuse.report.scene import make_scene, render_thumbnail
+    from tofuse.report.thumbnails import encode
 
     arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:

@@ -33,8 +33,8 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.trajectory import finite_or_none
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
-from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens
 from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.view_agreement import agreement_sums, move_points, project_by_lens
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording, evenly
 

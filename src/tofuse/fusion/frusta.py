@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
-from tofuse.fusion.view_store import Views
+from tofuse.fusion.stored_views import Views
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import max_informative_depth

@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Int32, Int64
 from tofuse.fusion.range_view import RangeView
-from tofuse.fusion.view_store import Views, summaries
+from tofuse.fusion.stored_views import Views, summaries
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, enter
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import near_cubes

@@ -15,8 +15,8 @@ from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import RangeView
+from tofuse.fusion.stored_views import StoredClouds, StoredViews
 from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.fusion.view_store import StoredClouds, StoredViews
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView

@@ -17,7 +17,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import DECODED, RangeView
 from tofuse.fusion.stitching import Piece, colored, stitch
-from tofuse.fusion.view_store import Views, summaries
+from tofuse.fusion.stored_views import Views, summaries
 from tofuse.geometry import se3
 from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, index_of, mark_eighths, neighbours_of
 from tofuse.kernels.surface_nets import Vertices, make_faces, make_vertices, mark_cells

@@ -17,7 +17,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.geometry import check_kind, wrong_focal
-from tofuse.inspection.motion import Pair, aligned, aligned_pair, field_of_view
+from tofuse.inspection.pair_motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import VIEW_COLUMNS, Sample, part_starts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view

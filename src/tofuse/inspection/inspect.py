@@ -11,7 +11,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from tofuse.errors import InputError
-from tofuse.inspection import channels, facts, focal, geometry, moving, times, values
+from tofuse.inspection import channels, facts, focal, geometry, motion_checks, times, values
 from tofuse.inspection.finding import SEVERITIES, Finding
 from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import Frame
@@ -37,10 +37,10 @@ QUICK: tuple[Check, ...] = (
     values.check_wrap,
     values.check_saturation,
     values.check_flying,
-    moving.check_motion,
-    moving.check_moving_objects,
-    moving.check_still,
-    moving.check_walls,
+    motion_checks.check_motion,
+    motion_checks.check_moving_objects,
+    motion_checks.check_still,
+    motion_checks.check_walls,
 )
 CHECKS: tuple[Check, ...] = (*QUICK, focal.check_focal)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Intp
 from tofuse.errors import UnreadableFrameError
-from tofuse.inspection.motion import Pair, aligned_pair
+from tofuse.inspection.pair_motion import Pair, aligned_pair
 from tofuse.inspection.planar import Distortion, Region, fit_distortion, regions_of
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording, evenly

@@ -14,8 +14,8 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.motion import retract
 from tofuse.kernels.projection import jacobian_row, project_ray
+from tofuse.kernels.rigid_motions import retract
 
 # m; points nearer to the camera are not projected.
 _MIN_DEPTH = 0.05

@@ -12,7 +12,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.refinement import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS, G, H
+from tofuse.kernels.pair_equations import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS, G, H
 
 
 @kernel
@@ -24,7 +24,7 @@ def discount_shared_errors(
     Parameters
     ----------
     sums
-        (N, patches, PATCH_SIZE), see `refinement.target_equations`.
+        (N, patches, PATCH_SIZE), see `pair_equations.target_equations`.
     alike
         (patches, patches) correlation of the errors of patches.
     variance
@@ -32,7 +32,7 @@ def discount_shared_errors(
     which
         (K,) pairs.
     rows
-        (N, SIZE) equations of the pairs, see `refinement`; updated.
+        (N, SIZE) equations of the pairs, see `pair_equations`; updated.
     """
     for k in range(len(which)):
         _discount(sums[which[k]], alike, variance[k], rows[which[k]])

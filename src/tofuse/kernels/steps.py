@@ -10,7 +10,7 @@ from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as sums
 from tofuse.kernels.alignment import Residuals, TargetImage, accumulate, bin_edge, normal_equations
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.motion import compose, retract, twist_between
+from tofuse.kernels.rigid_motions import compose, retract, twist_between
 from tofuse.kernels.spurious_information import spurious_information
 
 # Number of points from which the spurious information is estimated.

@@ -17,9 +17,9 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.passing import Passing
 from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.checkpoint import discard_states
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import run
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.results.folder import RECORDING, OutputFolder
 from tofuse.results.types import Reconstruction
 

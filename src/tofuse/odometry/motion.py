@@ -16,7 +16,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.kernels.motion import distance_and_angle, retract, twist_between
+from tofuse.kernels.rigid_motions import distance_and_angle, retract, twist_between
 
 # Minimum of the gate, m and rad: handheld cameras at 5 to 30 frames a second stay below. At lower
 # rates the same acceleration of 3 m/s^2 moves them further, by the square of the time since the

@@ -19,7 +19,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import PROBABLE, Link, Registration
-from tofuse.registration.confidence import CERTAIN
+from tofuse.registration.pose_probability import CERTAIN
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.reduce import extent
 from tofuse.registration.search import SearchOptions

@@ -24,8 +24,8 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from tofuse.errors import Ended, InputError, OutputError
-from tofuse.files.arrays import Arrays, read_npz, write_npz
 from tofuse.files.memory import give_back
+from tofuse.files.npz import Arrays, read_npz, write_npz
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 from tofuse.pipeline.states import PIECE, StateError, decode, encode, from_json, to_json
 from tofuse.results.folder import CHECKPOINT

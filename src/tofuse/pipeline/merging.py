@@ -35,7 +35,7 @@ from tofuse.recordings.sources import JoinedSource
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
-from tofuse.results.sessions import session_sentences
+from tofuse.results.session_words import session_sentences
 from tofuse.results.types import (
     Reason,
     Reconstruction,

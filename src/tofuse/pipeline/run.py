@@ -20,13 +20,13 @@ from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.judging import device_sentence
-from tofuse.pipeline.options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.pipeline.paint import paint
 from tofuse.pipeline.priors import with_prior
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import reconstruct, view_kind
 from tofuse.pipeline.report_files import write_report_files
-from tofuse.posegraph.given import read_loops
+from tofuse.pipeline.run_options import Options, check_guess, check_unwrap, resolve, seed_of
+from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording

@@ -14,7 +14,7 @@ from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import evenly
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.results.sessions import MAX_STATED_PROBABILITY
+from tofuse.results.session_words import MAX_STATED_PROBABILITY
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
 View = PosedView[PreparedView]

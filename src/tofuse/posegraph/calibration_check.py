@@ -20,7 +20,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import (
     Refined,

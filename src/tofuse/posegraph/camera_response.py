@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph.pair_equations import (
     RefineOptions,
     directed_pairs,

@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels.motion import retract, twist_between
+from tofuse.kernels.rigid_motions import retract, twist_between
 from tofuse.normal import SIGMA_OF_MEDIAN
 from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.view_store import PosedView

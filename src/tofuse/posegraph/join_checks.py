@@ -21,7 +21,7 @@ from tofuse.posegraph.gaps import (
 from tofuse.posegraph.islands import DRIFT, Island, Islands, transformed
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
-from tofuse.registration.confidence import CONTRADICTION
+from tofuse.registration.pose_probability import CONTRADICTION
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import differ
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled

@@ -28,7 +28,7 @@ from tofuse.posegraph.islands import How, Island, Islands, Join
 from tofuse.posegraph.join_checks import VERIFY, JoinChecks, link_of
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.registration.base import Link
-from tofuse.registration.confidence import logistic
+from tofuse.registration.pose_probability import logistic
 from tofuse.registration.search import DISTINCT_M, SearchOptions
 from tofuse.registration.verification import IN_SIGHT
 from tofuse.registration.view_descriptor import (

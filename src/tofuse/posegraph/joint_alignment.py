@@ -16,7 +16,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Int64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph import robust
 from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity
@@ -83,7 +83,7 @@ class Refined:
     start
         (N, 4, 4) poses that the alignment started from.
     errors
-        (ERRORS,) of the camera, in the order of `kernels.refinement`; 0 where not estimated.
+        (ERRORS,) of the camera, in the order of `kernels.pair_equations`; 0 where not estimated.
     pairs
         (M, 2) positions of the overlapping views i < j.
     moved
@@ -161,7 +161,7 @@ def refine(
     options
         See `RefineOptions`.
     calibrate
-        Errors of the camera to estimate as well, by their number in `kernels.refinement`.
+        Errors of the camera to estimate as well, by their number in `kernels.pair_equations`.
     priors
         Measurements by other sensors.
     pairs

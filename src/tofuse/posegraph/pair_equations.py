@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Int64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.alignment import POINT_SIZE
 from tofuse.kernels.shared_error import discount_shared_errors
@@ -92,7 +92,7 @@ class DirectedPairs:
     sources
         Points of all views.
     rows
-        (P, SIZE) sums of each pair, in the order of `kernels.refinement`.
+        (P, SIZE) sums of each pair, in the order of `kernels.pair_equations`.
     sums
         (P, PATCHES, PATCH_SIZE) the same by patch of the target, or no patches.
     """
@@ -109,8 +109,16 @@ class DirectedPairs:
 
     def of(self, which: Intp) -> DirectedPairs:
         """Return some of the pairs, without their normal equations."""
-        columns = self.target, self.source, *self._scales(), self.max_scale
-        return DirectedPairs(*(column[which] for column in columns), self.sources)
+        exposure, scale_g, scale_p = (column[which] for column in self._scales())
+        return DirectedPairs(
+            self.target[which],
+            self.source[which],
+            exposure,
+            scale_g,
+            scale_p,
+            self.max_scale[which],
+            self.sources,
+        )
 
     def put(self, which: Intp, part: DirectedPairs) -> None:
         """Take over the exposure and scales of some of the pairs."""

@@ -13,7 +13,7 @@ from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.bounds import Bounded, Bounds
 from tofuse.files.spill import Spill
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.calibration_check import (

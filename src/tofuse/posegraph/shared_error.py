@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int64
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.registration.prepared_view import PreparedView
 
 # Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
@@ -87,9 +87,9 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     Parameters
     ----------
     sums
-        (P, PATCHES, PATCH_SIZE) of `kernels.refinement.target_equations`.
+        (P, PATCHES, PATCH_SIZE) of `kernels.pair_equations.target_equations`.
     rows
-        (P, SIZE) normal equations of the pairs, see `kernels.refinement`.
+        (P, SIZE) normal equations of the pairs, see `kernels.pair_equations`.
     correlation
         (PATCHES, PATCHES) of the errors.
     """

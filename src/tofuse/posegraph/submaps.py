@@ -17,7 +17,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels.executors import executor
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_evenly, support_of

@@ -15,7 +15,7 @@ from tofuse.arrays import Float32, Float64, Int64, Intp
 from tofuse.files.spill import Scratch, Spill
 from tofuse.geometry import se3
 from tofuse.geometry.places import PlaceCounts
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA, TargetImage
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error

@@ -22,9 +22,9 @@ from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
-from tofuse.registration.confidence import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.icp import Icp
+from tofuse.registration.pose_probability import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.remapping import Remapping

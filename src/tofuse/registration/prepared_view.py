@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.arrays import Float32
 from tofuse.kernels.alignment import TargetImage, ViewImages, make_target
 from tofuse.kernels.median import median
-from tofuse.kernels.surface import albedo_image, halve, smooth_and_slope
 from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.view_planes import albedo_image, halve, smooth_and_slope
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.projection import Projection, projection_of
 from tofuse.registration.surface_options import SurfaceOptions

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Float32
-from tofuse.kernels.surface import fit_planes
 from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.view_planes import fit_planes
 from tofuse.registration.prepared_view import PreparedView
 
 _CHUNKS = 4

@@ -24,10 +24,10 @@ from functools import cache
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.kernels import tiles as kernels
+from tofuse.kernels import tile_sums as kernels
 from tofuse.kernels.alignment import Residuals
 from tofuse.kernels.median import median
-from tofuse.kernels.motion import distance_and_angle
+from tofuse.kernels.rigid_motions import distance_and_angle
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
 

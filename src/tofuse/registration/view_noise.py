@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float32
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.median import median
-from tofuse.kernels.surface import fit_planes
+from tofuse.kernels.view_planes import fit_planes
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.projection import Projection

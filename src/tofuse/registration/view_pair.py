@@ -17,7 +17,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.base import Registration
-from tofuse.registration.confidence import CERTAIN, CONTRADICTION, Evidence
+from tofuse.registration.pose_probability import CERTAIN, CONTRADICTION, Evidence
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import (
     UNITS,

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, UInt8
-from tofuse.kernels.surface import fit_planes
 from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.view_planes import fit_planes
 from tofuse.registration.surface_options import SurfaceOptions
 
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that

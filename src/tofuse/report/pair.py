@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
-from tofuse.report import images, pair_words, words
+from tofuse.report import pair_words, thumbnails, words
 from tofuse.report.html import asset, readable, script, template
 from tofuse.report.pair_scene import (
     MODES,
@@ -44,7 +44,7 @@ def render_pair(result: PairResult) -> str:
     scene = pair_scene(result)
     head, tail = pair_words.decision(result)
     drawn = render_modes(scene)
-    pictures = {mode: images.data_uri(image) for mode, image in drawn.items()}
+    pictures = {mode: thumbnails.data_uri(image) for mode, image in drawn.items()}
     return template("pair.html.j2").render(
         title=f"{_short(result.source)} registered to {_short(result.target)}",
         version=__version__,
@@ -59,7 +59,7 @@ def render_pair(result: PairResult) -> str:
         pictures=[(mode, _TITLES[mode], pictures[mode]) for mode in MODES],
         source_color=_css(SOURCE),
         target_color=_css(TARGET),
-        none_color=_css(images.GONE),
+        none_color=_css(thumbnails.GONE),
         bar=color_bar(),
         ticks=[_mm(scene.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
         beyond=words.length(scene.none_m),

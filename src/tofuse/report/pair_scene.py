@@ -11,7 +11,7 @@ from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.shape import normals_at
-from tofuse.report import images
+from tofuse.report import thumbnails
 from tofuse.report.packing import normal_bytes, pack, steps_of
 from tofuse.report.scene import Scene, extreme_points, random_subset, render, spacing_of
 from tofuse.results.pair import LocalView, PairResult
@@ -124,14 +124,14 @@ def pair_scene(result: PairResult) -> PairScene:
 def distance_colors(distance: Float64, cap_m: float) -> UInt8:
     """Return colours (N, 3) of distances in m; grey for points without a counterpart."""
     fraction = np.clip(distance / cap_m, 0, 1)
-    colors = images.viridis(_FROM_BASE + (1 - _FROM_BASE) * fraction)
-    colors[distance > _NONE_CAPS * cap_m] = images.GONE
+    colors = thumbnails.viridis(_FROM_BASE + (1 - _FROM_BASE) * fraction)
+    colors[distance > _NONE_CAPS * cap_m] = thumbnails.GONE
     return colors
 
 
 def color_bar() -> str:
     """Return the colour bar as a CSS gradient."""
-    stops = images.viridis(np.linspace(_FROM_BASE, 1, 9))
+    stops = thumbnails.viridis(np.linspace(_FROM_BASE, 1, 9))
     return f"linear-gradient(to right, {', '.join(f'rgb({r},{g},{b})' for r, g, b in stops)})"
 
 
@@ -243,7 +243,7 @@ def render_modes(scene: PairScene) -> dict[str, UInt8]:
             normals=np.concatenate([source.normals, target.normals]) if have else None,
             spacing=max(source.spacing, target.spacing),
         )
-        eye = _fit_eye(seen[mode], images.view_rotation(scene.yaw, scene.pitch), _SIZE)
+        eye = _fit_eye(seen[mode], thumbnails.view_rotation(scene.yaw, scene.pitch), _SIZE)
         out[mode] = render(
             both,
             _SIZE,

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from tofuse.kernels.threads import run_all
-from tofuse.report.images import GONE, REMOVED, encode, grey, viridis
+from tofuse.report.thumbnails import GONE, REMOVED, encode, grey, viridis
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
 

@@ -13,7 +13,7 @@ from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
-from tofuse.report import images
+from tofuse.report import thumbnails
 from tofuse.report.packing import normal_bytes, pack, steps_of
 from tofuse.results.types import Reconstruction
 
@@ -277,7 +277,7 @@ def opening_yaw(scene: Scene) -> float:
         return YAW
     sample = np.nan_to_num(normals[:: -(-len(normals) // _SAMPLED)].astype(float))
     yaws = YAW + np.arange(8) * np.pi / 4
-    towards = np.array([-images.view_rotation(yaw, PITCH)[2] for yaw in yaws])
+    towards = np.array([-thumbnails.view_rotation(yaw, PITCH)[2] for yaw in yaws])
     seen = np.maximum(sample @ towards.T, 0).sum(0)
     best = int(seen.argmax())
     return float(yaws[best]) if seen[best] > _CLEARLY * seen[0] else YAW
@@ -346,7 +346,7 @@ def render(
         Minimum size of a point, pixels.
     """
     center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
-    R = images.view_rotation(yaw, pitch)
+    R = thumbnails.view_rotation(yaw, pitch)
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -R @ center
@@ -361,15 +361,15 @@ def render(
         if peel:
             points, colors = points[facing >= 0], colors[facing >= 0]
     radius = int(np.clip(np.ceil(scene.spacing * scale), least, 6))
-    drawn = images.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
+    drawn = thumbnails.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
     out = np.empty((*drawn.shape[:2], 3), np.uint8)
-    out[:] = images.BACKGROUND
+    out[:] = thumbnails.BACKGROUND
     seen = drawn[..., 3] > 0
     out[seen] = drawn[seen, :3]
     edge, step = 0.018 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
         dots = _sampled(camera_lines(poses, edge, step))
-        ink = images.splat(
+        ink = thumbnails.splat(
             dots,
             np.broadcast_to(np.array(color, np.uint8), dots.shape),
             T,
@@ -386,7 +386,7 @@ def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
     """Render the model so that it fills a small image (H, W, 3)."""
     if len(scene.points) == 0:
         return render(scene, size)
-    framing = images.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
+    framing = thumbnails.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
     R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
     # Far enough for the nearest points, which appear largest.
     depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
@@ -436,7 +436,7 @@ def _colors(cloud: Cloud, chosen: Intp, points: Float64) -> UInt8:
 def height_colors(points: Float64) -> UInt8:
     """Return colours (N, 3) of points by height, which is -y."""
     low, high = height_range(points)
-    return images.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
+    return thumbnails.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
 
 
 def height_range(points: Float64) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.report import cameras, images, plots, words
+from tofuse.report import camera_frusta, plots, thumbnails, words
 from tofuse.report.fields import fields
 from tofuse.report.scene import Scene, opening_yaw, packed, render
 from tofuse.report.subject import OUTER, Figure, Subject, Values
@@ -26,18 +26,18 @@ def model(s: Subject) -> Values:
         }
     laid = scene.view_rotation(s.straight)
     by = (
-        {field.name: field for field in fields(laid, cameras.position_errors(s))}
+        {field.name: field for field in fields(laid, camera_frusta.position_errors(s))}
         if len(scene.points)
         else {}
     )
     own = _own_colors(s)
     data = packed(laid) | {
         "fields": {name: field.packed() for name, field in by.items()},
-        "frames": cameras.packed(s),
+        "frames": camera_frusta.packed(s),
     }
     return {
         "scene": data,
-        "still": images.data_uri(render(laid, yaw=opening_yaw(laid))),
+        "still": thumbnails.data_uri(render(laid, yaw=opening_yaw(laid))),
         "toggles": _toggles(scene),
         "rig": _rig(s),
         "colorings": ([("", own)] if own else [])
@@ -67,7 +67,7 @@ def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
 
 def _rig(s: Subject) -> list[tuple[str, str]]:
     """Name and colour of each camera of a rig."""
-    rig = cameras.rig_cameras(s)
+    rig = camera_frusta.rig_cameras(s)
     if rig is None:
         return []
     return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tofuse.report import words
 from tofuse.report.subject import ROWS, Subject, Values
 from tofuse.results.output import CHANGE_COLORS
-from tofuse.results.sessions import probability_text
+from tofuse.results.session_words import probability_text
 from tofuse.results.types import SessionChange, SessionPair
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 
 from tofuse.recordings.frames import RangeFrame
-from tofuse.report import images, words
+from tofuse.report import thumbnails, words
 from tofuse.report.pictures import FATES, KINDS, depth_range
 from tofuse.report.section_frames import frame_text
 from tofuse.report.subject import Subject, Values
@@ -20,8 +20,8 @@ def filters(s: Subject) -> Values:
     shown = []
     if steps:
         raw = steps[0][1]
-        limits = images.depth_limits(raw)
-        framing = images.Framing.around(raw.points.astype(float), (_FILTER, 240))
+        limits = thumbnails.depth_limits(raw)
+        framing = thumbnails.Framing.around(raw.points.astype(float), (_FILTER, 240))
         last = raw
         for k, (name, frame) in enumerate(steps):
             if k:
@@ -39,14 +39,14 @@ def filters(s: Subject) -> Values:
                 lost = None
                 if k and isinstance(last, RangeFrame):
                     lost = last.valid & ~frame.valid
-                depth = images.depth_image(frame, limits, lost, _FILTER)
-                pictures.append(images.data_uri(depth))
-            pictures.append(images.data_uri(images.cloud_image(frame, limits, framing)))
+                depth = thumbnails.depth_image(frame, limits, lost, _FILTER)
+                pictures.append(thumbnails.data_uri(depth))
+            pictures.append(thumbnails.data_uri(thumbnails.cloud_image(frame, limits, framing)))
             shown.append({"name": name, "text": text, "images": pictures})
             last = frame
     note = ""
     if steps:
-        low, high = images.depth_limits(steps[0][1])
+        low, high = thumbnails.depth_limits(steps[0][1])
         note = (
             f"Frame {steps[0][1].index} after each filter; colours from dark (near, "
             f"{words.length(low)}) to bright (far, {words.length(high)})."
@@ -69,15 +69,15 @@ def filters(s: Subject) -> Values:
 def clouds(s: Subject) -> Values:
     """Return samples of the recording, if its views are clouds."""
     frames = s.extras.clouds
-    every = [images.depth_limits(f) for f in frames if len(f)]
+    every = [thumbnails.depth_limits(f) for f in frames if len(f)]
     limits = (0.0, 1.0)
     if every:
         limits = (min(low for low, _ in every), max(high for _, high in every))
     out = []
     for frame in frames:
-        framing = images.Framing.around(frame.points.astype(float), (_THUMBNAIL, 165))
-        drawn = images.cloud_image(frame, limits, framing)
-        out.append({"index": frame.index, "image": images.data_uri(drawn)})
+        framing = thumbnails.Framing.around(frame.points.astype(float), (_THUMBNAIL, 165))
+        drawn = thumbnails.cloud_image(frame, limits, framing)
+        out.append({"index": frame.index, "image": thumbnails.data_uri(drawn)})
     note = "Sample views before filtering, from above and to the side."
     if every:
         note += (

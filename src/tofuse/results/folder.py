@@ -21,7 +21,8 @@ from typing import Self
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import UNFINISHED
 from tofuse.files.locking import Claim
-from tofuse.files.moving import (
+from tofuse.files.reading import read_text
+from tofuse.files.staging import (
     Names,
     check_error,
     check_interrupted,
@@ -31,7 +32,6 @@ from tofuse.files.moving import (
     places,
     recover,
 )
-from tofuse.files.reading import read_text
 
 STAGING = f"{UNFINISHED}unfinished"
 LOCK = f"{UNFINISHED}lock"

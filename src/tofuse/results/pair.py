@@ -15,9 +15,9 @@ from tofuse._version import __version__
 from tofuse.arrays import Float64
 from tofuse.files.atomic import write_text
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.moving import Names
 from tofuse.files.ply import write_ply
 from tofuse.files.pose import pose_text
+from tofuse.files.staging import Names
 from tofuse.geometry import se3
 from tofuse.recordings.cloud_files import MAP_COORDINATES_M
 from tofuse.recordings.frames import Frame

@@ -17,7 +17,7 @@ from tofuse.recordings.rig import Disagreement, Rig, RigCamera
 from tofuse.rigs.check import Moved, compare_in_scene
 from tofuse.rigs.inputs import Camera, open_cameras
 from tofuse.rigs.moving_rig import MovingRig, calibrate_moving
-from tofuse.rigs.still import StillRig, calibrate_still, stands_still
+from tofuse.rigs.static_rig import StillRig, calibrate_still, stands_still
 
 Motion = Literal["auto", "still", "moving"]
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels import rig as kernels
+from tofuse.kernels import rig_residuals as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round

@@ -24,7 +24,7 @@ from tofuse.kernels.threads import run_all
 from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
-from tofuse.registration.confidence import ACCEPTED, Evidence
+from tofuse.registration.pose_probability import ACCEPTED, Evidence
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, differ
 from tofuse.registration.verification import comparable

@@ -16,10 +16,10 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.pipeline.config import Config
-from tofuse.pipeline.options import Options, resolve
 from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.run_options import Options, resolve
 from tofuse.posegraph.accuracy import HIDDEN
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby

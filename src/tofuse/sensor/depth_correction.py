@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
-from tofuse.files.arrays import read_npz
 from tofuse.files.atomic import replacing
+from tofuse.files.npz import read_npz
 
 _MAX_BYTES = 1 << 30
 KEYS = ("range_m", "bias_m", "pixel_bias_m")

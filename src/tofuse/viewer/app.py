@@ -14,9 +14,9 @@ from tofuse.errors import InputError
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
-from tofuse.report.images import viridis
 from tofuse.report.pictures import FATES, Pictures
 from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
+from tofuse.report.thumbnails import viridis
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result

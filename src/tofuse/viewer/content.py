@@ -19,9 +19,9 @@ from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.normal import OF_95_PERCENT
-from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.report.scene import RigCameras
+from tofuse.report.thumbnails import viridis
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.run_json import (

@@ -12,7 +12,7 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.geometry import se3
 from tofuse.normal import OF_95_PERCENT
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.report.images import data_uri, depth_image, depth_limits, subsample, viridis
+from tofuse.report.thumbnails import data_uri, depth_image, depth_limits, subsample, viridis
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
 from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
-from tofuse.files.arrays import read_npz
+from tofuse.files.npz import read_npz
 from tofuse.report.extras import ReportExtras
 from tofuse.report.html import write_report
 from tofuse.report.pictures import KINDS, Pictures, draw

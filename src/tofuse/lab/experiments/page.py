@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
 from tofuse.errors import InputError
-from tofuse.files.moving import Names
+from tofuse.files.staging import Names
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks

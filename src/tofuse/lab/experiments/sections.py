@@ -15,7 +15,7 @@ from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Ru
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.scenes import box, room
-from tofuse.report import images
+from tofuse.report import thumbnails
 
 _EXAMPLE_SIGMA = 0.09
 
@@ -73,10 +73,10 @@ def case_section(result: CaseResult) -> dict[str, Any]:
 
 
 def _picture(frame: Any) -> str:
-    image = images.amplitude_image(frame)
+    image = thumbnails.amplitude_image(frame)
     if image is None:
-        image = images.depth_image(frame, images.depth_limits(frame), None)
-    return images.data_uri(image, jpeg=True)
+        image = thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+    return thumbnails.data_uri(image, jpeg=True)
 
 
 def _rows(result: CaseResult) -> list[dict[str, Any]]:

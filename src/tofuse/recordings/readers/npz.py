@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.arrays import read_npz
+from tofuse.files.npz import read_npz
 from tofuse.files.reading import read_head
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable
 from tofuse.parts import part

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Plan, SceneOptions
-from tofuse.lab.simulation.scenes.assembly import Assembly, studio
+from tofuse.lab.simulation.scenes.composition import Assembly, studio
 from tofuse.lab.simulation.texture import Material
 
 WIDTH, DEPTH, HEIGHT = 0.300, 0.300, 0.400

@@ -10,7 +10,7 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.scene import Plan, SceneOptions
-from tofuse.lab.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.scenes.composition import Assembly
 from tofuse.lab.simulation.texture import Material
 
 # Inner corners, and the side of a square in m.

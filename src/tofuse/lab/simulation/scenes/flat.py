@@ -18,7 +18,7 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Plan, SceneOptions
 from tofuse.lab.simulation.scenes import furniture, household
-from tofuse.lab.simulation.scenes.assembly import Assembly, placed
+from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.texture import Material
 
 HALF, HEIGHT, WALL = 2.2, 2.5, 0.12

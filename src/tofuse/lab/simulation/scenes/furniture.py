@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation.mesh import Mesh
-from tofuse.lab.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.scenes.composition import Assembly
 from tofuse.lab.simulation.texture import Material
 
 PLASTIC = Material("chair frame", 0.16, 0.0, "plain", gloss=0.05)

@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation.mesh import Mesh
-from tofuse.lab.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.scenes.composition import Assembly
 from tofuse.lab.simulation.texture import Material
 
 OAK = Material("oak", 0.46, 0.2, "wood", (0.9, 0.9, 0.05))

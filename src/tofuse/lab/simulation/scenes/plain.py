@@ -5,7 +5,7 @@ from __future__ import annotations
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Plan, SceneOptions
-from tofuse.lab.simulation.scenes.assembly import Assembly, shell
+from tofuse.lab.simulation.scenes.composition import Assembly, shell
 from tofuse.lab.simulation.texture import Material
 
 WALL = Material("wall", 0.65, 0.2, "noise", (0.5, 0.5, 0.5))

@@ -8,7 +8,7 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Plan, SceneOptions
 from tofuse.lab.simulation.scenes import furniture
-from tofuse.lab.simulation.scenes.assembly import Assembly, placed, shell
+from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
 from tofuse.lab.simulation.texture import Material
 
 RAIL_LENGTH = 0.90

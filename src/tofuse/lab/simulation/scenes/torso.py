@@ -9,9 +9,9 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.mesh import Mesh
 from tofuse.lab.simulation.scene import Plan, SceneOptions
-from tofuse.lab.simulation.scenes import furniture, implicit
-from tofuse.lab.simulation.scenes.assembly import Assembly, studio
-from tofuse.lab.simulation.scenes.implicit import Shape, ellipsoid, limb
+from tofuse.lab.simulation.scenes import blends, furniture
+from tofuse.lab.simulation.scenes.blends import Shape, ellipsoid, limb
+from tofuse.lab.simulation.scenes.composition import Assembly, studio
 from tofuse.lab.simulation.texture import Material
 
 DISTANCE = 1.45
@@ -71,15 +71,15 @@ def body() -> list[tuple[Shape, float, Material]]:
 def person() -> tuple[Mesh, list[Material]]:
     """Triangulate the body; returns the mesh and the materials of its surfaces."""
     parts = body()
-    shape = implicit.blend([(s, width) for s, width, _ in parts])
-    mesh = implicit.surface_net(shape, (-0.25, -0.36, 0.0), (0.66, 0.36, 1.46), GRID)
+    shape = blends.blend([(s, width) for s, width, _ in parts])
+    mesh = blends.surface_net(shape, (-0.25, -0.36, 0.0), (0.66, 0.36, 1.46), GRID)
     materials = [SHIRT, TROUSERS, SKIN, HAIR]
 
     def distances(p: Float64) -> Float64:
         """Distance (4, V) in m of points to the nearest part of each material."""
         return np.stack([np.min([s(p) for s, _, m in parts if m is own], 0) for own in materials])
 
-    vertices = implicit.projected(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
+    vertices = blends.projected(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
     mesh = Mesh(vertices, mesh.faces, mesh.surface)
     return Mesh(vertices, mesh.faces, distances(mesh.corners().mean(1)).argmin(0)), materials
 

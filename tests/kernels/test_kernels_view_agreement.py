@@ -10,7 +10,7 @@ import pytest
 from tofuse.evaluation.consistency import SurfaceImage
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
-from tofuse.kernels.consistency import agreement_sums, move_points
+from tofuse.kernels.view_agreement import agreement_sums, move_points
 from tofuse.recordings.frames import RangeFrame
 
 SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)

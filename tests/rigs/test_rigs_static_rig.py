@@ -16,7 +16,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.still import minimum_cost_lag
+from tofuse.rigs.static_rig import minimum_cost_lag
 
 STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)]
 INTERVAL_S = 0.1

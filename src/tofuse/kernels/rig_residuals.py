@@ -1,6 +1,7 @@
 """Point-to-plane residuals between views of two cameras of a rig, each with its own range offset.
 
-As in `refinement`, source points are compared with the plane of the target pixel they project to.
+As in `pair_equations`, source points are compared with the plane of the target pixel that they
+project to.
 Every point gives a row of its own, as the cameras' unknowns are shared by many pairs of views.
 """
 

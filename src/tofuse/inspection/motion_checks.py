@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.inspection import channels
 from tofuse.inspection.finding import Finding
-from tofuse.inspection.motion import Pair
+from tofuse.inspection.pair_motion import Pair
 from tofuse.inspection.sample import Sample
 
 # Smaller motions count as standing still.

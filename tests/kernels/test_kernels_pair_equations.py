@@ -10,7 +10,7 @@ import pytest
 from corner_views import SHARP, corner, unpack
 from pair_equations import KNOWN, pair_equations
 from tofuse.geometry import se3
-from tofuse.kernels import refinement as kernels
+from tofuse.kernels import pair_equations as kernels
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import points_of
 from tofuse.registration.surface_options import SurfaceOptions

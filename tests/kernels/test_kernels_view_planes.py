@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.geometry.cameras import BrownConrady, Pinhole
 from tofuse.kernels.median import median
-from tofuse.kernels.surface import (
+from tofuse.kernels.view_planes import (
     albedo_image,
     fit_planes,
     halve,
