@@ -7,14 +7,14 @@ import numpy as np
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import pair_equations as kernels
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.surface_options import Smoothed, SurfaceOptions
+from tofuse.registration.surface_options import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 
 
 # No plane fit bridges the edges of the corner, so that the fits are exact. In images as coarse as
 # these, the half width is 2 pixels.
-SHARP = SurfaceOptions(radii=(4,), flatness=1e-5, smoothed=Smoothed(noise=0))
+SHARP = SurfaceOptions(radii=(4,), flatness=1e-5, fine_scale=FineScale(noise=0))
 
 
 def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0) -> RangeFrame:

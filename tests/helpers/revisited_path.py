@@ -14,10 +14,10 @@ from tofuse.odometry.base import Step, Tracker
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import Smoothed, SurfaceOptions
+from tofuse.registration.surface_options import FineScale, SurfaceOptions
 
 ALL = Spacing(angle=0, distance=0)
-OPTIONS = SurfaceOptions(radii=(4,), smoothed=Smoothed(noise=0))
+OPTIONS = SurfaceOptions(radii=(4,), fine_scale=FineScale(noise=0))
 
 
 DRIFT = se3.exp(np.array([0.004, -0.003, 0.004, 0.002, -0.003, 0.002]))

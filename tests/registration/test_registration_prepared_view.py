@@ -15,12 +15,12 @@ from tofuse.registration.extended_planes import with_extended_planes
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projection import Projection
 from tofuse.registration.projective import ProjectiveOptions, Target, align
-from tofuse.registration.surface_options import Smoothed, SurfaceOptions
+from tofuse.registration.surface_options import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1
 OPTIONS = SurfaceOptions()
-NEVER = Smoothed(noise=0)
+NEVER = FineScale(noise=0)
 
 
 def wall(camera=CAMERA, sigma=0.0, seed=0, *, kind="z", amplitude="raw", spread=0.0, texture=0.0):
@@ -290,7 +290,7 @@ def smoothed(sigma, seed):
 
 def test_curved_surface_is_planar_within_stated_noise():
     frame = smoothed(0.01, 1)
-    strict = replace(OPTIONS, flatness=0.0, smoothed=NEVER)
+    strict = replace(OPTIONS, flatness=0.0, fine_scale=NEVER)
     without_sigma = prepare_view(frame, strict)
     with_sigma = prepare_view(
         replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict
@@ -305,7 +305,7 @@ def test_nearly_flat_surface_is_planar_without_noise():
     frame = smoothed(0.0005, 1)
     waves = np.s_[4:-4, 60:-4]
     strict, default = (
-        prepare_view(frame, replace(OPTIONS, flatness=f, smoothed=NEVER)) for f in (0.0, 0.002)
+        prepare_view(frame, replace(OPTIONS, flatness=f, fine_scale=NEVER)) for f in (0.0, 0.002)
     )
     strict, default = ((v.planes[waves][..., 3] > 0).mean() for v in (strict, default))
     assert strict < 0.75 < 0.95 < default
@@ -321,7 +321,7 @@ def test_small_shapes_are_kept_if_camera_smooths_its_noise():
         prepare_view(replace(frame, depth=(depth + n).astype(np.float32)), options)
         for n, options in (
             (0 * noise, OPTIONS),
-            (0 * noise, replace(OPTIONS, smoothed=NEVER)),
+            (0 * noise, replace(OPTIONS, fine_scale=NEVER)),
             (noise, OPTIONS),
         )
     )
@@ -511,4 +511,4 @@ def test_windows_are_smaller_in_coarse_images():
 
 def test_windows_are_small_where_few_pixels_determine_a_slope():
     assert OPTIONS.for_image(0.005, noise=0.002).radii == OPTIONS.radii
-    assert OPTIONS.for_image(0.01, noise=0.002).radii == OPTIONS.smoothed.radii
+    assert OPTIONS.for_image(0.01, noise=0.002).radii == OPTIONS.fine_scale.radii

@@ -13,7 +13,7 @@ _COARSE = 0.01
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class FineScale:
     """Preparation of views with little noise, or smoothed by the camera, at a finer scale.
 
     In such views noise is no limit, and the structures that constrain the pose may be small.
@@ -66,7 +66,7 @@ class SurfaceOptions:
         Exponent of the range by which colour (as if lit by a lamp on the camera) or infrared
         images of kind "ir" get darker; None to estimate it from the recording. A view alone is
         taken for one in ambient light, or for that of a time-of-flight camera.
-    smoothed
+    fine_scale
         Options for views with hardly any noise.
     """
 
@@ -82,7 +82,7 @@ class SurfaceOptions:
     albedo_radius: int = 1
     falloff: float | None = None
     range_falloff: float | None = None
-    smoothed: Smoothed = Smoothed()
+    fine_scale: FineScale = FineScale()
 
     def for_image(self, pitch: float, noise: float = math.inf) -> SurfaceOptions:
         """Return the options for an image with this resolution and noise.
@@ -97,9 +97,9 @@ class SurfaceOptions:
         noise
             Between neighbouring pixels, relative to the depth.
         """
-        s, options = self.smoothed, self
-        if noise < s.noise * pitch:
-            options = replace(self, radii=s.radii, edge_margin=s.edge_margin, fill=s.fill)
+        fine, options = self.fine_scale, self
+        if noise < fine.noise * pitch:
+            options = replace(self, radii=fine.radii, edge_margin=fine.edge_margin, fill=fine.fill)
         scale = min(1.0, _COARSE / pitch)
         return replace(
             options,
