@@ -34,6 +34,7 @@ _VARIABLES = {
     PAGE: "page",
 }
 _MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
+_MAX_QUANTILE = 50_000  # points of which quantiles are computed
 _SMALL_M = 0.6
 _WIDTH = 440  # of a plan, in pixels
 _STYLE: Any = {
@@ -211,7 +212,8 @@ def limits(
     `outer` percent of the points are left out at each end. The border is `room` of the size,
     and at least `least` m.
     """
-    boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in groups if len(g)]
+    some = [g[:: -(-len(g) // _MAX_QUANTILE)] if outer else g for g in groups if len(g)]
+    boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in some]
     if not boxes:
         return np.array([[-0.5, -0.5], [0.5, 0.5]])
     low = np.min([b[0] for b in boxes], axis=0)

@@ -24,6 +24,7 @@ _MAX_PATH = 1000  # segments of a trajectory
 _FAR = 1.8  # times the size of the model: then it is framed without the cameras
 _SAMPLED, _CLEARLY = 5000, 1.05  # sampled normals, and the ratio that decides
 _DIRECTIONS = 100  # in which the outermost points are framed
+_MAX_FRAMED = 50_000  # of these points
 # Of the cameras of a rig, in their order; the first is that of any camera.
 CAMERA_COLORS = (
     (90, 176, 245), (243, 122, 160), (95, 208, 138), (226, 200, 84),
@@ -401,7 +402,7 @@ def _sampled(lines: Float64, number: int = 24) -> Float64:
 
 
 def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
-    """Return the extreme points (K, 3) in many directions, without outliers.
+    """Return the extreme points (K, 3) in many directions, without outliers, of a sample.
 
     Parameters
     ----------
@@ -410,6 +411,7 @@ def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
     outer
         Percentage of points at each end of each axis that count as outliers.
     """
+    points = points[random_subset(len(points), _MAX_FRAMED)]
     low, high = np.percentile(points, [outer, 100 - outer], axis=0)
     inside = points[((points >= low) & (points <= high)).all(1)]
     points = inside if len(inside) else points
