@@ -19,6 +19,7 @@ from leaders import Board, Score, default_made
 from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.parts import name_of
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.reconstruct import reconstruct
 
@@ -52,9 +53,10 @@ class Sequences(Board):
 
     def methods(self) -> Sequence[str]:
         """See `Board`: configurations, `default` with one part replaced, and peers."""
-        out = [*_METHODS]
+        out, config = [*_METHODS], from_method("default")
         for kind in ("odometry", "refinement", "optimiser"):
-            out += [f"{kind} {name}" for name in default_made(kind)]
+            own = name_of(getattr(config, kind))
+            out += [f"{kind} {name}" for name in default_made(kind) if name != own]
         return [*out, *(label for label, module in _PEERS.items() if find_spec(module))]
 
     def cases(self, seeds: int) -> Sequence[str]:
