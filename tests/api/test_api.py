@@ -67,6 +67,7 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
+@pytest.mark.slow
 def test_saved_result_round_trips(result, tmp_path):
     assert result.save(tmp_path / "out") == tmp_path / "out"
     again = tofuse.load(tmp_path / "out")
@@ -329,6 +330,7 @@ def test_options_follow_config_file_schema(arrays) -> None:
             tofuse.reconstruct(recording, wrong)
 
 
+@pytest.mark.slow
 def test_fitted_filter_is_in_report(tmp_path) -> None:
     simulate("box", tmp_path / "rec", every=20, frames=6, effects=Effects.none(shot_noise=True))
     options = {"filters": [{"part": "background"}], "fusion": {"voxel_m": 0.02}}

@@ -60,6 +60,7 @@ def failing(k: int) -> int:
     raise ValueError(f"piece {k}")
 
 
+@pytest.mark.slow
 def test_cluster_run_gives_same_bytes(
     batch_benchmark, cluster: str, tmp_path: Path, monkeypatch
 ) -> None:
@@ -85,6 +86,7 @@ def test_cluster_run_gives_same_bytes(
     )
 
 
+@pytest.mark.slow
 def test_cluster_refinement_is_bit_identical(cluster: str) -> None:
     truth = path(30)
     views, start = surfaces(truth, noise=0.005), drifted(truth)
@@ -148,6 +150,7 @@ def test_worker_error_is_raised_as_in_local_run(cluster) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_lost_scheduler_falls_back_to_local_execution(batch_benchmark) -> None:
     messages: list[str] = []
     with batch_benchmark.local_cluster(1) as (address, _):

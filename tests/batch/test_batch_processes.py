@@ -85,6 +85,7 @@ def running(out: Path) -> bool:
     return (out / "jobs").is_dir() and any(r["state"] == "running" for r in records(out))
 
 
+@pytest.mark.slow
 def test_bad_recordings_do_not_stop_batch(room_recording: Path, tmp_path: Path, capsys) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
@@ -125,6 +126,7 @@ def test_bad_recordings_do_not_stop_batch(room_recording: Path, tmp_path: Path, 
     assert (out / room_recording.name / "run.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_killed_jobs_and_batch_are_resumed(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
@@ -169,6 +171,7 @@ def started_cluster(batch_benchmark: ModuleType, kind: str, folder: Path) -> Sta
     return batch_benchmark.own_processes(2, folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LocalCluster", "own processes"])
 def test_killed_dask_workers_lose_no_results(
     kind: str, batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
@@ -182,6 +185,7 @@ def test_killed_dask_workers_lose_no_results(
     assert same(batch_benchmark, single_runs, out)
 
 
+@pytest.mark.slow
 def test_batch_resumes_after_lost_scheduler(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
@@ -219,6 +223,7 @@ def test_unreachable_scheduler_is_reported(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_workers_without_tofuse_are_reported(
     batch_benchmark: ModuleType, listed: Path, tmp_path: Path, monkeypatch
 ) -> None:

@@ -68,6 +68,7 @@ def test_script_prints_help(script):
     assert "--threads" in done.stdout
 
 
+@pytest.mark.slow
 def test_end_to_end_run_is_measured(scripts, small_room):
     end_to_end = scripts["end_to_end"]
     room = small_room / "recordings" / "room"
@@ -87,6 +88,7 @@ def test_end_to_end_run_is_measured(scripts, small_room):
         end_to_end.tofuse_run(room / "nothing", [], 1)
 
 
+@pytest.mark.slow
 def test_tracking_benchmark_runs_without_peers(scripts, small_room, tmp_path, monkeypatch, capsys):
     tracking = scripts["tracking"]
     for name in ("open3d", "small_gicp", "kiss_icp"):
@@ -187,6 +189,7 @@ def test_undistorted_images_show_same_surface(scripts):
     assert np.abs(untouched.points @ normal - distance).max() > 0.03
 
 
+@pytest.mark.slow
 def test_scanner_app_poses_are_consistent_with_images(scripts, shared_data):
     sequence = scripts["sequences"].load("iphone", shared_data)
     assert len(sequence.frames) == 70

@@ -31,6 +31,7 @@ def attacks(monkeypatch):
     return attack, attacks.mutation
 
 
+@pytest.mark.slow
 def test_fuzzed_files_are_read_or_rejected(attacks, tmp_path: Path) -> None:
     """For every registered format and every function that reads files."""
     _, mutation = attacks
@@ -91,6 +92,7 @@ def reading() -> dict[str, FunctionType]:
     return found
 
 
+@pytest.mark.slow
 def test_crash_is_recorded_and_next_seed_runs(attacks) -> None:
     _, mutation = attacks
     found = list(mutation.run("pose", 3, first=7))

@@ -55,6 +55,7 @@ def test_registered_part_becomes_row(board, monkeypatch):
     assert {"ndt", "ls3d", "icp, gnc", "icp, comprehensive", "any-pair"} <= names
 
 
+@pytest.mark.slow
 def test_graph_results_are_reused_and_tabulated(board, monkeypatch, tmp_path):
     graphs = board.BOARDS["graphs"]
     monkeypatch.setattr(type(graphs), "methods", lambda _: ["elch", "levenberg-marquardt"])

@@ -346,6 +346,7 @@ def test_quick_turns_and_close_up_return_to_path(stress) -> None:
     assert speed.max() < 2.5
 
 
+@pytest.mark.slow
 def test_scene_cases_are_selected(stress, monkeypatch) -> None:
     short = replace(stress.SCENES["rail"], frames=8)
     found = list(stress.cases(short, 0, quick=True, containing="frame"))
@@ -365,6 +366,7 @@ def test_scene_cases_are_selected(stress, monkeypatch) -> None:
         assert scene.again < stress.scene_frames(scene.name)
 
 
+@pytest.mark.slow
 def test_runs_are_summarised_and_crashes_counted(stress, monkeypatch, capsys, tmp_path) -> None:
     import robustness
 

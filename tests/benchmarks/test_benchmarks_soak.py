@@ -52,6 +52,7 @@ def test_store_may_fill_its_budget_but_not_exceed_it(soak) -> None:
     assert not soak.bounded(filling(5 * 10**7), soak.RUN_BYTES)
 
 
+@pytest.mark.slow
 def test_descriptors_of_stores_are_not_counted(soak) -> None:
     before = soak.Usage.measured(1).descriptors
     spilled = soak.SpillFile()
@@ -63,6 +64,7 @@ def test_descriptors_of_stores_are_not_counted(soak) -> None:
     assert soak.Usage.measured(4).descriptors == before
 
 
+@pytest.mark.slow
 def test_all_live_frames_are_recorded(soak, tmp_path: Path, capsys) -> None:
     """A minute of camera time with missing, duplicate and late frames."""
     assert soak.live(32, 60.0, 10.0, tmp_path, mapped=False)
@@ -82,6 +84,7 @@ def test_all_live_frames_are_recorded(soak, tmp_path: Path, capsys) -> None:
     assert camera.sent.repeated == repeated >= camera.sent.doubled
 
 
+@pytest.mark.slow
 def test_mapper_accepts_late_missing_and_duplicate_frames(soak, tmp_path: Path) -> None:
     camera = soak.Camera(32, 70, 10.0)
     list(camera._frames(70))

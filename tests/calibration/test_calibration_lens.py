@@ -48,6 +48,7 @@ def fitted() -> LensFit:
     return calibrate_lens(recording_of(frames()), BOARD)
 
 
+@pytest.mark.slow
 def test_focal_length_within_0_2_percent_and_principal_point_within_half_a_pixel() -> None:
     camera = fitted().camera
     assert camera.fx == pytest.approx(TRUE.fx, rel=0.002)
@@ -88,6 +89,7 @@ def test_corners_follow_pixel_centre_convention() -> None:
     assert np.abs(offsets).max() < 0.1
 
 
+@pytest.mark.slow
 def test_inconsistent_view_is_excluded_and_reported() -> None:
     chosen = list(frames()[:10])
     image = chosen[4].amplitude_image
@@ -100,6 +102,7 @@ def test_inconsistent_view_is_excluded_and_reported() -> None:
     assert found.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
 
 
+@pytest.mark.slow
 def test_duplicate_viewpoints_are_excluded() -> None:
     found = calibrate_lens(recording_of([*frames()[:8], *frames()[:8]]), BOARD)
     assert len(found.views) == len([k for k, _ in found.left_out if k >= 8])
@@ -110,6 +113,7 @@ def _bare(frame: RangeFrame) -> RangeFrame:
     return replace(frame, amplitude_image=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("chosen", "board", "message"),
     [
@@ -193,6 +197,7 @@ def test_invalid_boards_are_rejected(text: str) -> None:
         Board.parse(text)
 
 
+@pytest.mark.slow
 def test_command_writes_camera_for_readers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

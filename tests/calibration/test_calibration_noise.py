@@ -45,6 +45,7 @@ def still_frames(scene: str, camera: str, count: int, first_seed: int = 0) -> li
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "camera"), [("corner", "sr4000"), ("wall", "pico-flexx")])
 def test_static_recording_recovers_camera_noise(scene: str, camera: str) -> None:
     fit = estimate_noise(recording_of(still_frames(scene, camera, 8)))
@@ -169,6 +170,7 @@ def test_static_segments_are_combined() -> None:
     assert fit.frames == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

@@ -53,6 +53,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate("peaks", tmp_path_factory.mktemp("peaks") / "rec", frames=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHOSEN)
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -75,6 +76,7 @@ def shell(script: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 def test_unwritable_stdout_is_reported(clouds: Path) -> None:
     status, stderr = shell(f"tofuse inspect {clouds} > /dev/full")
     assert (status, stderr) == (
@@ -89,6 +91,7 @@ def test_unwritable_stdout_is_reported(clouds: Path) -> None:
     assert (status, stderr) == (141, "")
 
 
+@pytest.mark.slow
 def test_damaged_image_prints_no_library_messages(tmp_path: Path) -> None:
     made_exports.make_tiff3d(tmp_path / "a")
     path = tmp_path / "a" / "00001.range.tif"

@@ -71,6 +71,7 @@ def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
     return se3.inverse(poses[target]) @ poses[source]
 
 
+@pytest.mark.slow
 def test_two_frames_of_recording_are_registered(room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
     status, output = register_json(
@@ -128,6 +129,7 @@ def test_result_is_printed(room_recording, capfd) -> None:
     assert f"{angle:.3f}" in next(line for line in output if line.startswith("rotation"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las", ".laz"])
 def test_clouds_of_each_format_are_registered(suffix, clouds, capfd) -> None:
     paths = []
@@ -210,6 +212,7 @@ def test_map_coordinates_keep_millimetre_precision(
     near(again["T_target_source"], T, MIDDLE, metres=0.002, degrees=0.1)
 
 
+@pytest.mark.slow
 def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
     """Without a guess the centres are aligned first; the result is in the frames of the files."""
     target = bumpy_ball(6000, 1) + MAP
@@ -602,6 +605,7 @@ def test_two_trajectory_lines_are_not_read_as_matrix(tmp_path) -> None:
         read_pose(tmp_path / "t.txt")
 
 
+@pytest.mark.slow
 def test_report_in_browser(room_recording, tmp_path) -> None:
     """The three states differ, views can be hidden, and the page makes no external requests."""
     out = tmp_path / "out"

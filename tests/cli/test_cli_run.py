@@ -186,12 +186,14 @@ def test_run_json_follows_contract(plain_run, room_recording) -> None:
         assert 0 <= values["removed"] <= 1
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_threads(plain_run, room_recording, tmp_path) -> None:
     assert run_json(plain_run)["threads"] == 2
     run(room_recording, "--out", tmp_path / "one", "--threads", 1)
     assert same(tmp_path / "one") == same(plain_run)
 
 
+@pytest.mark.slow
 def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         options = ["--method", "thesis", "--seed", seed, "--threads", 1 + (name == "b")]
@@ -201,6 +203,7 @@ def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     assert len(found) == 2
 
 
+@pytest.mark.slow
 def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
@@ -261,6 +264,7 @@ def test_filters_from_options_come_first(room_recording, tmp_path) -> None:
     assert np.linalg.norm(first, axis=1).max() < 4
 
 
+@pytest.mark.slow
 def test_object_is_segmented_from_background(tmp_path, full_report, capsys, monkeypatch) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=7, effects=effects)
@@ -281,6 +285,7 @@ def test_object_is_segmented_from_background(tmp_path, full_report, capsys, monk
     assert same(tmp_path / "again") == same(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_ranges_beyond_period_are_unwrapped(room_recording, tmp_path) -> None:
     frames, period = list(open_recording(room_recording))[::2], 2.8
     source = ArraySource(wrapping(frames, period), metadata={"ambiguity_m": period})
@@ -314,6 +319,7 @@ def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_unreadable_frame_is_skipped_and_counted(recording, tmp_path, capsys) -> None:
     file = recording / "depth/000004.png"
     file.write_bytes(file.read_bytes()[:200])
@@ -327,6 +333,7 @@ def test_unreadable_frame_is_skipped_and_counted(recording, tmp_path, capsys) ->
     assert len(times) == 7
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_report")
 def test_report_mentions_unreadable_frame(recording, tmp_path) -> None:
     (recording / "depth/000002.png").write_bytes(b"")
@@ -335,6 +342,7 @@ def test_report_mentions_unreadable_frame(recording, tmp_path) -> None:
     assert "Frame 2 could not be read." in report
 
 
+@pytest.mark.slow
 def test_blank_frame_is_lost(recording, tmp_path, capsys) -> None:
     file = recording / "depth/000003.png"
     write_png(file, np.zeros_like(read_image(file)))
@@ -350,6 +358,7 @@ def test_blank_frame_is_lost(recording, tmp_path, capsys) -> None:
     assert read_g2o(tmp_path / "out/pose_graph.g2o").ids.tolist() == [0, 1, 2, 4, 5, 6, 7]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_report")
 def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--end", 1)
@@ -373,6 +382,7 @@ def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
     assert len(mesh.faces) > 1000
 
 
+@pytest.mark.slow
 def test_frame_selection(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--start", 1, "--end", 7, "--every", 2)
     data = run_json(tmp_path / "out")
@@ -383,6 +393,7 @@ def test_frame_selection(room_recording, tmp_path) -> None:
     np.testing.assert_array_equal(poses[0], np.eye(4))
 
 
+@pytest.mark.slow
 def test_multiple_inputs_are_concatenated(recording, tmp_path) -> None:
     both = tmp_path / "both"
     both.mkdir()
@@ -428,6 +439,7 @@ def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
 
 
+@pytest.mark.slow
 def test_odometry_file_is_used_as_guess(recording, tmp_path) -> None:
     shutil.copy(recording / "groundtruth.txt", recording / "odometry.txt")
     run(recording, "--out", tmp_path / "a", "--method", "thesis", "--guess", "odometry")
@@ -436,12 +448,14 @@ def test_odometry_file_is_used_as_guess(recording, tmp_path) -> None:
     assert same(tmp_path / "a") != same(tmp_path / "b")
 
 
+@pytest.mark.slow
 def test_reference_is_never_used(recording, tmp_path, plain_run) -> None:
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
     run(recording, "--out", tmp_path / "out")
     assert same(tmp_path / "out") == same(plain_run)
 
 
+@pytest.mark.slow
 def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     run(room_recording, "--out", tmp_path / "out", "--json", "--every", 2)
     done = capfd.readouterr()
@@ -457,6 +471,7 @@ def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
 
 
+@pytest.mark.slow
 def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
@@ -504,6 +519,7 @@ def two_components(recording, config, **_options) -> Reconstruction:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_report")
 def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(run_module, "reconstruct", two_components)
@@ -531,6 +547,7 @@ def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypa
     assert last["reasons"] == run_json(out)["reasons"]
 
 
+@pytest.mark.slow
 def test_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:
     words = (room_recording, "--out", tmp_path / "out", *COARSE)
     run(*words)
@@ -542,6 +559,7 @@ def test_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None
     assert contents(tmp_path) != before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "error"),
     [
@@ -594,6 +612,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
@@ -683,6 +702,7 @@ def test_argument_defaults_follow_contract() -> None:
     assert (arguments.start, arguments.end, arguments.every) == (0, None, 1)
 
 
+@pytest.mark.slow
 def test_closed_output_pipe_is_silent(room_recording) -> None:
     words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
     reading, writing = os.pipe()
@@ -710,6 +730,7 @@ def test_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_failure_demo_reports_degenerate_frames(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     monkeypatch.setattr(demo_module, "simulate_to", partial(demo_module.simulate_to, frames=8))
@@ -725,6 +746,7 @@ def test_failure_demo_reports_degenerate_frames(tmp_path, capsys, monkeypatch) -
     assert stopped.value.code == 2
 
 
+@pytest.mark.slow
 def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     # A part of the circle.
@@ -822,6 +844,7 @@ def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_faces_and_voxel_options_set_model_resolution(plain_run, room_recording, tmp_path) -> None:
     whole = read_ply(plain_run / "mesh.ply")
     sizes = {}

@@ -22,6 +22,7 @@ _K = np.arange(9000)
 CONTENT = ((_K // 300) ** 2 % 17 * 9 + (_K % 300 > 280)).astype(np.uint8).tobytes()
 
 
+@pytest.mark.slow
 def test_reference_stream_is_decompressed() -> None:
     assert lzfse_decompress(STREAM, len(CONTENT), "x") == CONTENT
 

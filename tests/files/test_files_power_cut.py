@@ -58,6 +58,7 @@ def with_mine(folder: Path, *, old: bool) -> None:
             (folder / name).write_bytes(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("old", [True, False], ids=["over an old one", "a first one"])
 @pytest.mark.parametrize("reader_first", [True, False])
 def test_result_is_old_or_new_after_power_cut(memory, power, old, reader_first) -> None:
@@ -98,6 +99,7 @@ def test_result_is_old_or_new_after_power_cut(memory, power, old, reader_first) 
     assert seen == {(False, False), (True, True), (False, True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["forward", "back"])
 def test_recovery_survives_another_power_cut(memory, power, monkeypatch, way) -> None:
     numbers = itertools.count()

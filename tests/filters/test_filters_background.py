@@ -75,14 +75,17 @@ def check(case: Shown, least: float) -> None:
         assert (keep & ~outer).sum() < 0.03 * true.sum()
 
 
+@pytest.mark.slow
 def test_person_is_segmented() -> None:
     check(shown("torso"), 0.93)
 
 
+@pytest.mark.slow
 def test_box_is_segmented() -> None:
     check(shown("box"), 0.85)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("distance", "size"), [(0.8, (0.3, 0.3, 0.4)), (1.3, (0.16, 0.2, 0.25))])
 def test_other_box_distances_and_sizes_are_segmented(
     distance: float, size: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
@@ -93,6 +96,7 @@ def test_other_box_distances_and_sizes_are_segmented(
     check(shown.__wrapped__("box", off=SLOW), 0.82)
 
 
+@pytest.mark.slow
 def test_box_is_segmented_with_other_camera() -> None:
     check(shown("box", camera="ifm-o3r", off=SLOW), 0.85)
 
@@ -129,6 +133,7 @@ def test_filter_needs_fit_and_keeps_options() -> None:
         found.mask(small, ())
 
 
+@pytest.mark.slow
 def test_lens_scattering_is_estimated_and_corrected() -> None:
     """The estimate matches the simulated scattering, although the shape of its blur differs."""
     case, clean = shown("box"), shown("box", off=("scatter",))

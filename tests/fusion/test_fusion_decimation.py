@@ -127,6 +127,7 @@ def test_groups_match_library_triangles() -> None:
     np.testing.assert_allclose(places[found], moved[left] * unit + middle, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_result_is_same_in_another_process() -> None:
     code = (
         "import hashlib, sys; sys.path.insert(0, sys.argv[1])\n"

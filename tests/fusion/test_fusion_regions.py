@@ -202,6 +202,7 @@ def test_view_counts_saturate() -> None:
     assert (volume.seen[near] == tsdf.MAX_SEEN).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory_mb", [1, 600])
 def test_spilled_views_are_restored_with_state(room, memory_mb) -> None:
     _, poses = room

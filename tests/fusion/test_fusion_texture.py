@@ -311,6 +311,7 @@ def test_plain_atlas_cells_shrink_with_more_triangles() -> None:
     assert 256 < many.size <= 60 * 6
 
 
+@pytest.mark.slow
 def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr(

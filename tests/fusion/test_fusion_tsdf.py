@@ -142,6 +142,7 @@ def slow_distances(volume, views, poses):
     return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
 
 
+@pytest.mark.slow
 def test_distances_match_slow_sum_over_views() -> None:
     # A ball in front of a wall, gone after two views: free-space violations, occlusion and jumps.
     rng = np.random.default_rng(2)

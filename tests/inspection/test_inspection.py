@@ -289,6 +289,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()
     assert codes(colored(turn, 0)) == set()
@@ -296,6 +297,7 @@ def test_good_recording_has_no_findings(turn) -> None:
     assert codes(ranges) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", FAULTS)
 def test_faults_are_detected(code, turn) -> None:
     found = tofuse.inspect(of(FAULTS[code](turn)))
@@ -336,6 +338,7 @@ def _shades(depth):
     return np.dstack([(depth * 100).astype(np.uint8)] * 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_wrong_focal_length_is_estimated(factor) -> None:
     plain = turning(camera=BROWN)
@@ -381,6 +384,7 @@ def test_folding_distortion_is_rejected() -> None:
     assert not distortion(0.4, -0.2).folds
 
 
+@pytest.mark.slow
 def test_camera_motion_is_classified() -> None:
     still = turning(6, 0.0)
     assert codes(still) == {"static"}
@@ -407,6 +411,7 @@ def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None
     assert not reported & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
 
 
+@pytest.mark.slow
 def test_joined_recordings_are_not_unsorted(turn) -> None:
     twice = stamped([*turn[:5], *turn[:5]], np.tile(TIMES[:5], 2))
     parts = {"parts": [{"frames": 5}, {"frames": 5}]}
@@ -414,6 +419,7 @@ def test_joined_recordings_are_not_unsorted(turn) -> None:
     assert "time_unsorted" in codes(twice)
 
 
+@pytest.mark.slow
 def test_contact_sheet_is_saved(turn, tmp_path, capsys) -> None:
     path = tofuse.inspect(of(FAULTS["range_taken_for_z"](turn))).save_sheet(
         tmp_path / "a/sheet.png"
@@ -425,6 +431,7 @@ def test_contact_sheet_is_saved(turn, tmp_path, capsys) -> None:
         tofuse.inspect(of(turn[:3])).save_sheet(path / "below.png")
 
 
+@pytest.mark.slow
 def test_run_reports_findings(copy, tmp_path, capfd) -> None:
     camera = json.loads((copy / "camera.json").read_text())
     (copy / "camera.json").write_text(json.dumps(camera | {"depth_unit_m": 0.01}))
@@ -438,6 +445,7 @@ def test_run_reports_findings(copy, tmp_path, capfd) -> None:
     assert "The median depth is" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_real_recordings_have_only_true_findings(shared_data) -> None:
     explained = {
         "sr4000_corridor": {"phase_wrap", "flying_pixels"},  # longer than 5 m; a shiny floor
@@ -482,6 +490,7 @@ def test_corrected_focal_length_does_not_affect_verdict(room_recording: Path) ->
     assert faults(0.0, 0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [6.0, 15.0])
 def test_rotating_object_is_distinguished_from_moving_camera(degrees) -> None:
     """Its background is static, so a run without --object would estimate no motion."""
@@ -496,6 +505,7 @@ def test_rotating_object_is_distinguished_from_moving_camera(degrees) -> None:
     assert not any("--object" in str(f) for f in remaining)
 
 
+@pytest.mark.slow
 def test_depth_errors_are_not_attributed_to_lens(tmp_path) -> None:
     """In a corridor few surfaces are visible, and depth errors bend them."""
     recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)

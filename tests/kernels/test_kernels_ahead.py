@@ -43,6 +43,7 @@ def test_named_tuples_are_listed_with_fields(
     assert ahead.signatures() == [("moving_objects.compare", types)]
 
 
+@pytest.mark.slow
 def test_listed_signatures_compile(tmp_path: Path) -> None:
     """From the cache of these tests, or compiled now: unsupported types would fail."""
     words = [sys.executable, "-m", "tofuse.kernels.ahead"]
@@ -50,6 +51,7 @@ def test_listed_signatures_compile(tmp_path: Path) -> None:
     assert ahead.compiled_marker().exists()
 
 
+@pytest.mark.slow
 def test_run_uses_listed_signatures(room_recording: Path) -> None:
     program = textwrap.dedent(
         """

@@ -53,6 +53,7 @@ def test_unwritable_home_uses_temporary_cache(tmp_path, place) -> None:
     assert [p.name for p in tmp_path.iterdir()] == (["home"] if place == "file" else [])
 
 
+@pytest.mark.slow
 def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
     env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     text, folder, files = _run(env)

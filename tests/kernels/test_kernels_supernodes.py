@@ -70,6 +70,7 @@ def test_panels_contain_the_pattern_and_few_zeros() -> None:
     assert blocks < 2 * len(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "links", "k"), SIZES)
 def test_solution_and_inverse_are_those_of_the_dense_matrix(n: int, links: int, k: int) -> None:
     A = Sparse(n, links, k)

@@ -97,6 +97,7 @@ def test_halving_preserves_planes():
 # --- planes --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pixels_without_weight_are_ignored_even_with_unknown_rays():
     rays = CAMERA.rays().copy()
     w, weight = plane_w(rays), np.ones(rays.shape[:2], np.float32)

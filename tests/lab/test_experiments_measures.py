@@ -125,6 +125,7 @@ def test_surface_error_is_distance_to_model():
     assert measures.surface_error_m(above, cKDTree(surface)) == pytest.approx(0.05, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_strided_frames_match_recording_with_that_stride():
     recorded = record_scene("rail", (2, 3), 1, limit=4)
     assert recorded.made.raw.tolist() == [0, 2, 3]

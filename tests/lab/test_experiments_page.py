@@ -101,6 +101,7 @@ def test_scene_is_run_with_all_variants(rail_page):
     assert not re.search(r"\bnan\b", re.sub(r"data:[^\"']+", "", text), re.IGNORECASE)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_result(peaks_page, tmp_path):
     again = run_experiments(tmp_path / "again", cases=("peaks",), seeds=2)
     first, second = read(peaks_page), read(again)

@@ -80,6 +80,7 @@ def motions(n, seed):
     return poses, pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_closed_chain_error_is_reduced(method):
     T, clouds = ring()
@@ -90,6 +91,7 @@ def test_closed_chain_error_is_reduced(method):
     assert left.max() < 0.25 * before.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_refinement_corrects_drift(method):
     T, clouds = ring()

@@ -154,6 +154,7 @@ def test_axis_offset_moves_optical_centre_on_circle():
     np.testing.assert_allclose(half[:3, 3], [0, 0, -0.04], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_motion_is_smooth_and_slow(built, name):
     _, sequence = built[name]

@@ -30,6 +30,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_written_folder_matches_recording_in_memory(folder) -> None:
     source = NativeSource(folder)
     memory = simulate_recording("corner", every=10, frames=3)
@@ -87,6 +88,7 @@ def test_moving_object_defines_world() -> None:
         np.testing.assert_allclose(pose, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_raw_frame_is_independent_of_stride() -> None:
     effects = Effects()
     two = simulate_recording("wall", every=2, frames=3, effects=effects)

@@ -263,6 +263,7 @@ def test_unusable_image_is_lost(request, scene, damage, amplitude):
     assert_right(steps, poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
 @pytest.mark.parametrize("damage", NONSENSE.values(), ids=NONSENSE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
@@ -278,6 +279,7 @@ def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
     assert found[-1] == 0 or any(i < BAD < j for i, j in certain_links(steps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
 @pytest.mark.parametrize("scene", ["room", "corner"])
 def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, damage):
@@ -290,6 +292,7 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, damag
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
 def test_run_of_wrong_images_forms_its_own_component(corner, damage):
     frames = list(corner.frames)
@@ -317,6 +320,7 @@ def test_static_camera_stays_static(room):
     assert_right(steps, [*room.poses[:4], *[room.poses[3]] * 4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("searches", [True, False])
 def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
@@ -345,6 +349,7 @@ def test_links_connect_different_components(corner, elsewhere):
             assert np.linalg.eigvalsh(link.information).min() > 0
 
 
+@pytest.mark.slow
 def test_degenerate_directions_are_reported():
     """A flat wall without albedo does not constrain motion within its plane."""
     wall = Sequence("wall", range(0, 12, 3), False)
@@ -360,6 +365,7 @@ def test_degenerate_directions_are_reported():
         assert len(tracked[-1].unobservable) == 3
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_threads(room, elsewhere):
     frames = in_order([*room.frames[:3], *elsewhere, *room.frames[2:5]])
     results = []
@@ -375,6 +381,7 @@ def test_result_is_independent_of_threads(room, elsewhere):
         ]
 
 
+@pytest.mark.slow
 def test_interruption_starts_component_without_motion_prior(room):
     frames, poses = [*room.frames[:6], *room.frames[:6]], [*room.poses[:6], *room.poses[:6]]
     tracker = Keyframes().start(0)

@@ -107,6 +107,7 @@ def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
         assert off(step, pose, path[0])[0] < 0.03
 
 
+@pytest.mark.slow
 def test_new_component_continues_motion() -> None:
     """Another room from one frame to the next, with the same camera motion."""
     frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
@@ -121,6 +122,7 @@ def test_new_component_continues_motion() -> None:
         assert off(step, pose, WALK[12])[0] < 0.03
 
 
+@pytest.mark.slow
 def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
     from tofuse.evaluation.trajectory import displacement
@@ -137,6 +139,7 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     assert not any(len(f.unobservable) for f in result.diagnostics.frames)
 
 
+@pytest.mark.slow
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.evaluation.trajectory import displacement

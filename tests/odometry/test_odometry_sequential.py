@@ -208,6 +208,7 @@ def test_poses_are_independent_of_threads():
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_peaks_is_tracked_at_low_noise_and_drifts_at_high_noise():
     """Section 5.6: "ICP does well on its own" below 0.05 m of noise, and not above."""
 

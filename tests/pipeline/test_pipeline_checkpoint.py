@@ -57,6 +57,7 @@ def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate("peaks", tmp_path_factory.mktemp("clouds") / "peaks", frames=3)
 
 
+@pytest.mark.slow
 def test_stopped_run_resumes_at_any_stage(room_recording: Path, monkeypatch) -> None:
     recording = tofuse.open(room_recording).select(every=2)
     kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
@@ -88,6 +89,7 @@ def test_stopped_run_resumes_at_any_stage(room_recording: Path, monkeypatch) -> 
         assert set(again.diagnostics.seconds) == set(whole.diagnostics.seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["default", "thesis"])
 def test_runs_of_clouds_resume(method: str, turned_box: Path) -> None:
     recording = tofuse.open(turned_box)
@@ -205,6 +207,7 @@ def test_state_round_trip() -> None:
     found["frame"].covariance[0, 0] = 5.0
 
 
+@pytest.mark.slow
 def test_large_state_is_stored_in_parts() -> None:
     many = [np.full(200, float(k)) for k in range(12_000)]
     state = {"arrays": many, "tuples": [(k, many[k % 7]) for k in range(20_000)]}
@@ -453,6 +456,7 @@ def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
 def test_repeatedly_killed_run_gives_same_bytes(
     room_recording: Path, tmp_path: Path, monkeypatch
@@ -494,6 +498,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of other systems")
 def test_full_disk_preserves_earlier_result(room_recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

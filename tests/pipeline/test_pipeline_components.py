@@ -110,6 +110,7 @@ def test_live_poses_of_connected_components_are_correct(there_and_back, joined) 
     assert_right([np.eye(4) if T is None else T for T in live], places, rows)
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_threads(there_and_back, joined) -> None:
     result, live = joined
     other, also = run(there_and_back[1], threads=2)
@@ -126,6 +127,7 @@ def test_result_is_independent_of_threads(there_and_back, joined) -> None:
         assert one is None or one.tobytes() == two.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [6, 12, 20])
 def test_restored_copy_gives_same_result(there_and_back, joined, after) -> None:
     _, frames = there_and_back
@@ -144,6 +146,7 @@ def test_restored_copy_gives_same_result(there_and_back, joined, after) -> None:
     assert again.cloud.points.tobytes() == result.cloud.points.tobytes()
 
 
+@pytest.mark.slow
 def test_finish_resumes_after_any_stage(there_and_back, joined) -> None:
     """Decisions about components are stored with the other stages."""
     result, _ = joined
@@ -173,6 +176,7 @@ def test_blank_frames_leave_one_model() -> None:
     assert all(component.connected for component in result.components)
 
 
+@pytest.mark.slow
 def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))
@@ -194,12 +198,14 @@ def test_two_scenes_give_two_components_with_models() -> None:
     assert result.diagnostics.verdict == "degraded"
 
 
+@pytest.mark.slow
 def test_few_frames_of_another_scene_get_no_model() -> None:
     result, _ = run(in_order([*frames_of(range(6)), *frames_of(range(3), **STRANGE)]))
     assert [c.connected for c in result.components] == [True, False]
     assert result.components[1].result is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 4])
 def test_unordered_views_are_joined(seed) -> None:
     places = np.random.default_rng(seed).permutation(range(0, 24, 2)).tolist()

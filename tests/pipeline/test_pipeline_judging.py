@@ -98,6 +98,7 @@ def test_wrong_poses_deviate_more_from_measurements(recording, truth, of_truth, 
     assert again.estimate_m == pytest.approx(wrong.estimate_m, rel=0.1)
 
 
+@pytest.mark.slow
 def test_tolerance_decides_verdict(recording, truth) -> None:
     near = truth.copy()
     near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((8, 3))
@@ -106,6 +107,7 @@ def test_tolerance_decides_verdict(recording, truth) -> None:
     assert reason.code == "uncertain_poses"
 
 
+@pytest.mark.slow
 def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) -> None:
     turns = np.array([se3.exp(np.array([0, 0, 0, 0, 2.5 * k, 0])) for k in range(8)])
     found = tofuse.judge(recording, turns @ truth)
@@ -120,6 +122,7 @@ def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) 
     assert "images_disagree" in [r.code for r in found.reasons]
 
 
+@pytest.mark.slow
 def test_frames_without_pose_stay_without(recording, truth) -> None:
     some = truth.copy()
     some[[2, 5]] = np.nan
@@ -164,6 +167,7 @@ def tofuse_ply(path, points) -> None:
     write_ply(path, GeometryRecord(points))
 
 
+@pytest.mark.slow
 def test_command(room_recording, truth, tmp_path, capsys) -> None:
     recording = tofuse.open(room_recording)
     poses = tmp_path / "poses.txt"
@@ -209,6 +213,7 @@ def test_command_refuses(room_recording, tmp_path, capsys) -> None:
     assert "contains no earlier result" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_device_poses_are_judged_by_default(recording, truth) -> None:
     """The stated errors also hold for wrong poses of the phone."""
     result = tofuse.reconstruct(recording)

@@ -139,6 +139,7 @@ def test_filter_for_images_refuses_clouds_early(frames) -> None:
     mapper.push(frames[0])  # the refused view does not set the kind
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "amplitude", "filters", "corrected", "ready"),
     [
@@ -212,6 +213,7 @@ def test_given_loops_are_used_or_rejected(frames, whole) -> None:
     assert len(result.diagnostics.objective) > 0
 
 
+@pytest.mark.slow
 def test_clouds_alone_give_a_model(frames) -> None:
     clouds = [CloudFrame.of(f.points[::3], index=f.index, timestamp=f.index) for f in frames[:4]]
     result = reconstruct(in_memory(clouds))
@@ -310,6 +312,7 @@ def test_pushed_frames_form_the_history(frames) -> None:
     assert SeesHistory.seen[3][2] == [len(frames[1]), len(frames[2])]
 
 
+@pytest.mark.slow
 def test_odometry_is_used_as_guess_on_request(frames, recording) -> None:
     config = replace(CONFIG, odometry=replace(CONFIG.odometry, guess="odometry"))
     odometry = recording.reference.copy()
@@ -320,6 +323,7 @@ def test_odometry_is_used_as_guess_on_request(frames, recording) -> None:
     assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
 
 
+@pytest.mark.slow
 def test_model_before_loop_closure_is_kept() -> None:
     views, poses = peaks_views(0.06, 0)
     recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
@@ -345,6 +349,7 @@ def test_model_before_loop_closure_is_kept() -> None:
     assert len(closed.cloud) != len(before)
 
 
+@pytest.mark.slow
 def test_camera_that_jumps_back_is_tracked(frames) -> None:
     mapper = Mapper("default")
     again = [replace(f, index=k) for k, f in enumerate([*frames[:6], *frames[:4]])]

@@ -138,6 +138,7 @@ def test_flat_of_same_plan_is_not_joined(results) -> None:
     assert exit_status(found) == 3
 
 
+@pytest.mark.slow
 def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
     """And merged results can be merged again: joined sessions stay joined."""
     found = merged(results["elsewhere"], pair, searches=3)
@@ -156,6 +157,7 @@ def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
     assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
 
 
+@pytest.mark.slow
 def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> None:
     sessions = read_sessions([results["elsewhere"], pair], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < 12 <= p.j]
@@ -173,6 +175,7 @@ def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> Non
     assert "loop_rejected" not in codes
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_threads(both, results) -> None:
     sessions = read_sessions([results["here"], results["there"]], 1, Silent())
     with threads(1):
@@ -181,6 +184,7 @@ def test_result_is_independent_of_threads(both, results) -> None:
     assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
 
 
+@pytest.mark.slow
 def test_command_writes_result(results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"
@@ -271,6 +275,7 @@ def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) ->
     assert len(session.posed) == 12
 
 
+@pytest.mark.slow
 def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
     """The same frames are opened again: both recordings of a run, every other frame."""
     paths = [Path(read_run_json(results[k] / "run.json")["input"]["path"]) for k in results][:2]
@@ -296,6 +301,7 @@ def test_damaged_result_is_refused(results, tmp_path, changes) -> None:
     refused([results["here"], again], "damaged")
 
 
+@pytest.mark.slow
 def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> None:
     """And one that cannot be located in the map leaves it unchanged."""
     monkeypatch.setattr(merging, "merged_config", quick_merge)
@@ -325,6 +331,7 @@ def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> No
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
 
 
+@pytest.mark.slow
 def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path) -> None:
     """A recording that continues elsewhere after a dark frame, and a session of that place."""
     first, second = HERE[5:], THERE[5:]

@@ -46,6 +46,7 @@ def made(folder: Path, *priors: object) -> Reconstruction:
     return reconstruct(open_recording(folder), config, threads=1)
 
 
+@pytest.mark.slow
 def test_priors_are_used_on_request_and_reported(beside, room_recording):
     alone, both = made(beside), made(beside, *BOTH)
     records = {record.sensor: record for record in both.diagnostics.priors}
@@ -75,6 +76,7 @@ def test_priors_are_used_on_request_and_reported(beside, room_recording):
     assert np.trace(last[0][3:, 3:]) < np.trace(last[1][3:, 3:])
 
 
+@pytest.mark.slow
 def test_missing_sensor_files_change_nothing(room_recording):
     asked, not_asked = made(room_recording, *BOTH), made(room_recording)
     assert asked.diagnostics.priors == ()

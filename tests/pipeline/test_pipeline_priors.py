@@ -110,6 +110,7 @@ def test_unknown_prior_is_refused(recording) -> None:
         with_prior(recording, from_method("default"), "some")
 
 
+@pytest.mark.slow
 def test_inconsistent_device_poses_are_ignored(recording) -> None:
     """A phone that lost tracking: its poses contradict the images."""
     rng = np.random.default_rng(0)
@@ -152,6 +153,7 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
     return Recording.of(ArraySource(frames, poses, metadata={}), "simulated", "native")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covered", [(), range(22, 32)])
 def test_device_poses_bound_slide_along_wall(covered) -> None:
     """The images alone do not constrain the motion along it."""

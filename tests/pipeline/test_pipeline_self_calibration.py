@@ -117,6 +117,7 @@ def wrong(recording):
     return seen_by(recording, 1.05)
 
 
+@pytest.mark.slow
 def test_wrong_focal_length_is_corrected(wrong) -> None:
     config = replace(COARSE, self_calibration=False)
     stated = reconstruct(wrong, config)
@@ -146,6 +147,7 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
+@pytest.mark.slow
 def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     """Rotation scales with the focal length and all views agree: only the loop reveals it."""
     wrong = seen_by(recording, 1.05, "range")
@@ -156,6 +158,7 @@ def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
+@pytest.mark.slow
 def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     half = replace(recording, indices=recording.indices[:12])
     wrong = seen_by(half, 1.05)
@@ -168,6 +171,7 @@ def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     assert error_of(half, right) < right.diagnostics.accuracy.position_m
 
 
+@pytest.mark.slow
 def test_correct_focal_length_is_unchanged(recording) -> None:
     result = reconstruct(recording, COARSE)
     assert result.diagnostics.calibrated is None

@@ -40,6 +40,7 @@ def multipath_of(config: Config) -> Multipath:
     return found
 
 
+@pytest.mark.slow
 def test_compensation_is_disabled_without_multipath(straight: Recording) -> None:
     listener = Listener()
     config = adapted(from_method("default"), straight, 1, listener)
@@ -57,6 +58,7 @@ def test_compensation_is_disabled_without_multipath(straight: Recording) -> None
     assert adapted(config, straight, 1) == config
 
 
+@pytest.mark.slow
 def test_compensation_is_kept_with_multipath() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
     recording = simulate_recording("empty-room", every=6, frames=20, effects=effects)
@@ -118,6 +120,7 @@ def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float
     assert found.helps == (there > 0)
 
 
+@pytest.mark.slow
 def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     spoil, correct = bent(0.02, 8.0), bent(-0.02, 21.0)
     assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).helps

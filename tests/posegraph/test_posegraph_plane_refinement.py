@@ -25,6 +25,7 @@ def nudged(poses, size, seed=0):
     return poses @ se3.exp(steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.04, 0.1])
 def test_peaks_error_is_near_bound(sigma):
     """From the drift of the thesis's method, and from random errors."""
@@ -43,6 +44,7 @@ def test_peaks_error_is_near_bound(sigma):
     assert 0.7 < rms / peaks_bound(sigma) < 2
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_threads():
     views, truth = peaks_views(0.05, 0)
     clouds, start = [v.points[::2] for v in views[:8]], nudged(truth[:8], 0.05)
@@ -144,6 +146,7 @@ def refined(part, views, poses):
     return out.finish([v.index for v in views], poses)
 
 
+@pytest.mark.slow
 def test_refinement_is_kept_only_if_views_support_it():
     views, truth = peaks_views(0.05, 2)
     start = nudged(truth[:10], 0.1)
@@ -168,6 +171,7 @@ def test_distant_clouds_are_not_moved(count):
     np.testing.assert_array_equal(same.poses, apart)
 
 
+@pytest.mark.slow
 def test_view_of_another_place_does_not_drag_others():
     views, truth = peaks_views(0.02, 0)
     noise = np.random.default_rng(5).uniform(-8, 8, (2500, 3)).astype(np.float32)
@@ -200,6 +204,7 @@ def test_two_sides_of_wall_stay_separate():
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_kept_follow_the_others():
     views, truth = peaks_views(0.03, 0)
     part = Planes(max_views=12)

@@ -31,6 +31,7 @@ def swing() -> tuple[list, np.ndarray]:
     return surfaces(truth, noise=0.005), truth
 
 
+@pytest.mark.slow
 def test_submaps_match_refinement_of_all_views(swing) -> None:
     views, truth = swing
     start = drifted(truth)
@@ -48,6 +49,7 @@ def test_submaps_match_refinement_of_all_views(swing) -> None:
     assert {i for e in parts.edges for i in (e.i, e.j)} == set(range(COUNT))
 
 
+@pytest.mark.slow
 def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
     views, truth = swing
     start = drifted(truth)

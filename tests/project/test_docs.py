@@ -91,6 +91,7 @@ def codes(text: str) -> set[str]:
     return set(re.findall(r"`([^`]+)`", prose))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", with_blocks("python"))
 def test_python_in_documents_runs(
     name: str, room_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -238,6 +239,7 @@ def test_reason_codes_are_the_closed_list() -> None:
     assert {row[0].strip("`"): (row[1], row[2]) for row in table} == REASONS
 
 
+@pytest.mark.slow
 def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     data = run_json(result)
@@ -518,6 +520,7 @@ def simulate_without(monkeypatch: pytest.MonkeyPatch, *effects: str) -> None:
     monkeypatch.setattr(demo, "simulate_to", partial(demo.simulate_to, without=effects))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted({*NOTEBOOKS} - {JUDGING}), ids=lambda path: path.stem)
 def test_notebooks_run(
     path: Path, room_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -529,6 +532,7 @@ def test_notebooks_run(
     assert len(names["recording"]) > 1
 
 
+@pytest.mark.slow
 def test_phone_notebook_runs_on_phone_scan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_data: Path
 ) -> None:
@@ -540,6 +544,7 @@ def test_phone_notebook_runs_on_phone_scan(
     assert np.isfinite(names["result"].trajectory).all()
 
 
+@pytest.mark.slow
 def test_judging_notebook_detects_drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     # Those that need many rays per pixel; noise remains.

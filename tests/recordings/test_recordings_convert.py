@@ -63,6 +63,7 @@ def check_same(before: Recording, after: Recording, *, depth: float = 1e-6) -> N
         assert family[0] == family[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_every_camera(tmp_path: Path, name: str) -> None:
     make, file, _ = MAKERS[name]
@@ -209,6 +210,7 @@ REAL: list[tuple[str, int, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "every", "how"), REAL)
 def test_real_recordings(
     shared_data: Path, tmp_path: Path, name: str, every: int, how: dict[str, Any]

@@ -201,6 +201,7 @@ def test_damaged_folders_raise_only_package_errors(folder: Path, tmp_path: Path)
     assert unread + refused > 0
 
 
+@pytest.mark.slow
 def test_rig_is_reconstructed_by_one_command(folder: Path, tmp_path: Path, capfd) -> None:
     out = tmp_path / "model"
     assert main(["run", str(folder), "--out", str(out)]) == 0, capfd.readouterr().err

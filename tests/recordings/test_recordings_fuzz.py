@@ -38,6 +38,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
 ROUNDS = {"tum": 12, "7scenes": 12, "redwood": 12}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_damage_raises_only_package_errors(tmp_path: Path, name: str) -> None:
     original = tmp_path / "freiburg1"

@@ -17,6 +17,7 @@ ROUNDS = {"aditof": 30, "kinect2": 30, "mkv": 30, "helios": 30, "csv": 30}
 CUTS = {"kinect2": 20, "mkv": 12, "aditof": 12}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_damage_raises_only_package_errors(tmp_path: Path, name: str) -> None:
     make, file, format_ = MAKERS[name]
@@ -39,6 +40,7 @@ def test_damage_raises_only_package_errors(tmp_path: Path, name: str) -> None:
     assert whole > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_truncated_file_loses_no_frame_silently(tmp_path: Path, name: str) -> None:
     """Frames that are read have the same depth; an error or a warning tells of missing ones."""

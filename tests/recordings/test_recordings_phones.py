@@ -142,6 +142,7 @@ def test_camera_option_is_refused(tmp_path: Path) -> None:
         open_recording(tmp_path / "scan.r3d", camera=tmp_path / "camera.json")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "format_", "count", "size", "every", "others"),
     [

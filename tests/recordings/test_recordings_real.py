@@ -74,6 +74,7 @@ def test_kinectv2_clouds_match_images(shared_data: Path) -> None:
         assert cloud.camera.fx == pytest.approx(365.7449, abs=0.01)
 
 
+@pytest.mark.slow
 def test_sevenscenes_kitchen(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sevenscenes_kitchen")
     assert (recording.format, len(recording)) == ("7scenes", 500)
@@ -152,6 +153,7 @@ def test_unknown_formats_are_refused(shared_data: Path, name: str) -> None:
         open_recording(shared_data / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "format_", "sensor"),
     [

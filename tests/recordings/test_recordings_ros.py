@@ -83,6 +83,7 @@ def test_metres_and_a_fisheye(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(frame.z[1:], image[1:])
 
 
+@pytest.mark.slow
 def test_compressed_depth(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros2")
     bag.info("/a/depth/camera_info")
@@ -294,6 +295,7 @@ def test_orbbec_bags(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, COUNTS[index] // 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maker", ["realsense", "orbbec"])
 def test_damaged_bags_of_manufacturers(tmp_path: Path, maker: str) -> None:
     if maker == "realsense":
@@ -369,6 +371,7 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_folders_are_rejected(tmp_path: Path, name: str) -> None:
     bag = Bag(tmp_path, "ros2")
@@ -408,6 +411,7 @@ def bounded_bags() -> Any:
     return importlib.import_module("tofuse.recordings.bounded_bags")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ros2", "mcap"])
 def test_compressed_files(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are decompressed into a temporary folder, which is removed, up to a limit."""

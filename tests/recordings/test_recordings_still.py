@@ -235,11 +235,13 @@ def test_memory_of_long_intervals_is_bounded() -> None:
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / np.sqrt(48), rel=0.02)
 
 
+@pytest.mark.slow
 def test_simulated_rotation_is_not_stationary() -> None:
     frames = simulate_recording("wall", every=10, frames=2)
     assert len(stationary_intervals(frames)) == 2
 
 
+@pytest.mark.slow
 def test_run_averages_on_request(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "rec", CAMERA, depth_unit_m=0.0001)
     for k, shift in enumerate([0, 0, 0, 0.03, 0.03, 0.03]):

@@ -92,6 +92,7 @@ def test_viewpoint_of_scan_is_detected(scans):
     np.testing.assert_array_equal(viewpoint_of(moved).origin, origin)
 
 
+@pytest.mark.slow
 def test_moved_points_have_no_viewpoint(frames, scans):
     """Mostly: from some places the surfaces of a small image are sampled as evenly."""
     rng = np.random.default_rng(4)
@@ -291,6 +292,7 @@ def test_registration_is_independent_of_scale(scans, scale):
     assert found.believed
 
 
+@pytest.mark.slow
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
@@ -398,6 +400,7 @@ def test_registration_in_other_frames():
 # Sequences of views
 
 
+@pytest.mark.slow
 def test_views_are_chained_and_rejected_views_start_components(scans):
     source, target, true = scans
     tracker = Pairwise().start(0)
@@ -418,6 +421,7 @@ def test_views_are_chained_and_rejected_views_start_components(scans):
             Pairwise(**bad)
 
 
+@pytest.mark.slow
 def test_folder_of_scans_becomes_one_model(tmp_path):
     """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
     places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))

@@ -48,6 +48,7 @@ def test_clouds_of_any_size_are_registered(scale, degrees):
     assert len(found.unobservable) == 0
 
 
+@pytest.mark.slow
 def test_half_of_each_view_may_be_outside_overlap():
     for k in range(3):
         T = turn(rng(k).normal(size=3), 6)
@@ -71,6 +72,7 @@ def test_view_and_array_may_be_mixed():
     assert error(found, T)[0] < 0.003
 
 
+@pytest.mark.slow
 def test_real_pair_of_lidar_scans(shared_data):
     folder = shared_data / "lidar_pair_gt"
     source, target = (read_ply(folder / f"{name}.ply").points for name in ("source", "target"))
@@ -108,6 +110,7 @@ def test_map_coordinates_keep_precision():
     np.testing.assert_allclose(np.diag(back)[:3], np.diag(near.information)[:3], rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.001, 0.01])
 @pytest.mark.parametrize(("walls", "count"), [("z", 3), ("x", 3), ("xy", 1), ("xyz", 0)], ids=str)
 def test_unobservable_directions_are_reported_and_stay_as_guessed(walls, count, noise):

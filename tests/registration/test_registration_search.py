@@ -417,6 +417,7 @@ def test_result_is_independent_of_threads(pair):
         assert a.score == b.score
 
 
+@pytest.mark.slow
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
     effects = Effects.none(shot_noise=True)

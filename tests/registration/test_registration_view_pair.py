@@ -89,6 +89,7 @@ def test_covariance_covers_error(far):
     assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_camera_on_its_side_is_found(quarters):
     # Outside the exhaustive search, whose poses are upright.

@@ -57,6 +57,7 @@ def middle(page):
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
+@pytest.mark.slow
 def test_model_rotates_and_toggles_switch(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -89,6 +90,7 @@ def test_model_rotates_and_toggles_switch(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_colours_of_values_match_colour_bar(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -115,6 +117,7 @@ def test_colours_of_values_match_colour_bar(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_two_taps_measure_distance_with_error(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -146,6 +149,7 @@ def test_two_taps_measure_distance_with_error(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_section_cuts_and_is_reset(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -163,6 +167,7 @@ def test_section_cuts_and_is_reset(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_screenshot_and_full_screen(browser, report, tmp_path):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -186,6 +191,7 @@ def test_screenshot_and_full_screen(browser, report, tmp_path):
         seen.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 def test_reason_links_to_its_frames(browser, report, size):
     with opened(browser, report, viewport=size) as seen:
@@ -210,6 +216,7 @@ def test_reason_links_to_its_frames(browser, report, size):
         seen.check()
 
 
+@pytest.mark.slow
 def test_cameras_and_timeline_select_frames(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -231,6 +238,7 @@ def test_cameras_and_timeline_select_frames(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_phone_scrolls_past_model(browser, report):
     with opened(browser, report, viewport=PHONE, has_touch=True, is_mobile=True) as seen:
         page = seen.page
@@ -255,6 +263,7 @@ def test_phone_scrolls_past_model(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_slider_shows_frames_and_reason_of_loss(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -304,6 +313,7 @@ def test_page_without_scripts_shows_image_and_first_frame(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
     result, extras = make_room()
     rng = np.random.default_rng(0)

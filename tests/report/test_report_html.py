@@ -163,6 +163,7 @@ def test_identifiers_are_unique_and_links_resolve(shown):
     assert set(ORDER) - {"recording"} <= anchors
 
 
+@pytest.mark.slow
 def test_same_result_gives_same_file(tmp_path):
     result, extras = room()
     for name in "ab":
@@ -200,6 +201,7 @@ def test_displacement_is_shown_without_reference(tmp_path):
     assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(moved, rel=0.06)
 
 
+@pytest.mark.slow
 def test_true_and_measured_sizes(shown, tmp_path):
     result, extras = room()
     row = shown.row("width")
@@ -448,6 +450,7 @@ def test_model_can_be_coloured_by_attributes_of_points():
     assert wider.high == pytest.approx(0.05)
 
 
+@pytest.mark.slow
 def test_viewer_thins_large_model(tmp_path):
     points = np.random.default_rng(1).uniform(-2, 2, (200_000, 3)).astype(np.float32)
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))

@@ -339,6 +339,7 @@ def test_component_may_be_tiled_too(tmp_path, small_limits) -> None:
         OutputFolder(out, overwrite=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped_at", [0, 1, 3, 6, 12])
 def test_interrupted_moves_are_finished_with_all_tiles(
     tmp_path, small_limits, monkeypatch, stopped_at

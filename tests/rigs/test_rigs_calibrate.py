@@ -66,6 +66,7 @@ def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration)
     assert {(d.a, d.b) for d in found.rig.disagreement} >= {("cam0", "cam1"), ("cam1", "cam2")}
 
 
+@pytest.mark.slow
 def test_camera_without_overlap_is_named() -> None:
     wall = RangeFrame(0, 0.0, CAMERA, np.full((96, 128), 1.7, np.float32), "z", None)
     cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
@@ -96,6 +97,7 @@ def test_names_distinguish_cameras() -> None:
     assert unique_names([Path("/a/x/depth"), Path("/a/y/depth")]) == ["x/depth", "y/depth"]
 
 
+@pytest.mark.slow
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = written(tmp_path / "rig")
     cameras = [str(folder / f"cam{k}") for k in range(3)]
@@ -149,6 +151,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert shown.of_frames.tolist() == run_json["of_frames"]
 
 
+@pytest.mark.slow
 def test_displaced_camera_is_found(
     calibrated: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +166,7 @@ def test_displaced_camera_is_found(
     assert [line.split()[0] for line in output if "moved by" in line] == ["cam2"]
 
 
+@pytest.mark.slow
 def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]

@@ -81,6 +81,7 @@ def test_hand_eye_is_exact_without_errors() -> None:
     assert found.time_offset_s == pytest.approx(OFFSET, abs=0.0003)
 
 
+@pytest.mark.slow
 def test_covariance_covers_errors() -> None:
     squares, clocks = [], []
     for seed in range(40):

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from tofuse.geometry import se3
 from tofuse.posegraph.view_store import KeptView
@@ -11,6 +12,7 @@ from tofuse.rigs.inputs import open_cameras
 from tofuse.rigs.joint import View, disagreements
 
 
+@pytest.mark.slow
 def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     folder = shared_data / "azure_kinect_rig"
     paths = sorted(p for p in folder.iterdir() if p.is_dir())

@@ -68,6 +68,7 @@ def test_cells_tile_surroundings_of_image_up_to_lamp_cone() -> None:
     assert around.fraction.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
 
 
+@pytest.mark.slow
 def test_map_recalls_planes_and_albedo_after_rotation() -> None:
     known = ReflectorMap()
     # Back and forth, so that the newest view is the one in the middle.
@@ -152,6 +153,7 @@ def test_only_trusted_surfaces_are_stored() -> None:
     assert (known.patches[:, 0] > -0.1).all()
 
 
+@pytest.mark.slow
 def test_correction_uses_map_only_with_poses() -> None:
     world = (LEFT, RIGHT, FLOOR)
     T = turned(0.45)
@@ -201,6 +203,7 @@ class Recorder(Correction, Corrector):
         self.received.append((frame.index, T_world_camera))
 
 
+@pytest.mark.slow
 def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
     listener = Recorder()
     mapper = Mapper(replace(from_method("default"), corrections=(listener,)))

@@ -70,6 +70,7 @@ def test_hall_beyond_period_is_unwrapped() -> None:
     assert harmed <= 0.001 * good
 
 
+@pytest.mark.slow
 def test_room_within_period_is_unchanged() -> None:
     """Its dark chairs and floor reflect as little as a white wall one period farther."""
     frames = taken("room", 128)

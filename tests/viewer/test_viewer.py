@@ -217,6 +217,7 @@ def screen(client, point, box):
     )
 
 
+@pytest.mark.slow
 @needs_viser
 def test_page_toggles_selects_frames_and_measures(folder, browser):
     from playwright.sync_api import TimeoutError as NotYet
@@ -299,6 +300,7 @@ def test_page_toggles_selects_frames_and_measures(folder, browser):
         stop(server)
 
 
+@pytest.mark.slow
 @needs_viser
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal of POSIX")
 def test_command_serves_until_interrupted(folder):
@@ -323,6 +325,7 @@ class Recorder(Silent):
         self.frames.append((frame.index, T_world_camera.copy(), len(self.stages)))
 
 
+@pytest.mark.slow
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
     from tofuse.pipeline.progress import Both

@@ -194,6 +194,7 @@ def browser():
         yield found
 
 
+@pytest.mark.slow
 @needs_viser
 def test_viewer_loads_tiles_on_approach(folder, browser, monkeypatch) -> None:
     from tofuse.viewer.app import ResultView
