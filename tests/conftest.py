@@ -20,7 +20,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
         if not ahead.compiled_marker().exists():
             with ahead.compiling_in_background():
-                ahead.compile_listed(ahead.signatures())
+                ahead.compile_listed(1, 2)
 
 
 @pytest.fixture(scope="session")

@@ -1,19 +1,20 @@
-"""Compilation of kernels ahead of their first call, by a second process during the first run.
+"""Compilation of kernels ahead of their first call, by other processes during the first run.
 
-The first run on a machine compiles every kernel that it calls. Meanwhile a second process compiles
-the same kernels in reverse order into the same cache, until the two meet. The list of kernels and
-argument types was recorded in runs of the default method; `python benchmarks/compilation.py --list`
-records it again.
+The first run on a machine compiles every kernel that it calls. Meanwhile other processes compile
+the same kernels in reverse order into the same cache, each from another place of the list on, and
+load what is there already. The list of kernels and argument types was recorded in runs of the
+default method; `python benchmarks/compilation.py --list` records it again.
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,10 @@ import numba
 from tofuse.kernels import jit
 from tofuse.kernels.cores import usable_cores
 
+# Processes, of which each takes about 0.5 GB of memory; no more than half of the cores.
+_MAX_HELPERS = 3
+# Objects after which Python looks for garbage: the compiler makes many, nearly all of which stay.
+_COLLECT_AFTER = 100_000
 _LIST = Path(__file__).with_name("signatures.txt")
 _DTYPES = {
     "b1": "boolean",
@@ -40,32 +45,47 @@ _NAMES = {name: short for short, name in _DTYPES.items()} | {"bool": "b1"}
 
 @contextmanager
 def compiling_in_background() -> Iterator[None]:
-    """Compile kernels in another process during the block, unless they are in the cache.
+    """Compile kernels in other processes during the block, unless they are in the cache.
 
-    The process is terminated with the block. What it has not compiled is compiled when called.
+    The processes are terminated with the block. What they have not compiled is compiled when
+    called.
     """
-    helper = _start()
+    with ExitStack() as stack:
+        helpers = list(_start())
+        if helpers:
+            stack.enter_context(collecting_rarely())
+        for helper in helpers:
+            stack.callback(helper.wait)
+            stack.callback(helper.terminate)
+        yield
+
+
+@contextmanager
+def collecting_rarely() -> Iterator[None]:
+    """Look for garbage rarely during the block, as that is a tenth of the time of compilation."""
+    before = gc.get_threshold()
+    gc.set_threshold(_COLLECT_AFTER, *before[1:])
     try:
         yield
     finally:
-        if helper is not None:
-            helper.terminate()
-            helper.wait()
+        gc.set_threshold(*before)
 
 
-def _start() -> subprocess.Popen[bytes] | None:
-    if usable_cores() < 2 or compiled_marker().exists():
-        return None
-    try:
-        return subprocess.Popen(
-            [sys.executable, "-m", "tofuse.kernels.ahead"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the run, which ends this process
-        )
-    except OSError:  # no more processes
-        return None
+def _start() -> Iterator[subprocess.Popen[bytes]]:
+    if compiled_marker().exists():
+        return
+    count = min(usable_cores() // 2, _MAX_HELPERS)
+    for k in range(count):
+        try:
+            yield subprocess.Popen(
+                [sys.executable, "-m", "tofuse.kernels.ahead", str(k), str(count)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for the run, which ends this process
+            )
+        except OSError:  # no more processes
+            return
 
 
 def signatures() -> list[tuple[str, tuple[Any, ...]]]:
@@ -77,9 +97,14 @@ def signatures() -> list[tuple[str, tuple[Any, ...]]]:
     return found
 
 
-def compile_listed(listed: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
-    """Compile all of `signatures`, in the given order, or load them from the cache."""
-    for name, types in listed:
+def compile_listed(helper: int = 0, helpers: int = 1) -> None:
+    """Compile all of `signatures` in reverse order, or load them from the cache.
+
+    Of several `helpers` each begins at another place of the list, and continues at its end.
+    """
+    listed = signatures()[::-1]
+    first = len(listed) * helper // helpers
+    for name, types in listed[first:] + listed[:first]:
         module, function = name.rsplit(".", 1)
         getattr(import_module(f"tofuse.kernels.{module}"), function).compile(types)
     compiled_marker().touch()
@@ -131,4 +156,5 @@ def _text_of(kind: Any) -> str:
 
 
 if __name__ == "__main__":
-    compile_listed(reversed(signatures()))
+    with collecting_rarely():
+        compile_listed(*map(int, sys.argv[1:]))

@@ -59,10 +59,13 @@ def _base() -> Path:
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function over arrays: nogil, cached, IEEE arithmetic (the same every time)."""
     config: Any = numba.config
+    njit: Any = numba.njit  # its type hints lack an option
     before = config.CACHE_DIR
     config.CACHE_DIR = cache_folder()
     try:
-        compiled: Callable[P, R] = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+        # Nothing calls kernels from C, so the wrapper for that would only take time to compile.
+        options = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+        compiled: Callable[P, R] = options(function)
     finally:
         config.CACHE_DIR = before
     return compiled
