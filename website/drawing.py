@@ -8,7 +8,7 @@ import numpy as np
 from tofuse.arrays import Float64, UInt8
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.geometry import se3
-from tofuse.kernels import bvh
+from tofuse.lab.kernels import bvh
 
 SIZE = (720, 480)  # pixels
 TILT, TURN = np.radians(48.0), np.radians(62.0)

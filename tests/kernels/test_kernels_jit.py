@@ -80,3 +80,12 @@ def test_cache_key_changes_with_any_kernel(tmp_path) -> None:
     assert changed != [jit.source_hash()]
     (package / "lzf.py").rename(package / "renamed.py")
     assert _run({}, code) != changed
+
+
+def test_kernels_of_the_laboratory_depend_on_both_packages(tmp_path: Path) -> None:
+    from tofuse.lab import kernels
+
+    folder = Path(kernels.__file__).parent
+    assert jit.source_hash(folder) != jit.source_hash()
+    (tmp_path / "more.py").write_text("")
+    assert jit.source_hash(tmp_path) not in (jit.source_hash(), jit.source_hash(folder))

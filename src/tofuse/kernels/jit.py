@@ -24,20 +24,31 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+_HERE = Path(__file__).parent
+
+
 @cache
-def source_hash() -> str:
-    """Hash of every source file of this package and of the versions that compile it."""
+def source_hash(package: Path = _HERE) -> str:
+    """Hash of the versions that compile kernels, and of all sources of this package.
+
+    For kernels of another package (a folder), which may call these, of its sources as well.
+    """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    for folder in dict.fromkeys((_HERE, package)):
+        for file in sorted(folder.glob("*.py")):
+            digest.update(file.name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 
 
-@cache
-def cache_folder() -> str:
+def cache_folder(package: Path = _HERE) -> str:
     """Return a folder that can be written, the same in every run where the machine allows it."""
+    return _writable(f"kernels-{source_hash(package)}")
+
+
+@cache
+def _writable(name: str) -> str:
     try:
-        folder = _base() / f"kernels-{source_hash()}"
+        folder = _base() / name
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return str(folder)
@@ -61,7 +72,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     config: Any = numba.config
     njit: Any = numba.njit  # its type hints lack an option
     before = config.CACHE_DIR
-    config.CACHE_DIR = cache_folder()
+    config.CACHE_DIR = cache_folder(Path(function.__code__.co_filename).parent)
     try:
         # Nothing calls kernels from C, so the wrapper for that would only take time to compile.
         options = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)

@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64, Int64
 from tofuse.errors import InputError
-from tofuse.kernels.cloud_matching import kdtree_nearest_featured
-from tofuse.kernels.cloud_shape import ball_moments
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.threads import run_chunks
 
@@ -268,7 +266,7 @@ class KdTree:
     """
 
     def __init__(self, points: ArrayLike) -> None:
-        array = _rows(points, "points")
+        array = checked_points(points, "points")
         if not np.isfinite(array).all():
             raise InputError(
                 "are not all finite", where="points", remedy="drop the invalid points first"
@@ -286,7 +284,7 @@ class KdTree:
         Returns index (M,), -1 where there is none, and squared distance (M,) in m^2, infinity
         where there is none. Of equally near points the one with the lowest index is found.
         """
-        array = _rows(queries, "queries")
+        array = checked_points(queries, "queries")
         index = np.empty(len(array), np.int64)
         distance2 = np.empty(len(array))
         limit = max_distance * max_distance if max_distance >= 0 else -1.0
@@ -294,7 +292,7 @@ class KdTree:
         def work(a: int, b: int) -> None:
             kdtree_nearest(*self._tree, self._depth, array[a:b], limit, index[a:b], distance2[a:b])
 
-        _spread(work, len(array))
+        spread_queries(work, len(array))
         return index, distance2
 
     def neighbours(self, queries: ArrayLike, k: int) -> tuple[Int64, Float64]:
@@ -306,78 +304,24 @@ class KdTree:
         """
         if k < 1:
             raise ValueError("k must be at least 1")
-        array = _rows(queries, "queries")
+        array = checked_points(queries, "queries")
         index = np.empty((len(array), k), np.int64)
         distance2 = np.empty((len(array), k))
 
         def work(a: int, b: int) -> None:
             kdtree_neighbours(*self._tree, self._depth, array[a:b], index[a:b], distance2[a:b])
 
-        _spread(work, len(array))
+        spread_queries(work, len(array))
         return index, distance2
 
-    def nearest_featured(
-        self,
-        queries: ArrayLike,
-        features: Float64,
-        query_features: Float64,
-        tolerance: float = np.inf,
-        max_distance: float = np.inf,
-        weight: float = 1.0,
-    ) -> tuple[Int64, Float64]:
-        """Find the point least far away in space and features together, for each query (M, 3).
 
-        Least is the squared distance in space plus `weight` times that of the features, `features`
-        (N, K) of the points and `query_features` (M, K), weighted so that they are in m. Points
-        further away in space than `max_distance` m, or off by more than `tolerance` in a feature,
-        don't count, nor do NaN features. Returns index (M,), -1 where there is none, and the
-        squared distance in space (M,) in m^2, infinity there.
-        """
-        array = _rows(queries, "queries")
-        index = np.empty(len(array), np.int64)
-        distance2 = np.empty(len(array))
-        limit = max_distance * max_distance if max_distance >= 0 else -1.0
-        own, asked = (np.ascontiguousarray(f, np.float64) for f in (features, query_features))
-
-        def work(a: int, b: int) -> None:
-            kdtree_nearest_featured(
-                *self._tree,
-                self._depth,
-                own,
-                array[a:b],
-                asked[a:b],
-                tolerance,
-                weight,
-                limit,
-                index[a:b],
-                distance2[a:b],
-            )
-
-        _spread(work, len(array))
-        return index, distance2
-
-    def moments(self, centres: ArrayLike, radius: float) -> Float64:
-        """Eigenvalues (M, 3), rising, of the second moments in a ball round each centre (M, 3).
-
-        Of ``sum (x - c)(x - c)^T / count`` over the points x not further than `radius` m from the
-        centre c, in m^2; zero where there are none.
-        """
-        array = _rows(centres, "centres")
-        out = np.empty((len(array), 3))
-        _, arranged, axes, cuts = self._tree
-
-        def work(a: int, b: int) -> None:
-            out[a:b] = ball_moments(arranged, axes, cuts, self._depth, array[a:b], radius)
-
-        _spread(work, len(array))
-        return out
-
-
-def _spread(work: Callable[[int, int], None], size: int) -> None:
+def spread_queries(work: Callable[[int, int], None], size: int) -> None:
+    """Call `work(start, stop)` for chunks of `size` queries, in parallel if there are many."""
     run_chunks(work, size, chunks=min(16, 2 * size // _SMALL_WORK) if size > _SMALL_WORK else 1)
 
 
-def _rows(points: ArrayLike, what: str) -> Float64:
+def checked_points(points: ArrayLike, what: str) -> Float64:
+    """Return points as an (N, 3) array; InputError, which names them `what`, if they are not."""
     array = np.ascontiguousarray(points, np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"have shape {array.shape}", where=what, remedy="pass an (N, 3) array")

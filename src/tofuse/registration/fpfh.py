@@ -11,7 +11,7 @@ from tofuse.arrays import Bool, Float64, Int64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.kernels import cloud_matching as kernels
+from tofuse.kernels import fpfh as kernels
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part

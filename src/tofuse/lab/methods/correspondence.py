@@ -10,13 +10,13 @@ import numpy as np
 from tofuse.arrays import Float64, Int64
 from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.errors import RegistrationError
-from tofuse.kernels.cloud_matching import grid_search
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
+from tofuse.lab.kernels.cloud_search import grid_search
+from tofuse.lab.methods.featured_tree import FeaturedKdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
-from tofuse.registration.shape import tree_of
 
 Invariant = Literal["curvature", "moments"]
 
@@ -162,13 +162,13 @@ class ClosestCompatible(Bounded, Matcher):
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""
         return _CompatibleSearch(
-            KdTree(target.points), _log_amplitude(target), float(np.log(self.ratio))
+            FeaturedKdTree(target.points), _log_amplitude(target), float(np.log(self.ratio))
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _CompatibleSearch:
-    tree: KdTree
+    tree: FeaturedKdTree
     features: Float64
     tolerance: float
 
@@ -215,13 +215,13 @@ class ClosestInvariant(Bounded, Matcher):
 
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations."""
-        return _InvariantSearch(self, KdTree(target.points), {})
+        return _InvariantSearch(self, FeaturedKdTree(target.points), {})
 
 
 @dataclass(frozen=True, eq=False)
 class _InvariantSearch:
     options: ClosestInvariant
-    tree: KdTree
+    tree: FeaturedKdTree
     # Features of both views, cached at the first matching; the source's by its identity.
     known: dict[str, tuple[Points, Float64]]
 
@@ -245,7 +245,7 @@ class _InvariantSearch:
                 columns.append(points.shape.curvature[:, None] * resolution)
             else:
                 radius = self.options.radius * resolution
-                moments = tree_of(points.view).moments(points.points, radius)
+                moments = FeaturedKdTree(points.view.points).moments(points.points, radius)
                 columns.append(moments / radius**2)
         self.known[which] = (points, np.concatenate(columns, 1))
         return self.known[which][1]

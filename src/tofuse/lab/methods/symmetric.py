@@ -9,7 +9,8 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.kernels.cloud_sums import plane_sums, symmetric_sums
+from tofuse.kernels.cloud_sums import plane_sums
+from tofuse.lab.kernels.symmetric import symmetric_sums
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches
 from tofuse.registration.pairs import (

@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from tofuse.arrays import Bool, Float64, Int32
 from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels import phasor
 from tofuse.kernels.threads import run_chunks
+from tofuse.lab.kernels import phasor
 from tofuse.lab.simulation.scene import Scene
 from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 
@@ -198,7 +198,7 @@ def lit_by(
 
 
 def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
-    """Direct light in each pixel, (H, W, 7) in the channels of `kernels.phasor`."""
+    """Direct light in each pixel, (H, W, 7) in the channels of `lab.kernels.phasor`."""
     return _pooled(grid, returns.strength, returns.path, frequency)
 
 
@@ -262,7 +262,7 @@ def bounced_light(
 
     Returns
     -------
-    For each frequency (H, W, 7) in the channels of `kernels.phasor`.
+    For each frequency (H, W, 7) in the channels of `lab.kernels.phasor`.
     """
     step = max(4, points.shape[1] // 44)
     pick = (slice(step // 2, None, step), slice(step // 2, None, step))

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.kernels import bvh
-from tofuse.kernels.texture import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.kernels.threads import run_chunks
+from tofuse.lab.kernels import bvh
+from tofuse.lab.kernels.shading import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import texture
 from tofuse.lab.simulation.mesh import Mesh

@@ -9,7 +9,7 @@ from typing import Literal, Self
 import numpy as np
 
 from tofuse.arrays import Float64, Int32
-from tofuse.kernels import texture as kernels
+from tofuse.lab.kernels import shading as kernels
 
 Pattern = Literal["plain", "noise", "wood", "tiles", "print", "speckle"]
 _KINDS: dict[Pattern, int] = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.kernels import bvh
 from tofuse.kernels.threads import chunk_bounds
+from tofuse.lab.kernels import bvh
 
 
 def brute_force_cast(triangles, origins, directions):

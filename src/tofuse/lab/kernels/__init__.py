@@ -1,0 +1,1 @@
+"""What Numba compiles for the simulator and for methods of the laboratory."""

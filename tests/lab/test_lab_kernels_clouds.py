@@ -1,0 +1,97 @@
+"""Kernels of the laboratory that search and sum over points, against slow twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.lab.kernels.cloud_search import grid_search
+from tofuse.lab.kernels.symmetric import symmetric_sums
+from tofuse.lab.methods.featured_tree import FeaturedKdTree
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def test_moments_match_twin_and_are_rotation_invariant():
+    r = np.random.default_rng(3)
+    points = r.normal(size=(500, 3))
+    centres = np.vstack([points[:50], [[50, 0, 0]]])
+    found = FeaturedKdTree(points).moments(centres, 0.7)
+    for c, values in zip(centres, found, strict=True):
+        near = points[((points - c) ** 2).sum(1) <= 0.49] - c
+        wanted = np.linalg.eigvalsh(near.T @ near / len(near)) if len(near) else np.zeros(3)
+        np.testing.assert_allclose(values, wanted, atol=1e-12)
+    T = se3.exp([1, 2, 3, 0.5, -1, 0.3])
+    turned = FeaturedKdTree(se3.transform(T, points)).moments(se3.transform(T, centres), 0.7)
+    np.testing.assert_allclose(turned, found, atol=1e-9)
+
+
+def test_symmetric_sums_match_twin():
+    r = np.random.default_rng(7)
+    p, q, n, w = (*r.normal(size=(3, 20, 3)), r.uniform(0, 2, 20))
+    J = np.hstack([n, np.cross(p + q, n)])
+    e = ((p - q) * n).sum(1)
+    H, g = symmetric_sums(p, q, n, w)
+    np.testing.assert_allclose(H, J.T @ (w[:, None] * J), atol=1e-12)
+    np.testing.assert_allclose(g, J.T @ (w * e), atol=1e-12)
+
+
+@settings(max_examples=40)
+@given(
+    seed=seeds,
+    n=st.integers(0, 120),
+    k=st.integers(1, 3),
+    tolerance=st.sampled_from([0.3, 1.0, np.inf]),
+    limit=st.sampled_from([0.4, np.inf]),
+    share=st.sampled_from([0.0, 1.0]),
+    count=st.sampled_from([1, 3]),
+)
+def test_nearest_featured_matches_brute_force(seed, n, k, tolerance, limit, share, count):
+    r = np.random.default_rng(seed)
+    # Coordinates on a grid, so that there are ties.
+    points, queries = (r.integers(0, 8, (m, 3)) / 8 for m in (n, 40))
+    f, g = (r.integers(0, 4, (m, k)) / 4 for m in (n, 40))
+    f[: n // 5] = np.nan
+    with threads(count):
+        index, squared = FeaturedKdTree(points).nearest_featured(
+            queries, f, g, tolerance, limit, share
+        )
+    for q in range(40):
+        d = ((points - queries[q]) ** 2).sum(1)
+        gap = f - g[q]
+        ok = (d <= limit**2) & (np.abs(gap) <= tolerance).all(1)
+        total = np.where(ok, d + share * (gap**2).sum(1), np.inf)
+        if not ok.any():
+            assert index[q] == -1
+            assert squared[q] == np.inf
+        else:
+            assert index[q] == np.argmin(total)
+            assert squared[q] == d[index[q]]
+
+
+def test_grid_search_descends_from_pixel():
+    grid = np.arange(400).reshape(20, 20)
+    grid[5, 5] = -1
+    v, u = np.divmod(np.arange(400), 20)
+    points = np.column_stack([u, v, np.zeros(400)]).astype(float)
+    moved = np.array([[7.2, 3.1, 1], [5, 5, 0], [3, 3, 0], [0, 0, 0], [9, 9, 0.0]])
+    pixels = np.array([[1, 1], [5, 5], [np.nan, 3], [-1e300, 0], [-2, 9.0]])
+    index, squared = np.empty(5, np.int64), np.empty(5)
+    grid_search(grid, points, moved, pixels, 2, index, squared)
+    # Six pixels away, with steps of two; a pixel without a point; behind the camera; outside.
+    assert index[0] == 3 * 20 + 7
+    assert squared[0] == pytest.approx(0.04 + 0.01 + 1)
+    assert squared[1] == 1
+    assert list(index[2:]) == [-1, -1, 9 * 20 + 9]
+    grid_search(grid, points, moved, pixels, 0, index, squared)
+    assert list(index) == [21, -1, -1, -1, -1]
+
+
+def test_search_rejects_wrong_shape():
+    with pytest.raises(InputError, match="shape"):
+        FeaturedKdTree(np.zeros((3, 3))).moments(np.zeros((3, 2)), 1.0)
