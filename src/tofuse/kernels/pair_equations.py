@@ -78,6 +78,8 @@ SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweig
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
+_TINY = 1e-6  # m or m^2, instead of 0 in a denominator
+
 # Layout of the sums of a patch: of w, w r and w J.
 PATCH_WEIGHT = 0
 PATCH_RESIDUAL = 1
@@ -442,7 +444,7 @@ def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
     z = block[(POINT + 2) * LANES : (POINT + 3) * LANES]
     for k in range(LANES):
         side2 = x[k] * x[k] + y[k] * y[k]
-        r2 = side2 + z[k] * z[k]
+        r2 = max(side2 + z[k] * z[k], _TINY)  # columns without a point may be 0
         shorter = side2 / r2 if radial else 0.0
         along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - errors[FOCAL] * shorter
         x[k] *= along + errors[FOCAL]
@@ -463,7 +465,8 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
         side2 = xn[k] * xn[k] + yn[k] * yn[k]
         r2 = side2 + 1
         shorter = side2 / r2 if radial else 0.0
-        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + errors[FOCAL] * shorter
+        nearness = 1 / max(np.sqrt(r2) * z[k], _TINY)
+        along = 1 - errors[OFFSET] * nearness - errors[SCALE] + errors[FOCAL] * shorter
         wider = 1 + errors[FOCAL]
         xn[k] /= wider
         yn[k] /= wider
