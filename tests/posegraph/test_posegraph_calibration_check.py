@@ -129,6 +129,8 @@ def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
 
     monkeypatch.setattr("tofuse.posegraph.calibration_check.align_pairs", drifting)
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
+    monkeypatch.setattr(_Loop, "kept_by_views", lambda *args: -0.5 * args[-1])
+    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
     monkeypatch.setattr(_Loop, "kept_by_views", lambda *args: args[-1])
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert found.alarm

@@ -49,6 +49,8 @@ _CHANCE = 0.003
 # Maximum number of secant steps to the error that closes a loop; change at convergence, and an
 # implausible error, relative to the tolerance.
 _SECANTS, _CONVERGED, _IMPLAUSIBLE = 4, 0.05, 10.0
+# Fraction of a closing error that the views must confirm: they may measure another one.
+_KEPT = 0.5
 # The spread between views is not known from fewer.
 _MIN_VIEWS = 8
 _SMALL = 1e-3  # error of the camera, to differentiate by
@@ -439,7 +441,8 @@ def _check_by_loop(
 
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
     residuals show nothing. Pairwise alignments from the poses before it don't depend on it. But any
-    drift leaves a gap that some error of the camera nearly closes: the views must keep the error.
+    drift leaves a gap that some error of the camera nearly closes: the views must keep the error,
+    and not find another one.
 
     Parameters
     ----------
@@ -463,7 +466,8 @@ def _check_by_loop(
         gap = loop.gap(uncorrected, corrected)
         if not (gap.closes and _large(name, error, sigmas[name])):
             continue
-        if _large(name, loop.kept_by_views(poses, _NUMBERS[name], error), sigmas[name]):
+        kept = loop.kept_by_views(poses, _NUMBERS[name], error)
+        if _large(name, kept, sigmas[name]) and kept / error > _KEPT:
             found[name] = error, gap
     if not found:
         return none

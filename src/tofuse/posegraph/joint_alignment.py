@@ -40,7 +40,7 @@ _ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
 _MAX_MOTION = 2.0
 # Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
 # it has converged: small, as the errors of the pairs of a loop add up.
-_PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.01
+_PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.002
 
 
 @dataclass(frozen=True, eq=False)
