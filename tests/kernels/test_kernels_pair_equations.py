@@ -132,6 +132,14 @@ def test_few_points_with_known_errors_have_finite_equations(pair, kind):
     assert np.isfinite(row).all()
 
 
+def test_points_behind_target_are_not_compared_with_known_errors(pair):
+    source, target, T = pair
+    errors = np.zeros(kernels.ERRORS)
+    errors[kernels.OFFSET] = 0.1
+    behind = T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert evaluate(source, target, behind, errors)[kernels.COMPARED] == 0
+
+
 def test_fixed_unknowns_have_no_equations(pair):
     source, target, T = pair
     H, g = unpack(evaluate(source, target, T))

@@ -64,7 +64,7 @@ SIZE = HISTOGRAM + BINS
 # (6), each weighted by the root of w; the statistics to be summed; the squared distance in unscaled
 # variances; and the root of w of the distance.
 LANES = 128
-_MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
+MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
 XN, YN, Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
 SEEN = _PIXEL + PIXEL_SIZE
 FITS = SEEN + 1
@@ -205,7 +205,7 @@ def transform_block(block: Float32, T: Float64) -> None:
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        per_z = 1 / z if z > _MIN_DEPTH else 0.0
+        per_z = 1 / z if z > MIN_DEPTH else 0.0
         block[XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
         block[YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
         block[Z * LANES + k] = z
@@ -224,7 +224,7 @@ def project_block(
     for k in range(LANES):
         block[SEEN * LANES + k] = 0
     for k in range(count):
-        if not block[Z * LANES + k] > _MIN_DEPTH:
+        if not block[Z * LANES + k] > MIN_DEPTH:
             continue
         if not (u[k] > -0.5 and v[k] > -0.5 and u[k] < columns - 0.5 and v[k] < rows - 0.5):
             continue

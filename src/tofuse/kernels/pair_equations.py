@@ -23,6 +23,7 @@ from tofuse.kernels.alignment import (
     INLIERS,
     JACOBIAN,
     LANES,
+    MIN_DEPTH,
     MISFIT,
     NORMAL,
     PLANE,
@@ -462,11 +463,12 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
     yn = block[YN * LANES : (YN + 1) * LANES]
     z = block[Z * LANES : (Z + 1) * LANES]
     for k in range(LANES):
+        if not z[k] > MIN_DEPTH:  # it is not projected
+            continue
         side2 = xn[k] * xn[k] + yn[k] * yn[k]
         r2 = side2 + 1
         shorter = side2 / r2 if radial else 0.0
-        nearness = 1 / max(np.sqrt(r2) * z[k], _TINY)
-        along = 1 - errors[OFFSET] * nearness - errors[SCALE] + errors[FOCAL] * shorter
+        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + errors[FOCAL] * shorter
         wider = 1 + errors[FOCAL]
         xn[k] /= wider
         yn[k] /= wider
