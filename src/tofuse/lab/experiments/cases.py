@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from tofuse.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
 from tofuse.lab.experiments.recorded import Recorded, record_scene
+from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.scene import SCENES
 from tofuse.lab.simulation.scenes import box
 from tofuse.pipeline.config import Config, changed, from_method
@@ -197,7 +199,15 @@ class CaseResult:
 
 
 def run_case(
-    case: Case, seed: int, progress: Progress, *, limit: int | None = None, draws: int = DRAWS
+    case: Case,
+    seed: int,
+    progress: Progress,
+    *,
+    limit: int | None = None,
+    draws: int = DRAWS,
+    methods: Sequence[str] = METHODS,
+    effects: Effects | None = None,
+    changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> CaseResult:
     """Simulate a case once and reconstruct it with every configuration.
 
@@ -210,6 +220,12 @@ def run_case(
     draws
         Number of repetitions with other random points of each run with the previous guess, and of
         each at the thesis's stride.
+    methods
+        Some of `METHODS`, "thesis" among them.
+    effects
+        Errors of the simulated camera; all of them by default.
+    changes
+        Of the configurations of the methods.
     """
     start = perf_counter()
 
@@ -218,17 +234,22 @@ def run_case(
             progress.stage(f"{case.scene}: simulating", total)
         progress.advance()
 
-    recorded = record_scene(case.scene, case.strides, seed, limit=limit, progress=tell)
+    recorded = record_scene(
+        case.scene, case.strides, seed, limit=limit, effects=effects, progress=tell
+    )
     simulated = perf_counter()
     plans = [
         (method, stride, guess, draw)
-        for method in METHODS
+        for method in methods
         for stride in case.strides
         for guess in GUESSES
         for draw in range(draws if guess == "previous" or stride == case.stride else 1)
     ]
     progress.stage(f"{case.scene}: registering", len(plans))
-    configs = {method: configuration(method, recorded) for method in METHODS}
+    configs = {
+        method: changed(configuration(method, recorded), changes, where="experiments")
+        for method in methods
+    }
     filtered = {method: recorded.filtered(config) for method, config in configs.items()}
     runs = []
     for method, stride, guess, draw in plans:

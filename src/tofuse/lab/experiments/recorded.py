@@ -12,6 +12,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.filters.base import apply_filters
 from tofuse.geometry import se3
+from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan
 from tofuse.pipeline.config import Config
 from tofuse.recordings.correction_file import corrected_depth
@@ -81,6 +82,7 @@ def record_scene(
     seed: int,
     *,
     limit: int | None = None,
+    effects: Effects | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recorded:
     """Simulate the raw frames of a scene for a set of strides, each frame once.
@@ -88,13 +90,15 @@ def record_scene(
     Parameters
     ----------
     scene
-        One of the simulator's, with all effects switched on.
+        One of the simulator's.
     limit
         Maximum number of raw frames.
+    effects
+        Errors of the camera; all of them by default.
     progress
         Called with the number of frames done and the total.
     """
-    made = plan(scene, seed=seed, every=1, frames=limit)
+    made = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
     needed = np.any([made.raw % stride == 0 for stride in strides], axis=0)
     made = replace(made, raw=made.raw[needed])
     factory = made.correction
