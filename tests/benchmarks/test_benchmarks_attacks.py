@@ -24,6 +24,8 @@ SEEDS = 3
 
 @pytest.fixture
 def attacks(monkeypatch):
+    # The subjects are made by helpers of the readers' tests, which are imported when needed.
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "recordings"))
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import attack
     import attacks.mutation
