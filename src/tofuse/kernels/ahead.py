@@ -26,7 +26,7 @@ from tofuse.kernels.cores import usable_cores
 
 # Processes, of which each takes about 0.5 GB of memory; no more than half of the cores.
 _MAX_HELPERS = 3
-# Objects after which Python looks for garbage: the compiler makes many, nearly all of which stay.
+# Net number of new objects after which Python collects garbage.
 _COLLECT_AFTER = 100_000
 _LIST = Path(__file__).with_name("signatures.txt")
 _DTYPES = {
@@ -62,7 +62,7 @@ def compiling_in_background() -> Iterator[None]:
 
 @contextmanager
 def collecting_rarely() -> Iterator[None]:
-    """Look for garbage rarely during the block, as that is a tenth of the time of compilation."""
+    """Collect garbage rarely during the block: the compiler makes many objects that stay."""
     before = gc.get_threshold()
     gc.set_threshold(_COLLECT_AFTER, *before[1:])
     try:
