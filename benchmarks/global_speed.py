@@ -34,7 +34,7 @@ from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.search import SearchOptions, search
@@ -86,8 +86,8 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> s
             surface = prepare_view(frame, options).subsampled(200)
             store.push(surface, poses[k])
             loops.push(frame, poses[k])
-    views = [KeptView.of(posed.view, 600) for posed in store.views]
-    at = np.array([view.surface.index for view in views])
+    views = [SampledView.of(posed.view, 600) for posed in store.views]
+    at = np.array([view.index for view in views])
     found = overlaps(views, poses[at], 0.5)[0]
     chosen = found[
         np.unique(np.linspace(0, len(found) - 1, min(max_pairs, len(found))).astype(int))
@@ -95,7 +95,7 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> s
 
     def work(a: int, _: int) -> bool:
         i, j = chosen[a]
-        loop = loops._confirm(views[i].surface, views[j].surface)
+        loop = loops._confirm(store.views[i], store.views[j])
         return loop.record.accepted
 
     wall, cpu = time.perf_counter(), time.process_time()

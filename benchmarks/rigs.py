@@ -35,7 +35,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wander
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
 from tofuse.rigs.calibrate import calibrate, calibrate_cameras, loosest
@@ -154,7 +154,7 @@ def systematic(seeds: int) -> None:
                     seed=seed,
                 )
                 views = [
-                    View(k, 0, KeptView.of(camera.surface(camera.images(1)[0]), 6000))
+                    View(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
                     for k, camera in enumerate(cameras_of(recordings))
                 ]
                 away = rng.normal(size=(len(truth), 6)) * start
@@ -280,7 +280,7 @@ def real() -> None:
     reference = np.stack([np.array(poses[camera.name], float) for camera in rig.cameras])
     reference = se3.inverse(reference[0]) @ reference
     views = [
-        View(k, 0, KeptView.of(camera.surface(camera.images(1)[0]), 6000))
+        View(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
         for k, camera in enumerate(open_cameras([REAL / c.name for c in rig.cameras]))
     ]
     apart = np.median([pair.median_m for pair in rig.disagreement])

@@ -48,6 +48,14 @@ VARIANTS = {
     "seed": Variant("other recording", seed=100),
     "resolution": Variant("resolution 5 cm", changes=_registration(resolution=0.05)),
     "points": Variant("all target points", changes=_registration(target={"part": "all"})),
+    "both": Variant(
+        "resolution 5 cm, all target points",
+        changes=_registration(resolution=0.05, target={"part": "all"}),
+    ),
+    "uncalibrated": Variant(
+        "errors of the distance x 4",
+        effects=Effects(wiggling=4.0, pixel_offsets=4.0, thermal_drift=4.0),
+    ),
 }
 
 

@@ -29,7 +29,7 @@ from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.states import StateError, decode, encode, known_types
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.results.folder import CHECKPOINT, STAGING
@@ -225,11 +225,11 @@ def test_large_state_is_stored_in_parts() -> None:
 
 
 def test_derived_values_are_not_stored() -> None:
-    view = KeptView.of(prepare_view(corner(np.eye(4)), SurfaceOptions(radii=(2,))), 100)
-    assert len(view.middle) == 3
+    view = SampledView.of(prepare_view(corner(np.eye(4)), SurfaceOptions(radii=(2,))), 100)
+    assert len(view.patches) == len(view.points)
     found = decode(dict(encode(view)))
-    assert "middle" in vars(view)
-    assert "middle" not in vars(found)
+    assert "patches" in vars(view)
+    assert "patches" not in vars(found)
     np.testing.assert_array_equal(found.middle, view.middle)
 
 

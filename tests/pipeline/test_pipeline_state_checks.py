@@ -158,7 +158,7 @@ def test_all_checked_types_occur_in_a_run(kept: Kept) -> None:
 
     states = [a for arrays in kept.states.values() for n, a in arrays.items() if "nodes" in n]
     text = b"".join(array.tobytes() for array in states).decode()
-    rare = {"KeptView", "Cloud", "Keyframe"}
+    rare = {"SampledView", "Cloud", "Keyframe"}
     for kind, arrays in state_checks._ARRAYS.items():
         assert f"{kind.__module__}.{kind.__qualname__}" in text or kind.__name__ in rare, kind
         annotated = {*vars(kind), *getattr(kind, "__annotations__", ())}

@@ -15,13 +15,13 @@ from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, lo
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
 from tofuse.posegraph.pose_priors import Priors
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 
 
-def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
+def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
     """Views of a camera whose ranges are short by `offset`, refined as if they were correct."""
     truth = path(12)[:views]
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
     return views, refine(views, truth, OPTIONS)
 
 
@@ -61,10 +61,10 @@ def test_focal_length_without_rotation_is_undetermined():
     # Without rotation a wrong focal length widens everything alike: the views still agree.
     truth = path(12)
     truth[:, :3, :3] = np.eye(3)
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
-    turned = [KeptView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
+    turned = [SampledView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
 
-    def sigma(views: list[KeptView], poses: np.ndarray) -> float:
+    def sigma(views: list[SampledView], poses: np.ndarray) -> float:
         pairs = refine(views, poses, OPTIONS).pairs
         responses = response(views, poses, pairs, OPTIONS)
         return float(responses.sigma(pairs, len(views))[kernels.FOCAL])
@@ -76,7 +76,7 @@ def test_focal_length_without_rotation_is_undetermined():
 def test_focal_length_error_scales_sideways_motion() -> None:
     truth = path(12)
     truth[:, :3, :3] = np.eye(3)
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
     found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
     assert found.undetermined
     sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
@@ -115,7 +115,7 @@ def test_unclosed_gap_contradicts_errors() -> None:
 def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
     """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
     truth = path(24)[:8]
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
     refined = refine(views, truth, OPTIONS)
     drift = np.zeros(kernels.ERRORS)
     drift[kernels.FOCAL] = -0.06

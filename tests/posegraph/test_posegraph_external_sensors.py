@@ -26,7 +26,7 @@ from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.prepared_view import prepare_view
 
 N = 60
@@ -285,7 +285,7 @@ def test_refinement_takes_unconstrained_tilt_from_gravity():
         n = T[:3, :3].T @ np.array([0, 0, 1.0])
         z = (2.0 - T[2, 3]) / (rays @ n[:2] + n[2])
         frame = replace(frame, depth=z.astype(np.float32), amplitude_image=None)
-        views.append(KeptView.of(prepare_view(frame, SHARP), 800))
+        views.append(SampledView.of(prepare_view(frame, SHARP), 800))
     rolled = poses.copy()
     for k in range(6):
         rolled[k] = rolled[k] @ se3.exp(np.array([0, 0, 0, 0, 0, 0.02 * k]))

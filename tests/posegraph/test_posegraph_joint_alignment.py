@@ -17,14 +17,14 @@ from tofuse.posegraph.build import build_graph
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.joint_alignment import Bodies, refine, spread_evenly
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
-from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.registration.prepared_view import prepare_view
 
 
 @pytest.fixture(scope="module")
 def swing():
     truth = path(12)
-    kept = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
+    kept = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
     return kept, truth
 
 
@@ -77,14 +77,14 @@ def test_result_is_independent_of_threads(swing):
 
 def test_camera_errors_are_estimated_where_observable():
     truth = path(12)
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, offset=0.05)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, offset=0.05)]
     start = drifted(truth)
     plain = refine(views, start, OPTIONS)
     found = refine(views, start, OPTIONS, calibrate=[kernels.OFFSET])
     assert found.errors[kernels.OFFSET] == pytest.approx(0.05, abs=0.01)
     assert away(found.poses, truth) < 0.5 * away(plain.poses, truth)
     # A correct camera is found to have no errors.
-    good = [KeptView.of(s, 1500) for s in surfaces(truth)]
+    good = [SampledView.of(s, 1500) for s in surfaces(truth)]
     none = refine(good, start, OPTIONS, calibrate=[kernels.OFFSET, kernels.FOCAL])
     assert np.abs(none.errors).max() < 0.01
 
@@ -174,8 +174,8 @@ def test_shared_pixel_error_counts_once_in_joint_refinement():
     assert whole[0].with_pixel_variance() is whole[0]
     found = refiner(Joint(), views, truth)
     # A hundred pixels that share their error weigh more than one pixel.
-    wary = refine([KeptView.of(view, 1500) for view in views], truth, OPTIONS)
-    once = refine([KeptView.of(view, 1500) for view in whole], truth, OPTIONS)
+    wary = refine([SampledView.of(view, 1500) for view in views], truth, OPTIONS)
+    once = refine([SampledView.of(view, 1500) for view in whole], truth, OPTIONS)
     np.testing.assert_allclose(found.poses, once.poses, atol=1e-12)
     gained = np.linalg.det(once.information) / np.linalg.det(wary.information)
     assert gained.min() > 10
@@ -242,7 +242,7 @@ def test_rigidly_mounted_views_move_together():
     instants = path(8)
     mounted = se3.exp(np.array([[0.0] * 6, [0.05, 0.02, -0.03, 0.1, 0.25, -0.05]]))
     truth = (instants[:, None] @ mounted[None]).reshape(-1, 4, 4)
-    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
     bodies = Bodies(np.repeat(np.arange(8), 2), np.tile(mounted, (8, 1, 1)))
     start = bodies.views(drifted(instants))
     found = refine(views, start, OPTIONS, bodies=bodies)

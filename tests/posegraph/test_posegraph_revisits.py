@@ -15,7 +15,7 @@ from tofuse.posegraph import revisits
 from tofuse.posegraph.information_gain import InformationGain
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.view_store import KeptView, ViewStore
+from tofuse.posegraph.view_store import SampledView, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.pose_probability import ACCEPTED
 from tofuse.registration.prepared_view import prepare_view
@@ -60,7 +60,7 @@ def test_loop_to_the_least_certain_view_is_tried_as_well():
         for shift in ([0.0] * 8, aside)
     )
     options = SurfaceOptions(radii=(2,))
-    views = [KeptView.of(prepare_view(corner(T), options), 600) for T in truth]
+    views = [SampledView.of(prepare_view(corner(T), options), 600) for T in truth]
     found = Revisits(per_view=1).candidates(views, poses, first=6)
     assert list(found) == [(4, 6), (5, 7)]
     assert all(overlap > 0.9 for overlap in found.values())

@@ -16,14 +16,14 @@ from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.prepared_view import prepare_view
 
 WIDE = (1.0, 50.0, 0.5)  # scale, robust limit (so wide that robust weights are 1), cosine
 
 
-def view(frame) -> KeptView:
-    return KeptView.of(prepare_view(frame, SHARP), 1500)
+def view(frame) -> SampledView:
+    return SampledView.of(prepare_view(frame, SHARP), 1500)
 
 
 def bent(frame, rng, size: float):
@@ -47,7 +47,7 @@ def sums_of(source, target, T):
     residuals = (0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
     row, sums = pair_equations(
         source.points,
-        target.surface,
+        target,
         T,
         residuals,
         patches=source.patches,
@@ -67,9 +67,9 @@ def test_patches_divide_image_into_equal_cells(pair):
         assert x[u == k - 1].max() < x[u == k].min()
     for k in range(1, shared_error.DOWN):
         assert y[v == k - 1].max() < y[v == k].min()
-    alike = shared_error.alike(source.surface)
-    np.testing.assert_array_equal(np.diag(alike), 1)
-    assert np.linalg.eigvalsh(alike).min() > 0
+    correlation = shared_error.patch_correlation(source.shape)
+    np.testing.assert_array_equal(np.diag(correlation), 1)
+    assert np.linalg.eigvalsh(correlation).min() > 0
 
 
 def test_sums_of_patches_match_normal_equations(pair):
@@ -81,7 +81,7 @@ def test_sums_of_patches_match_normal_equations(pair):
     R = response / np.sqrt(np.maximum(sums[:, :1], 1e-12))
     assert np.linalg.eigvalsh(H[:6, :6] - R.T @ R).min() > -1e-6 * np.trace(H)
     middle = len(source.points) // 2
-    single = KeptView(source.surface, source.points[middle : middle + 1])
+    single = source.with_points(np.s_[middle : middle + 1])
     one, row = sums_of(single, target, T)
     H, g = unpack(row)
     (k,) = np.flatnonzero(one[:, kernels.PATCH_WEIGHT])
@@ -91,30 +91,30 @@ def test_sums_of_patches_match_normal_equations(pair):
     np.testing.assert_allclose(g[:6], weight * r * J, atol=1e-5 * np.abs(weight * r * J).max())
 
 
-def discount(sums, alike, variance, row):
+def discount(sums, correlation, variance, row):
     which = np.array([0])
-    discount_shared_errors(sums[None], alike, np.array([variance]), which, row[None])
+    discount_shared_errors(sums[None], correlation, np.array([variance]), which, row[None])
 
 
 def test_kernel_eliminates_one_unknown_per_patch(pair):
     source, target, T = pair
     sums, row = sums_of(source, target, T)
-    alike, variance = shared_error.alike(target.surface), 0.004**2
+    correlation, variance = shared_error.patch_correlation(target.shape), 0.004**2
     H, g = unpack(row.copy())
     # Reference by the full system: pose, then the errors of the patches with their prior.
     D, h, M = sums[:, 0], sums[:, 1], sums[:, 2:]
-    big = np.diag(D) + np.linalg.inv(variance * alike)
+    big = np.diag(D) + np.linalg.inv(variance * correlation)
     H[:6, :6] -= M.T @ np.linalg.solve(big, M)
     g[:6] -= M.T @ np.linalg.solve(big, h)
     allowed = row.copy()
-    discount(sums, alike, variance, allowed)
+    discount(sums, correlation, variance, allowed)
     found_H, found_g = unpack(allowed)
     np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
     np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
     # Counts are unchanged, and without errors everything is.
     np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
     same = row.copy()
-    discount(sums, alike, 0.0, same)
+    discount(sums, correlation, 0.0, same)
     np.testing.assert_allclose(same, row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
 
 
@@ -132,15 +132,15 @@ def test_size_of_shared_errors_is_estimated_from_residuals(size):
             frames.append(replace(frame, depth=(frame.depth + noise).astype(np.float32)))
         source, target = (view(frame) for frame in frames)
         sums, row = sums_of(source, target, T)
-        alike = shared_error.alike(target.surface)
-        found = shared_error.disagreement(sums[None], row[None], alike)
+        correlation = shared_error.patch_correlation(target.shape)
+        found = shared_error.disagreement(sums[None], row[None], correlation)
         seen.append((found.seen - found.noise) / found.expected)
     sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
     # Both views have errors along their rays, which meet surfaces at an angle.
     assert sigma < 0.002 if size == 0 else 0.5 * size < sigma < 2 * size
 
 
-def bent_views(seed: int, size: float, *, lit: bool = True) -> tuple[list[KeptView], np.ndarray]:
+def bent_views(seed: int, size: float, *, lit: bool = True) -> tuple[list[SampledView], np.ndarray]:
     rng = np.random.default_rng(seed)
     truth, views = path(8), []
     for k, T in enumerate(truth):

@@ -12,7 +12,7 @@ from tofuse.evaluation.trajectory import displacement
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.prepared_view import prepare_view
 
 
@@ -41,7 +41,7 @@ def errors(
         if not upper:
             depth[: len(depth) // 2] = 0
         view = prepare_view(replace(frame, depth=depth.astype(np.float32)), SHARP)
-        views.append(KeptView.of(view, 1500))
+        views.append(SampledView.of(view, 1500))
     refined = refine(views, truth, OPTIONS)
     found = split_half_errors(views, refined, OPTIONS, Priors.none())
     return displacement(truth, refined.poses), found

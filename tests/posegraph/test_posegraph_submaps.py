@@ -15,7 +15,7 @@ from tofuse.posegraph import view_store as of_views
 from tofuse.posegraph.calibration_check import CalibrationCheck, of_submaps
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.submaps import cut, submaps
-from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, nearby, overlaps
+from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, nearby, overlaps
 from tofuse.registration.view_descriptor import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
@@ -135,7 +135,7 @@ def test_views_of_nearby_places_are_compared(monkeypatch) -> None:
 
 def test_nearest_views_are_overlapping_views(swing, monkeypatch) -> None:
     views, truth = swing
-    kept = [KeptView.of(view, 600) for view in views]
+    kept = [SampledView.of(view, 600) for view in views]
     every, shares = overlaps(kept, truth, 0.6)
     for name, number in (("_ALL", 10), ("_NEAREST", 20), ("_JUST_BEFORE", 5)):
         monkeypatch.setattr(of_views, name, number)

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from rig_scene import looked_at
 from tofuse.geometry import se3
 from tofuse.lab.simulation.rig import around, relative
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
@@ -38,7 +38,7 @@ def rig(
         frame = looked_at(T[k], rng, offset if k == 2 else 0.0)
         if distortion is not None:
             frame = distorted(frame, distortion[k])
-        views.append(View(k, 0, KeptView.of(prepare_view(frame, SurfaceOptions()), 4000)))
+        views.append(View(k, 0, SampledView.of(prepare_view(frame, SurfaceOptions()), 4000)))
     return views, np.stack(relative(T))
 
 
@@ -115,7 +115,7 @@ def test_displaced_camera_increases_disagreement() -> None:
 def test_cameras_without_overlap_are_not_calibrated() -> None:
     views, truth = rig(3)
     apart = [v for v in views if v.camera in (0, 1)]
-    apart = [apart[0], View(1, 1, apart[1].kept)]  # at another instant
+    apart = [apart[0], View(1, 1, apart[1].sampled)]  # at another instant
     placed = refine_together(apart, truth[:2])
     assert np.allclose(placed.poses, truth[:2])
     assert not placed.disagreement

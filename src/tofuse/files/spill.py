@@ -216,7 +216,7 @@ class Spill(Generic[T]):
                 shapes = self._shapes  # of which there may be many
             self._shapes = shapes
             nbytes = sum(a.nbytes for a in own.values())
-            self._entries[number] = _Entry(type(item)(**(fields | empty)), shapes, nbytes)
+            self._entries[number] = _Entry(_shell(type(item), fields | empty), shapes, nbytes)
             self._keep(number, item)
         return number
 
@@ -266,7 +266,6 @@ class Spill(Generic[T]):
 
     def _empty_like(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return the same empty array for all arrays of this type and shape beyond the first."""
-        # Items may check the other dimensions in `__post_init__`.
         empty = np.empty((0, *array.shape[1:])[: array.ndim], array.dtype)
         return self._empty.setdefault((empty.shape, empty.dtype.str), empty)
 
@@ -340,6 +339,20 @@ class Scratch:
     def part(self, fraction: float) -> Spill[Any]:
         """Return a new store with a fraction of the budget."""
         return Spill(int(fraction * self.budget), self.folder)
+
+
+def _shell(kind: type[T], fields: Mapping[str, Any]) -> T:
+    """An item without the checks of its constructor, which empty arrays may not pass."""
+    shell = object.__new__(kind)
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.name in fields:
+            value = fields[field.name]
+        elif field.default_factory is not dataclasses.MISSING:
+            value = field.default_factory()
+        else:
+            value = field.default
+        object.__setattr__(shell, field.name, value)
+    return shell
 
 
 def _is_array(value: Any) -> bool:

@@ -55,7 +55,7 @@ class ModelBuilder:
     def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
         self._options = options
         if spill is None:
-            spill = Spill(options.memory_mb * 1_000_000 // 6)
+            spill = Spill(options.memory_mb * 1_000_000 // 10)
         self._ranges = StoredViews(spill)
         self._clouds = StoredClouds(spill)
         self._bytes = 0

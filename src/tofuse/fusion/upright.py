@@ -23,6 +23,8 @@ _LEVEL, _ROLLED = 0.0, np.log(0.05)
 # Standard deviation of man-made surfaces from horizontal or vertical, and the weight of their score
 # relative to the cameras.
 _STRUCTURE_ANGLE, _STRUCTURE_WEIGHT = np.radians(7.0), 4.0
+# Angles between up directions and normals that are computed at a time: bounds the memory.
+_AT_ONCE = 500_000
 
 
 def T_up_world(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
@@ -130,11 +132,13 @@ def _structure_score(normals: Float64, ups: Float64) -> Float64:
     """
     if not len(normals):
         return np.zeros(len(ups))
-    along = ups @ normals.T
-    sine2 = np.minimum(along**2, 1 - along**2)  # of the angle from vertical or horizontal
-    fits = np.exp(-0.5 * sine2 / np.sin(_STRUCTURE_ANGLE) ** 2)
-    score: Float64 = np.where(along < -np.sqrt(0.5), -fits, fits).mean(1)
-    return score
+    scores = []
+    for some in np.array_split(ups, -(-ups.shape[0] * len(normals) // _AT_ONCE)):
+        along = some @ normals.T
+        sine2 = np.minimum(along**2, 1 - along**2)  # of the angle from vertical or horizontal
+        fits = np.exp(-0.5 * sine2 / np.sin(_STRUCTURE_ANGLE) ** 2)
+        scores.append(np.where(along < -np.sqrt(0.5), -fits, fits).mean(1))
+    return np.concatenate(scores)
 
 
 def _refined(normals: Float64, up: Float64) -> Float64:

@@ -17,7 +17,7 @@ from tofuse.kernels.pair_equations import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS
 
 @kernel
 def discount_shared_errors(
-    sums: Float64, alike: Float64, variance: Float64, which: Int64, rows: Float64
+    sums: Float64, correlation: Float64, variance: Float64, which: Int64, rows: Float64
 ) -> None:
     """Marginalise the patches' shared errors in the normal equations of pairs, in place.
 
@@ -25,7 +25,7 @@ def discount_shared_errors(
     ----------
     sums
         (N, patches, PATCH_SIZE), see `pair_equations.target_equations`.
-    alike
+    correlation
         (patches, patches) correlation of the errors of patches.
     variance
         (K,) variances of these errors, m^2.
@@ -35,11 +35,11 @@ def discount_shared_errors(
         (N, SIZE) equations of the pairs, see `pair_equations`; updated.
     """
     for k in range(len(which)):
-        _discount(sums[which[k]], alike, variance[k], rows[which[k]])
+        _discount(sums[which[k]], correlation, variance[k], rows[which[k]])
 
 
 @kernel
-def _discount(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
+def _discount(sums: Float64, correlation: Float64, variance: float, row: Float64) -> None:
     """Do so for one pair."""
     count = len(sums)
     R = np.zeros((count, 7))
@@ -53,7 +53,7 @@ def _discount(sums: Float64, alike: Float64, variance: float, row: Float64) -> N
     Z = np.zeros((count, 7))
     for i in range(count):
         for j in range(i + 1):
-            total = variance * root[i] * root[j] * alike[i, j]
+            total = variance * root[i] * root[j] * correlation[i, j]
             for k in range(j):
                 total -= L[i, k] * L[j, k]
             if i == j:

@@ -234,7 +234,8 @@ class Assessment:
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""
-        frames = [f for f in self.stored.checks if f.index in self.tracked.poses]
+        images = (image.get() for image in self.stored.checks)
+        frames = [f for f in images if f.index in self.tracked.poses]
         row = {int(frame): k for k, frame in enumerate(graph.ids)}
         return frames, np.array([row[f.index] for f in frames], np.intp)
 

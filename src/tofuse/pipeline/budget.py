@@ -4,12 +4,17 @@ from __future__ import annotations
 
 # Fractions of the total. The rest is the program itself (some 400 MB), frames being processed, what
 # stages compute from stored views, and the result.
-_VOXELS, _VIEWS = 0.3, 0.05
+_VOXELS, _VIEWS, _CHECKED = 0.3, 0.03, 0.005
 
 
 def voxels_mb(memory_mb: int) -> int:
     """Return the memory of fusion for voxels, MB; see `Fusion.memory_mb`."""
     return max(1, int(_VOXELS * memory_mb))
+
+
+def checked_bytes(memory_mb: int) -> int:
+    """Return the memory for images that are compared with each other at the end, bytes."""
+    return int(_CHECKED * memory_mb * 1_000_000)
 
 
 def views_bytes(memory_mb: int) -> int:

@@ -239,6 +239,7 @@ class Mapper:
         if not self._ended:
             self._intake.end()
             self._ended = True
+            del self._tracker  # its keyframes
             give_back()
 
     def finish(self, stages: Stages | None = None) -> Reconstruction:

@@ -8,17 +8,17 @@ from functools import partial
 import numpy as np
 
 from tofuse.evaluation.cross_view import restore_thinned
-from tofuse.files.spill import Scratch
+from tofuse.files.spill import Scratch, Spill
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.odometry.base import Step
-from tofuse.pipeline.budget import views_bytes
+from tofuse.pipeline.budget import checked_bytes, views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
 from tofuse.pipeline.stage_results import BackEndInput
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.posegraph.view_store import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, Spilled, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.samples import FrameSample, FrameSamples
@@ -48,13 +48,14 @@ class Observations:
     def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
+        images = Scratch(checked_bytes(config.memory_mb))
         self.views: ViewStore[PreparedView] = ViewStore(Spacing(), always=ends, scratch=scratch)
         self.loops = config.loops.start(seed, given, self.views, config.search)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
         self._places = Spacing(enough=_ENOUGH).places()
-        self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._checks = _EvenSample(_CHECKED_IMAGES, images.part(1.0))
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None
         self._knows_errors = False
@@ -103,7 +104,7 @@ class Observations:
             self.loops,
             self._refiner,
             self._model,
-            self._checks.items,
+            self._checks.images,
             self._depths,
             self._ambiguity_m,
             self._knows_errors,
@@ -128,16 +129,17 @@ def _typical_range(frame: Frame) -> float:
 
 
 class _EvenSample:
-    """Keeps at most `size` items of a stream of unknown length, evenly spaced."""
+    """Stores at most `size` images of a stream of unknown length, evenly spaced."""
 
-    def __init__(self, size: int) -> None:
-        self.items: list[RangeFrame] = []
+    def __init__(self, size: int, spill: Spill[RangeFrame]) -> None:
+        self.images: list[Spilled[RangeFrame]] = []
+        self._spill = spill
         self._size, self._step, self._count = size, 1, 0
 
     def add(self, make: Callable[[], RangeFrame]) -> None:
         if self._count % self._step == 0:
-            self.items.append(make())
-            if len(self.items) > self._size:
-                self.items = self.items[::2]
+            self.images.append(Spilled(make(), self._spill))
+            if len(self.images) > self._size:
+                self.images = self.images[::2]
                 self._step *= 2
         self._count += 1

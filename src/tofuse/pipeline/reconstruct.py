@@ -30,7 +30,7 @@ from tofuse.results.types import Reconstruction
 
 _TRACKING = "tracking"
 # Frames that are read and prepared in advance; each takes a multiple of its images' size.
-_AHEAD = 6
+_AHEAD = 4
 
 
 def reconstruct(

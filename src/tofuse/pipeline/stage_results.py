@@ -12,7 +12,7 @@ from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
 from tofuse.posegraph.refinement import Refinement, Refiner
-from tofuse.posegraph.view_store import ViewStore
+from tofuse.posegraph.view_store import Spilled, ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 
@@ -86,7 +86,7 @@ class BackEndInput:
     loops: Loops
     refiner: Refiner
     model: ModelBuilder
-    checks: Sequence[RangeFrame]
+    checks: Sequence[Spilled[RangeFrame]]
     depths: dict[int, float]
     ambiguity_m: float | None
     knows_errors: bool

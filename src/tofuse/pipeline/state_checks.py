@@ -24,7 +24,7 @@ from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.pipeline.frame_log import Entry
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.view_store import Outline, PosedView
+from tofuse.posegraph.view_store import CoarseView, PosedView
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projection import Projection
@@ -44,7 +44,7 @@ _ARRAYS: dict[type, dict[str, str]] = {
         "target": f"f4 H W {PIXEL_SIZE}",
     },
     Projection: {"rays": "f4 H W 2", "lookup": "f4 A B 2", "frame": "f8! 4", "lengths2": "f4 H W"},
-    Outline: {"points": f"f4 N {POINT_SIZE}", "target": f"f4 H W {PIXEL_SIZE}"},
+    CoarseView: {"points": f"f4 N {POINT_SIZE}", "target": f"f4 H W {PIXEL_SIZE}"},
     RangeView: {"z": "u2 H W", "normals": "i1 H W 3", "strength": "u1 H W"},
     Step: {"T_component_camera": "f8! 4 4", "moving": "b1 H W"},
     Keyframe: {"T_component_camera": "f8! 4 4"},

@@ -32,7 +32,7 @@ from tofuse.posegraph.joint_alignment import (
 from tofuse.posegraph.pair_equations import RefineOptions, Round
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import aligned_motion
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
@@ -189,7 +189,7 @@ def _large(name: str, error: float, sigma: float) -> bool:
 
 
 def check_calibration(
-    views: Sequence[KeptView], refined: Refined, options: RefineOptions, priors: Priors
+    views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from refined views.
 
@@ -220,7 +220,7 @@ def check_calibration(
         return by_loop()
     few, some = list(views), pairs
     if len(pairs) > _ENOUGH_PAIRS:
-        few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
+        few = [v.with_points(np.s_[::_EVERY]) for v in views]
         some = spread_evenly(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
     patient = replace(options, rounds=_ROUNDS)
 
@@ -289,13 +289,13 @@ def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
     return _rms(position) / _SMALL, _rms(rotation) / _SMALL
 
 
-def _gain(found: Refined, views: Sequence[KeptView]) -> float:
+def _gain(found: Refined, views: Sequence[SampledView]) -> float:
     n = len(views)
     return float(found.after.of_views(n).mean() - found.before.of_views(n).mean())
 
 
 def loop_gap(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     refined: Refined,
     poses: Float64,
     errors: Float64,
@@ -323,14 +323,14 @@ def loop_gap(
 class _Loop:
     """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
 
-    views: Sequence[KeptView]
+    views: Sequence[SampledView]
     i: int
     j: int
     options: RefineOptions
 
     @classmethod
     def longest(
-        cls, views: Sequence[KeptView], refined: Refined, options: RefineOptions
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions
     ) -> _Loop | None:
         """Return the longest loop of refined views; None if there is none."""
         ends = longest_loop(refined.pairs)
@@ -339,7 +339,7 @@ class _Loop:
     @property
     def depth(self) -> float:
         """Median depth of the two ends, m."""
-        return 0.5 * (self.views[self.i].surface.depth + self.views[self.j].surface.depth)
+        return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
 
     def miss(self, poses: Float64, errors: Float64) -> Float64:
         """Return the motion (4, 4) by which chained pairwise alignments miss the end of the loop.
@@ -388,7 +388,7 @@ class _Loop:
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given `miss` without and with errors of the camera."""
-        first, last = (self.views[k].surface.index for k in (self.i, self.j))
+        first, last = (self.views[k].index for k in (self.i, self.j))
         change = se3.inverse(before) @ after
         return Gap(first, last, _size(before), _size(after), self.depth, _size(change))
 
@@ -431,7 +431,7 @@ def _size(T: Float64) -> tuple[float, float]:
 
 
 def _check_by_loop(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     refined: Refined,
     sigmas: Mapping[str, float],
     none: CalibrationCheck,

@@ -18,7 +18,7 @@ from tofuse.posegraph.pair_equations import (
     without_exposure,
 )
 from tofuse.posegraph.pose_priors import DAMPING, Priors, weak_prior
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Response:
 
 
 def response(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     poses: Float64,
     pairs: Intp,
     options: RefineOptions,

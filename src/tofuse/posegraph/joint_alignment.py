@@ -33,7 +33,7 @@ from tofuse.posegraph.pair_equations import (
 )
 from tofuse.posegraph.pose_priors import DAMPING, UNITS, WEAK, Priors, weak_prior
 from tofuse.posegraph.sparse import PairSystem
-from tofuse.posegraph.view_store import KeptView, overlaps
+from tofuse.posegraph.view_store import SampledView, overlaps
 
 _ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
 # Overlaps are computed anew after a larger motion, in units of 1 cm and 1 degree.
@@ -141,7 +141,7 @@ class Bodies:
 
 
 def refine(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     poses: Float64,
     options: RefineOptions,
     *,
@@ -220,7 +220,7 @@ class AlignedViews:
 
 
 def align_views(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     poses: Float64,
     options: RefineOptions,
     *,
@@ -268,7 +268,7 @@ def align_views(
 
 
 def support_of(
-    views: Sequence[KeptView], poses: Float64, refined: Refined, options: RefineOptions
+    views: Sequence[SampledView], poses: Float64, refined: Refined, options: RefineOptions
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     state = directed_pairs(views, refined.pairs, options)
@@ -278,7 +278,7 @@ def support_of(
 
 
 def align_pairs(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     pairs: Intp,
     T_i_j: Float64,
     options: RefineOptions,
@@ -337,7 +337,7 @@ def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
 
 
 def _overlapping(
-    views: Sequence[KeptView], poses: Float64, options: RefineOptions, bodies: Bodies | None
+    views: Sequence[SampledView], poses: Float64, options: RefineOptions, bodies: Bodies | None
 ) -> Intp:
     """Return the (M, 2) pairs of overlapping views, of different bodies if there are any."""
     pairs = overlaps(views, poses, options.overlap)[0]
@@ -355,7 +355,7 @@ def _moved(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
 
 
 def _support(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     poses: Float64,
     errors: Float64,
     known: Int64,

@@ -20,7 +20,7 @@ from tofuse.kernels.alignment import POINT_SIZE
 from tofuse.kernels.shared_error import discount_shared_errors
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 
 _PAIRS_A_CHUNK = 8
 # Approximate number of pairs from which the disagreement of patches is estimated.
@@ -130,7 +130,7 @@ class DirectedPairs:
 
 
 def directed_pairs(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     pairs: Intp,
     options: RefineOptions,
     before: DirectedPairs | None = None,
@@ -144,7 +144,7 @@ def directed_pairs(
     n = len(target)
     max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
-    photometric = np.array([v.surface.has_albedo for v in views]) & options.photometric
+    photometric = np.array([v.has_albedo for v in views]) & options.photometric
     sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
     state = DirectedPairs(target, source, *unknown, max_scale[source], sources)
     state.scale_p[~(photometric[target] & photometric[source])] = 0.0
@@ -157,7 +157,7 @@ def directed_pairs(
     return state
 
 
-def _sources(views: Sequence[KeptView], *, by_patch: bool) -> kernels.SourcePoints:
+def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourcePoints:
     """Points of views; of those that occur several times only once."""
     different = {id(v): v for v in views}
     row = {key: k for k, key in enumerate(different)}
@@ -170,12 +170,12 @@ def _sources(views: Sequence[KeptView], *, by_patch: bool) -> kernels.SourcePoin
         np.concatenate([np.zeros(0, np.int64), *patches]),
         ends[of],
         ends[of + 1],
-        np.array([v.surface.measures_range for v in views], np.bool_),
+        np.array([v.measures_range for v in views], np.bool_),
     )
 
 
 def evaluate(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     poses: Float64,
     errors: Float64,
     known: Int64,
@@ -214,7 +214,7 @@ def evaluate(
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             pairs = order[begin[k] : end[k]]
-            target = views[targets[k]].surface
+            target = views[targets[k]]
             found = np.empty((len(pairs), kernels.SIZE))
             of_patches = np.empty((len(pairs), *sums.shape[1:]))
             kernels.target_equations(
@@ -251,7 +251,7 @@ def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
 
 
 def discount_shared(
-    views: Sequence[KeptView], poses: Float64, state: DirectedPairs, options: RefineOptions
+    views: Sequence[SampledView], poses: Float64, state: DirectedPairs, options: RefineOptions
 ) -> None:
     """Remove from the normal equations what depth errors shared by patches could explain.
 
@@ -259,19 +259,19 @@ def discount_shared(
     """
     photometric = np.flatnonzero(state.scale_p > 0)
     T = se3.inverse(poses[state.target[photometric]]) @ poses[state.source[photometric]]
-    depth = np.array([v.surface.depth for v in views])[state.target[photometric]]
+    depth = np.array([v.depth for v in views])[state.target[photometric]]
     growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
-    # Views of one recording come from one camera: their errors are alike.
-    alike = shared_error.alike(views[0].surface)
+    # Views of one recording come from one camera: their patches are correlated in the same way.
+    correlation = shared_error.patch_correlation(views[0].shape)
     some = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
     sampled = photometric[some]
-    found = shared_error.disagreement(state.sums[sampled], state.rows[sampled], alike)
+    found = shared_error.disagreement(state.sums[sampled], state.rows[sampled], correlation)
     variance = options.shared**2 * found.variance(growth[some]) * growth
     if not variance.any():
         return
 
     def work(a: int, b: int) -> None:
-        discount_shared_errors(state.sums, alike, variance[a:b], photometric[a:b], state.rows)
+        discount_shared_errors(state.sums, correlation, variance[a:b], photometric[a:b], state.rows)
 
     run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
 

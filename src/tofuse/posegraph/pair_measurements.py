@@ -14,7 +14,7 @@ from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import spread_evenly
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.view_store import KeptView, PosedView, overlaps
+from tofuse.posegraph.view_store import PosedView, SampledView, overlaps
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
@@ -65,7 +65,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
     """Return (M, 2) positions i < j of the views that are compared."""
-    kept = [KeptView.of(view.view, _PAIRS.points) for view in views]
+    kept = [SampledView.of(view.view, _PAIRS.points) for view in views]
     pairs = spread_evenly(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
     after = np.arange(1, len(views))
     row = np.stack([after - 1, after], 1)

@@ -28,7 +28,14 @@ from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors
 from tofuse.posegraph.submaps import RefinedSubmap, fell, refine_submaps
-from tofuse.posegraph.view_store import KeptView, Outline, PosedView, Spilled, ViewStore
+from tofuse.posegraph.view_store import (
+    CoarseView,
+    PosedView,
+    SampledView,
+    Spilled,
+    ViewStore,
+    sampled_points,
+)
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
 
@@ -288,7 +295,7 @@ def _together(
     _: ViewStore[PreparedView],
 ) -> tuple[Refined, _Evidence]:
     """Refine all views at once."""
-    views = [_kept(p, options) for p in posed]
+    views = [_sampled(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     numbers = [_ERRORS[name] for name in options.calibrate]
     refined = refine(views, poses, options.alignment, calibrate=numbers, priors=priors)
@@ -308,11 +315,11 @@ def _in_submaps(
     """Refine submap by submap."""
     ids = [p.index for p in posed]
     refined, parts = refine_submaps(
-        [_Seen.of(_kept(p, options), store.outlines) for p in posed],
+        [_Spilled.of(p, options, store.coarse) for p in posed],
         poses,
         options.alignment,
         options.submap,
-        lambda some: [_kept(posed[k], options) for k in some],
+        lambda some: [_sampled(posed[k], options) for k in some],
         lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
         partial(_evaluated, options=options),
         [_ERRORS[name] for name in options.calibrate],
@@ -340,24 +347,33 @@ def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """The outline of a view, possibly on disk."""
+class _Spilled:
+    """The coarse version of a view, possibly on disk."""
 
     middle: Float64
-    kept: Spilled[Outline]
+    kept: Spilled[CoarseView]
 
     @classmethod
-    def of(cls, view: KeptView, spill: Spill[Outline]) -> _Seen:
-        return cls(view.middle, Spilled(view.outline, spill))
+    def of(
+        cls, posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
+    ) -> _Spilled:
+        surface = _surface(posed)
+        points = sampled_points(surface, options.alignment.points)
+        coarse = CoarseView.of(surface, points)
+        return cls(coarse.middle, Spilled(coarse, spill))
 
     @property
-    def outline(self) -> Outline:
-        """See `Outlined`."""
+    def coarse(self) -> CoarseView:
+        """See `HasCoarseView`."""
         return self.kept.get()
 
 
-def _kept(posed: PosedView[PreparedView], options: Joint) -> KeptView:
-    return KeptView.of(posed.view.with_pixel_variance().without_caches(), options.alignment.points)
+def _surface(posed: PosedView[PreparedView]) -> PreparedView:
+    return posed.view.with_pixel_variance().without_caches()
+
+
+def _sampled(posed: PosedView[PreparedView], options: Joint) -> SampledView:
+    return SampledView.of(_surface(posed), options.alignment.points)
 
 
 def _calibration_check(one: RefinedSubmap, options: Joint) -> CalibrationCheck:

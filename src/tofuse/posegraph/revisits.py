@@ -27,14 +27,14 @@ from tofuse.posegraph.loops import (
     in_order,
 )
 from tofuse.posegraph.view_store import (
-    KeptView,
-    Outline,
-    Outlined,
+    CoarseView,
+    HasCoarseView,
     PosedView,
     Spacing,
     Spilled,
     ViewStore,
     overlaps,
+    sampled_points,
 )
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
@@ -81,11 +81,11 @@ class _Entry:
 
     middle: Float64
     descriptor: Float32
-    kept: Spilled[Outline]
+    kept: Spilled[CoarseView]
 
     @property
-    def outline(self) -> Outline:
-        """See `Outlined`."""
+    def coarse(self) -> CoarseView:
+        """See `HasCoarseView`."""
         return self.kept.get()
 
 
@@ -147,7 +147,7 @@ class Revisits(Bounded, LoopDetector):
 
     def candidates(
         self,
-        views: Sequence[Outlined],
+        views: Sequence[HasCoarseView],
         poses: Float64,
         *,
         first: int = 0,
@@ -339,9 +339,9 @@ class _RevisitLoops(Loops):
 
     def _entry_of(self, posed: View) -> _Entry:
         surface = posed.view.without_caches()
-        outline = KeptView.of(surface, _POINTS).outline
-        kept = Spilled(outline, self._store.outlines)
-        return _Entry(outline.middle, view_descriptor(surface), kept)
+        coarse = CoarseView.of(surface, sampled_points(surface, _POINTS))
+        kept = Spilled(coarse, self._store.coarse)
+        return _Entry(coarse.middle, view_descriptor(surface), kept)
 
     def _learn(self, posed: Sequence[View]) -> None:
         """Learn the usual fit of neighbouring views of this camera."""

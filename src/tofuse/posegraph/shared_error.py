@@ -19,7 +19,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels import pair_equations as kernels
-from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.projection import Projection
 
 # Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
 # image's width, as in the tracker's covariance.
@@ -36,10 +36,10 @@ _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 
-def patches_of(points: Float32 | Float64, surface: PreparedView) -> Int64:
+def patches_of(points: Float32 | Float64, projection: Projection) -> Int64:
     """Return the (N,) patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
-    low, high = surface.projection.ray_bounds
+    low, high = projection.ray_bounds
     relative = (rays - low) / np.maximum(high - low, 1e-9)
     shape = np.array([ACROSS, DOWN])
     u, v = np.clip((relative * shape).astype(np.int64), 0, shape - 1).T
@@ -47,16 +47,16 @@ def patches_of(points: Float32 | Float64, surface: PreparedView) -> Int64:
 
 
 @cache
-def _alike(aspect: float) -> Float64:
+def _correlation(aspect: float) -> Float64:
     v, u = np.mgrid[:DOWN, :ACROSS]
     x, y = u.ravel() / ACROSS, v.ravel() * aspect / DOWN
     return np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / _REACH)
 
 
-def alike(surface: PreparedView) -> Float64:
-    """Return the (PATCHES, PATCHES) correlation of the errors of a view's patches."""
-    rows, columns = surface.z.shape
-    return _alike(rows / columns)
+def patch_correlation(shape: tuple[int, int]) -> Float64:
+    """Return the (PATCHES, PATCHES) correlation of the errors of patches, of an image (H, W)."""
+    rows, columns = shape
+    return _correlation(rows / columns)
 
 
 @dataclass(frozen=True, eq=False)

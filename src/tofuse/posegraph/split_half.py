@@ -25,7 +25,7 @@ from tofuse.posegraph.joint_alignment import Refined, align_views
 from tofuse.posegraph.pair_equations import RefineOptions, Round
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.shared_error import ACROSS, DOWN
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 
 # The poses are near the solution of each half.
 _ROUNDS = (Round(5, 0.0, 0.0),)
@@ -34,7 +34,7 @@ _EVERY = 2
 
 
 def split_half_errors(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     refined: Refined,
     options: RefineOptions,
     priors: Priors,
@@ -57,7 +57,7 @@ def split_half_errors(
 
 
 def refined_by_halves(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     refined: Refined,
     options: RefineOptions,
     priors: Priors,
@@ -74,7 +74,7 @@ def refined_by_halves(
 
     def by_half(first: bool, halves: Sequence[Bool]) -> Float64:
         part = [
-            KeptView(v.surface, np.ascontiguousarray(v.points[half == first][::_EVERY]))
+            v.with_points(np.flatnonzero(half == first)[::_EVERY])
             for v, half in zip(views, halves, strict=True)
         ]
         return align_views(

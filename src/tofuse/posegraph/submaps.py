@@ -24,7 +24,7 @@ from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_ev
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import UNITS, Priors
-from tofuse.posegraph.view_store import KeptView, Outlined, looked_at, overlaps
+from tofuse.posegraph.view_store import HasCoarseView, SampledView, looked_at, overlaps
 
 A = TypeVar("A")
 
@@ -54,7 +54,7 @@ class Submap:
 class RefinedSubmap:
     """A refined submap: its views, their positions among all, the result, and the priors."""
 
-    views: Sequence[KeptView]
+    views: Sequence[SampledView]
     at: Intp
     refined: Refined
     priors: Priors
@@ -107,11 +107,11 @@ def submaps(places: Float64, pairs: Intp, max_size: int) -> list[Submap]:
 
 
 def refine_submaps(
-    outlines: Sequence[Outlined],
+    coarse: Sequence[HasCoarseView],
     poses: Float64,
     options: RefineOptions,
     max_size: int,
-    load: Callable[[Intp], list[KeptView]],
+    load: Callable[[Intp], list[SampledView]],
     priors: Callable[[Intp | None], Priors],
     evaluate: Callable[[RefinedSubmap], A],
     calibrate: Sequence[int] = (),
@@ -120,7 +120,7 @@ def refine_submaps(
 
     Parameters
     ----------
-    outlines
+    coarse
         Of the N views.
     poses
         (N, 4, 4) initial T_world_camera; the first stays.
@@ -137,8 +137,8 @@ def refine_submaps(
     calibrate
         Errors of the camera to estimate: in each submap by itself, of which the median is taken.
     """
-    pairs = spread_evenly(overlaps(outlines, poses, options.overlap)[0], options.neighbours)
-    parts = [s for s in submaps(looked_at(outlines, poses), pairs, max_size) if len(s.pairs)]
+    pairs = spread_evenly(overlaps(coarse, poses, options.overlap)[0], options.neighbours)
+    parts = [s for s in submaps(looked_at(coarse, poses), pairs, max_size) if len(s.pairs)]
 
     def arguments(k: int) -> tuple[Any, ...]:
         # Only one submap's views are in memory at a time.
@@ -195,7 +195,7 @@ def fell(gained: Float64) -> bool:
 
 
 def _refined_alone(
-    views: Sequence[KeptView],
+    views: Sequence[SampledView],
     part: Submap,
     poses: Float64,
     options: RefineOptions,

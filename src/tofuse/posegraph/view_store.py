@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 from weakref import finalize
@@ -33,14 +33,13 @@ _FACING = 0.5
 # Up to this many views, all pairs are compared; of more, each view with those that see the nearest
 # places, and with those just before it, so that the work is linear in the length of the path.
 _ALL, _NEAREST, _JUST_BEFORE = 512, 192, 64
-# Fraction of the memory for views that is reserved for their outlines, which are small but all in
-# use.
-_FOR_OUTLINES = 0.25
+# Fraction of the memory for views that is reserved for coarse ones: small, but all in use.
+_FOR_COARSE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
-    """A thinned view, for estimates of the overlap.
+class CoarseView:
+    """A subsampled view, for estimates of the overlap.
 
     Attributes
     ----------
@@ -56,62 +55,114 @@ class Outline:
     target: Float32
     projection: Projection
 
+    @classmethod
+    def of(cls, surface: PreparedView, points: Float32) -> CoarseView:
+        """Subsample a view and its points (N, POINT_SIZE)."""
+        some = points[:: max(1, len(points) // _OVERLAP_POINTS)].copy()
+        coarse = surface.subsampled(_OVERLAP_COLUMNS)
+        return cls(some, coarse.target, coarse.projection)
+
     @property
     def middle(self) -> Float64:
-        """(3,) of the points, in the camera's frame."""
+        """(3,) centroid of the points, in the camera's frame."""
         p = self.points[:, POINT : POINT + 3]
         return np.asarray(p.mean(0, dtype=float) if len(p) else np.zeros(3), np.float64)
 
 
-class Outlined(Protocol):
-    """A view with an outline."""
+class HasCoarseView(Protocol):
+    """A view of which the overlap with others can be estimated."""
 
     @property
     def middle(self) -> Float64:
-        """(3,) middle of its outline's points, in its camera's frame."""
+        """(3,) centroid of its points, in its camera's frame."""
         ...
 
     @property
-    def outline(self) -> Outline:
-        """See `Outline`."""
+    def coarse(self) -> CoarseView:
+        """See `CoarseView`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class KeptView:
-    """A prepared view of few pixels, and the points that it gives as a source."""
+class SampledView:
+    """What the alignment of a prepared view with others needs, in half of its memory.
 
-    surface: PreparedView
+    Attributes
+    ----------
+    index
+        Of the frame in its recording.
+    depth
+        Median z, m.
+    target
+        (H, W, PIXEL_SIZE) target image, see `make_target`.
+    projection
+        Projection of points into it.
+    points
+        (N, POINT_SIZE) sampled points, which are compared with other views.
+    coarse
+        For estimates of the overlap.
+    has_albedo, measures_range
+        As of `PreparedView`.
+    """
+
+    index: int
+    depth: float
+    target: Float32
+    projection: Projection
     points: Float32
+    coarse: CoarseView
+    has_albedo: bool = False
+    measures_range: bool = False
 
     @classmethod
-    def of(cls, surface: PreparedView, points: int) -> KeptView:
+    def of(cls, surface: PreparedView, points: int) -> SampledView:
         """Sample approximately `points` points of a view."""
-        every = max(1, round(np.sqrt(surface.z.size / points)))
-        return cls(surface, points_of(surface, every))
+        sampled = sampled_points(surface, points)
+        return cls(
+            surface.index,
+            surface.depth,
+            surface.target,
+            surface.projection,
+            sampled,
+            CoarseView.of(surface, sampled),
+            surface.has_albedo,
+            surface.measures_range,
+        )
 
-    @cached_property
-    def outline(self) -> Outline:
-        """The thinned view, for estimates of the overlap."""
-        some = self.points[:: max(1, len(self.points) // _OVERLAP_POINTS)]
-        coarse = self.surface.subsampled(_OVERLAP_COLUMNS)
-        return Outline(some, coarse.target, coarse.projection)
+    def with_points(self, which: Intp | slice) -> SampledView:
+        """Return the view with a subset of its points."""
+        return replace(self, points=np.ascontiguousarray(self.points[which]))
 
-    @cached_property
+    @property
+    def target_image(self) -> TargetImage:
+        """The target image and its projection."""
+        return TargetImage(self.target, self.projection.lookup, self.projection.frame)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the target image."""
+        return self.target.shape[0], self.target.shape[1]
+
+    @property
     def middle(self) -> Float64:
-        """(3,) of what it sees, in the camera's frame."""
-        return self.outline.middle
+        """(3,) centroid of what it sees, in the camera's frame."""
+        return self.coarse.middle
 
     @cached_property
     def patches(self) -> Int64:
         """(N,) patch of the image that each point belongs to, see `shared_error`."""
-        return shared_error.patches_of(self.points, self.surface)
+        return shared_error.patches_of(self.points, self.projection)
 
     @cached_property
     def sigma(self) -> float:
         """Median sigma of the points' z, m."""
         p = self.points
         return float(np.median(p[:, SIGMA] * p[:, POINT + 2])) if len(p) else 0.01
+
+
+def sampled_points(surface: PreparedView, count: int) -> Float32:
+    """Return approximately `count` points (N, POINT_SIZE) of a view, on a regular grid."""
+    return points_of(surface, max(1, round(np.sqrt(surface.z.size / count))))
 
 
 @dataclass(frozen=True)
@@ -225,14 +276,14 @@ class ViewStore(Generic[V]):
     always
         Frames that are stored in any case.
     scratch
-        Limits the memory, outlines of views included; unlimited by default.
+        Limits the memory, coarse views included; unlimited by default.
 
     Attributes
     ----------
     views
         In the order of their frames. The first of each component stays.
-    outlines
-        Storage for the outlines of these views.
+    coarse
+        Storage for the coarse versions of these views.
     """
 
     def __init__(
@@ -242,9 +293,9 @@ class ViewStore(Generic[V]):
         scratch: Scratch = Scratch(),  # noqa: B008 - immutable
     ) -> None:
         self.views: list[PosedView[V]] = []
-        self.outlines: Spill[Outline] = scratch.part(_FOR_OUTLINES)
+        self.coarse: Spill[CoarseView] = scratch.part(_FOR_COARSE)
         self._spacing, self._always = spacing, frozenset(always)
-        self._spill: Spill[V] = scratch.part(1 - _FOR_OUTLINES)
+        self._spill: Spill[V] = scratch.part(1 - _FOR_COARSE)
         self._stretch = 1.0
         self._places = spacing.places()
         # Where the last view would be if places were not thinned.
@@ -308,7 +359,7 @@ class ViewStore(Generic[V]):
 
 
 def overlaps(
-    views: Sequence[Outlined], poses: Float64, least: float, *, first: int = 0
+    views: Sequence[HasCoarseView], poses: Float64, least: float, *, first: int = 0
 ) -> tuple[Intp, Float64]:
     """Return the pairs of views that overlap, and their overlaps.
 
@@ -344,7 +395,7 @@ def overlaps(
     return np.stack([target[order], source[order]], 1), overlap[order]
 
 
-def looked_at(views: Sequence[Outlined], poses: Float64) -> Float64:
+def looked_at(views: Sequence[HasCoarseView], poses: Float64) -> Float64:
     """(N, 3) centroids of the points of views, in the world of their poses (N, 4, 4)."""
     middles = np.array([view.middle for view in views]).reshape(-1, 3)
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], middles) + poses[:, :3, 3])
@@ -378,7 +429,7 @@ def nearby(middles: Float64, first: int = 0) -> tuple[Intp, Intp]:
 
 
 def _seen_fractions(
-    views: Sequence[Outlined],
+    views: Sequence[HasCoarseView],
     poses: Float64,
     target: Intp,
     source: Intp,
@@ -386,7 +437,7 @@ def _seen_fractions(
 ) -> Float64:
     """Fraction of each source's points that its target sees; 0 if that is below `least`."""
     used, row = np.unique(source, return_inverse=True)
-    some = [views[k].outline.points for k in used]
+    some = [views[k].coarse.points for k in used]
     starts = np.concatenate([[0], np.cumsum([len(points) for points in some])])
     points = np.concatenate(some) if some else np.zeros((0, POINT_SIZE), np.float32)
     inverse, at = se3.inverse(poses), np.ascontiguousarray(poses[used])
@@ -399,7 +450,7 @@ def _seen_fractions(
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             rows = order[begin[k] : end[k]]
-            view = views[different[k]].outline
+            view = views[different[k]].coarse
             found = np.empty(len(rows))
             kernels.overlaps(
                 points,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Float64
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.report import camera_frusta, plots, thumbnails, words
 from tofuse.report.fields import fields
@@ -126,15 +126,17 @@ def views(s: Subject) -> Values:
         legend.insert(0, ("bad", "6 3", "true outline"))
     return {
         "views": figures,
-        "sizes": _sizes(points, measured, true),
+        "sizes": _sizes(s.result.cloud.points @ R.T.astype(np.float32), measured, true),
         "true_sizes": true is not None,
         "views_legend": legend,
         "views_note": _turn_note(R),
     }
 
 
-def _sizes(points: Float64, measured: Float64, true: Float64 | None) -> list[list[str]]:
+def _sizes(points: Float32, measured: Float64, true: Float64 | None) -> list[list[str]]:
+    """Extents of the model without outliers, by its corners `measured`, and of all its points."""
     rows = []
+    points = points[np.isfinite(points).all(1)]
     for axis, name in enumerate(("width", "height", "depth")):
         got = float(np.ptp(measured[:, axis]))
         row = [name, words.length(got), words.length(float(np.ptp(points[:, axis])))]

@@ -38,7 +38,8 @@ class Subject:
     rows
         The row of each frame index.
     points, truth
-        (N, 3) and (K, 3) finite points of the model and of the true surfaces, world frame.
+        (N, 3) and (K, 3) finite points of the model, at random, and of the true surfaces, world
+        frame.
     straight
         (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright by
         `Reconstruction.T_up_world`, and rotated so that the model is aligned with them.
@@ -66,8 +67,7 @@ class Subject:
         ):
             reference = None
         scene = make_scene(result, rows, reference)
-        cloud, truth = result.cloud, extras.truth_points
-        points = cloud.points[np.isfinite(cloud.points).all(1)].astype(float) + cloud.offset
+        points, truth = scene.points, extras.truth_points
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]
         true = truth.astype(float) if truth is not None and len(truth) else None

@@ -9,6 +9,7 @@ motion are equal for neighbouring points, in all views of a place.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -21,7 +22,7 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
 from tofuse.posegraph.pose_priors import UNITS
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
@@ -81,7 +82,7 @@ class View:
 
     camera: int
     instant: int
-    kept: KeptView
+    sampled: SampledView
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +147,7 @@ def disagreements(
 
 
 def disagreements_of(
-    views: Sequence[KeptView], camera: Intp, poses: Float64, pairs: Intp
+    views: Sequence[SampledView], camera: Intp, poses: Float64, pairs: Intp
 ) -> dict[tuple[int, int], tuple[float, int]]:
     """As `disagreements`, for pairs (M, 2) of views at any time with poses (N, 4, 4)."""
     found: dict[tuple[int, int], list[Float64]] = {}
@@ -159,13 +160,15 @@ def disagreements_of(
     return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
 
 
-def distances_between(target: KeptView, source: KeptView, T_target_source: Float64) -> Float64:
+def distances_between(
+    target: SampledView, source: SampledView, T_target_source: Float64
+) -> Float64:
     """Return the (N,) distances in m between the surfaces that both views see."""
     rows = np.empty((len(source.points), kernels.ROW))
-    surface, options = target.surface, JointOptions()
+    options = JointOptions()
     kernels.residuals(
         source.points,
-        surface.target_image,
+        target.target_image,
         np.ascontiguousarray(T_target_source),
         0.0,
         0.0,
@@ -173,7 +176,7 @@ def distances_between(target: KeptView, source: KeptView, T_target_source: Float
         rows,
     )
     far = np.abs(rows[:, kernels.RESIDUAL])
-    near = (rows[:, kernels.OWN] > 0) & (far < _OTHER_SURFACE * surface.depth)
+    near = (rows[:, kernels.OWN] > 0) & (far < _OTHER_SURFACE * target.depth)
     return np.asarray(far[near], np.float64)
 
 
@@ -200,7 +203,7 @@ class _System:
         self.pairs = [(i, j) for one in at.values() for i in one for j in one if i != j]
         count = len(poses)
         self.scale = np.full((count, count), 3.0)
-        depths = [view.kept.surface.depth for view in views]
+        depths = [view.sampled.depth for view in views]
         self.depth = float(np.median(depths)) if depths else 1.0
 
     def compare(self) -> list[Float64]:
@@ -212,11 +215,11 @@ class _System:
         def work(a: int, b: int) -> None:
             for k in range(a, b):
                 target, source = (self.views[i] for i in self.pairs[k])
-                surface, points = target.kept.surface, source.kept.points
+                points = source.sampled.points
                 out = np.empty((len(points), kernels.ROW))
                 kernels.residuals(
                     points,
-                    surface.target_image,
+                    target.sampled.target_image,
                     np.ascontiguousarray(inverse[target.camera] @ self.poses[source.camera]),
                     self.offsets[source.camera],
                     self.offsets[target.camera],
@@ -390,11 +393,11 @@ class _System:
         responses
             (K, PATCHES, n) of the gradient to a relative error of each patch.
         """
-        surface_of = {view.camera: view.kept.surface for view in self.views}
+        shapes = {view.camera: view.sampled.shape for view in self.views}
         B = np.zeros((responses.shape[2],) * 2)
-        for camera, surface in surface_of.items():
+        for camera, shape in shapes.items():
             # Twice the correlation length of errors that leave residuals, as in the tracker.
-            correlation = np.sqrt(shared_error.alike(surface))
+            correlation = np.sqrt(shared_error.patch_correlation(shape))
             L = self.options.systematic * responses[camera]
             B += L.T @ correlation @ L
         return B
@@ -419,7 +422,7 @@ class _System:
         ends = (source, p, kernels.BY_SOURCE), (target, q, kernels.BY_TARGET)
         for view, points, column in ends:
             by_error = row[:, column] * np.linalg.norm(points, axis=1)
-            patch = shared_error.patches_of(points, view.kept.surface)
+            patch = shared_error.patches_of(points, view.sampled.projection)
             sums = np.zeros((shared_error.PATCHES, weighted.shape[1]))
             np.add.at(sums, patch, weighted * by_error[:, None])
             responses[view.camera][:, at] += sums
@@ -429,8 +432,8 @@ class _System:
 
         Windows of neighbouring pixels overlap, and the pair is compared both ways.
         """
-        kept = self.views[self.pairs[k][1]].kept
-        return 2 * max(1.0, _SHARED_NOISE * len(kept.points) / max(kept.surface.pixels, 1))
+        source = self.views[self.pairs[k][1]].sampled
+        return 2 * max(1.0, _SHARED_NOISE * len(source.points) / max(math.prod(source.shape), 1))
 
     def disagreement(self, rows: Sequence[Float64]) -> dict[tuple[int, int], tuple[float, int]]:
         """See `disagreements`."""

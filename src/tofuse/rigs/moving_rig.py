@@ -21,7 +21,7 @@ from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.refinement import followed
 from tofuse.posegraph.split_half import refined_by_halves
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
@@ -176,7 +176,7 @@ class _Kept:
     """Views of one camera, and the positions of their poses in its track."""
 
     at: Intp
-    views: tuple[KeptView, ...]
+    views: tuple[SampledView, ...]
 
 
 class _Together:
@@ -189,7 +189,7 @@ class _Together:
         self.kept = False
         self._fits = fits
         views = [v for k in sorted(kept) for v in kept[k].views]
-        self.depth = float(np.median([v.surface.depth for v in views])) if views else 1.0
+        self.depth = float(np.median([v.depth for v in views])) if views else 1.0
         self._halves: list[tuple[dict[int, Track], ...]] = []
         self._pairs = np.zeros((0, 2), np.intp)
         self._poses = np.zeros((0, 4, 4))
@@ -210,7 +210,7 @@ class _Together:
                 frame = cameras[k].image(row)
                 if frame is not None:
                     at.append(p)
-                    views.append(KeptView.of(cameras[k].surface(frame), _POINTS))
+                    views.append(SampledView.of(cameras[k].surface(frame), _POINTS))
             kept[k] = _Kept(np.array(at, np.intp), tuple(views))
         return cls(world, kept, fits)
 

@@ -21,7 +21,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.pose_probability import ACCEPTED, Evidence
@@ -120,7 +120,7 @@ class _Placer:
         full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
         some = _evenly(full or list(instants), _REFINED)
         return [
-            View(c, m, KeptView.of(view, _POINTS))
+            View(c, m, SampledView.of(view, _POINTS))
             for m in some
             for c, views in enumerate(self._views)
             if (view := views[m]) is not None

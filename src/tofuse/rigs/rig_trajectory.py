@@ -21,7 +21,7 @@ from tofuse.posegraph.joint_alignment import Bodies, refine
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.refinement import followed, pairwise_measurements
 from tofuse.posegraph.submaps import fell
-from tofuse.posegraph.view_store import KeptView, Spacing
+from tofuse.posegraph.view_store import SampledView, Spacing
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import RigCamera
@@ -227,7 +227,7 @@ def refined(
         image = _image(recording, int(frame))
         if image is not None:
             camera = cameras[int(source.camera[recording.indices[frame]])]
-            views.append(KeptView.of(camera.surface(image), _POINTS))
+            views.append(SampledView.of(camera.surface(image), _POINTS))
             frames.append(int(frame))
     used, of = np.unique(instant[frames], return_inverse=True)
     if len(used) < 2:

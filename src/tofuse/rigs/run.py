@@ -24,7 +24,7 @@ from tofuse.posegraph.accuracy import HIDDEN
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import Known, NoRefinement
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Disagreement, Rig
@@ -270,7 +270,7 @@ def _checked(
         frame = source.read(int(index))
         if isinstance(frame, RangeFrame):
             c = int(source.camera[index])
-            views.append(View(c, 0, KeptView.of(cameras[c].surface(frame), _POINTS)))
+            views.append(View(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
     stated = np.stack([camera.T_rig_camera for camera in rig.cameras])
     placed = refine_together(views, stated)
     found = tuple(

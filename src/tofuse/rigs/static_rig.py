@@ -17,7 +17,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.pipeline.progress import Progress
-from tofuse.posegraph.view_store import KeptView
+from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.background import FarSurface, far_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
@@ -146,7 +146,7 @@ def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[in
     count = max((len(row) for row in instants), default=1)
     points = int(np.clip(_ALL_POINTS / count, _MIN_POINTS, _POINTS))
     return [
-        View(k, m, KeptView.of(view, points))
+        View(k, m, SampledView.of(view, points))
         for k, c in enumerate(order)
         for m, view in enumerate(instants[c])
         if view is not None
@@ -175,7 +175,7 @@ def _finer_offsets(
             continue
         times = cameras[c].recording.timestamps
         interval = float(np.median(np.diff(times)))
-        rows: dict[int, KeptView | None] = {}
+        rows: dict[int, SampledView | None] = {}
         costs = np.full((len(at), 2 * _LAGS + 1), np.nan)
         lags = np.full(2 * _LAGS + 1, np.nan)
         for column, shift in enumerate(range(-_LAGS, _LAGS + 1)):
@@ -194,7 +194,7 @@ def _finer_offsets(
                     if view is not None and target is not None:
                         T = se3.inverse(placed.poses[other]) @ placed.poses[k]
                         far = distances_between(target, view, T)
-                        found.append(np.minimum(far, _FAR * target.surface.depth))
+                        found.append(np.minimum(far, _FAR * target.depth))
                 distances = np.concatenate(found)
                 if len(distances):
                     costs[m, column] = distances.mean()
@@ -210,8 +210,8 @@ def _finer_offsets(
     return out
 
 
-def _kept(surface: PreparedView | None) -> KeptView | None:
-    return None if surface is None else KeptView.of(surface, _MIN_POINTS)
+def _kept(surface: PreparedView | None) -> SampledView | None:
+    return None if surface is None else SampledView.of(surface, _MIN_POINTS)
 
 
 def minimum_cost_lag(lags: Float64, costs: Float64) -> float | None:
