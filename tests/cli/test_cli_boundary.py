@@ -141,6 +141,13 @@ def test_safe_stream_never_raises(tmp_path: Path) -> None:
     assert sys.stdout is before
 
 
+def in_compiled_code(signal_error: BaseException) -> SystemError:
+    """The error of a compiled function that was interrupted by a signal."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = signal_error
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "status", "says"),
     [
@@ -149,6 +156,8 @@ def test_safe_stream_never_raises(tmp_path: Path) -> None:
         (MemoryError(), 2, "out of memory"),
         (Ended(15), 143, "terminated"),
         (BrokenPipeError(32, "Broken pipe"), 2, "Broken pipe"),
+        (in_compiled_code(KeyboardInterrupt()), 130, "interrupted"),
+        (in_compiled_code(Ended(15)), 143, "terminated"),
     ],
 )
 def test_command_failures_are_reported_in_one_line(error, status, says, capfd) -> None:

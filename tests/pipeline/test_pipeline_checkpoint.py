@@ -392,7 +392,8 @@ def test_checkpoint_is_kept_after_output_error(tmp_path: Path, monkeypatch) -> N
         (OutputError("is full"), 0.0, True),
         (OutputError("is full"), 60.0, False),
         (InputError("is bad"), 0.0, False),
-        (KeyboardInterrupt(), 0.0, False),
+        (KeyboardInterrupt(), 0.0, True),
+        (KeyboardInterrupt(), 60.0, False),
     ):
         monkeypatch.setattr(checkpoint, "_WORTH_KEEPING_S", seconds)
         kept = Checkpoints(tmp_path, "a", lambda _text: None)

@@ -154,6 +154,21 @@ def _print_error(text: str) -> None:
     print("tofuse: " + " ".join(text.split()), file=sys.stderr)
 
 
+def _unwrapped(command: Callable[[], int]) -> int:
+    """Run a command; a signal that arrived during a call of compiled code is raised as itself."""
+    from tofuse.errors import Ended
+
+    try:
+        return command()
+    except SystemError as error:
+        cause: BaseException | None = error
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(cause, KeyboardInterrupt | Ended):
+            raise cause from None
+        raise
+
+
 def run_command(command: Callable[[], int]) -> int:
     """Return the exit status of a command; errors are printed in one line."""
     from tofuse.cli.streams import safe_streams
@@ -161,7 +176,7 @@ def run_command(command: Callable[[], int]) -> int:
 
     with safe_streams():
         try:
-            return command()
+            return _unwrapped(command)
         except TofuseError as error:
             _print_error(str(error))
             return 2

@@ -195,7 +195,9 @@ class Checkpoints(Stages):
 
     def give_up(self, error: BaseException) -> None:
         """Remove all checkpoints, unless they save much work and a retry may succeed."""
-        can_help = isinstance(error, OutputError | OSError | MemoryError | Ended)
+        can_help = isinstance(
+            error, OutputError | OSError | MemoryError | Ended | KeyboardInterrupt
+        )
         if self._finished or not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
             self.discard()
 
