@@ -496,10 +496,8 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         )
     elif found.unconfirmed:
         cure = " or ".join(camera_in_words(found.unconfirmed))
-        text = (
-            f"Views agree better with {cure}, but no loop closure confirms it: the stated accuracy "
-            "includes its effect."
-        )
+        why = "but no loop closure confirms it" if found.large else "which is a usual tolerance"
+        text = f"Views agree better with {cure}, {why}: the stated accuracy includes its effect."
     else:
         return
     yield Reason("unchecked_calibration", e.posed, text)

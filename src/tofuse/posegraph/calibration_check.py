@@ -36,21 +36,22 @@ from tofuse.posegraph.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
-TOLERANCES = {"focal": 0.02, "offset": 0.02}
+TOLERANCES = {"focal": 0.01, "offset": 0.01}
 # Significance of an error in standard deviations, for an alarm and for a closer look; and the
 # fraction of the tolerance that one Gauss-Newton step, which falls short, must show for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
 # A loop is closed if its error is below this, m and rad.
 _CLOSED = (0.01, np.radians(0.5))
 # Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
-_MAX_SIGMA = 0.4
+_MAX_SIGMA = 0.8
 # Change of the views' support that the choice of points alone explains.
 _CHANCE = 0.003
-# Maximum number of secant steps to the error that closes a loop; change at convergence, and an
-# implausible error, relative to the tolerance.
-_SECANTS, _CONVERGED, _IMPLAUSIBLE = 4, 0.05, 10.0
-# Fraction of a closing error that the views must confirm: they may measure another one.
-_KEPT = 0.5
+# Secant steps to the error that closes a loop: their maximum number; the first one, relative to the
+# tolerance; and the change at convergence, and an implausible error, relative to the first one.
+_SECANTS, _FIRST_STEP, _CONVERGED, _IMPLAUSIBLE = 4, 2.0, 0.05, 10.0
+# An error that only the drift over the loop shows must exceed the tolerance by this factor; and the
+# fraction of it that the views must confirm: they may measure another one.
+_BY_LOOP, _KEPT = 2.0, 0.5
 # The spread between views is not known from fewer.
 _MIN_VIEWS = 8
 _SMALL = 1e-3  # error of the camera, to differentiate by
@@ -164,12 +165,21 @@ class CalibrationCheck:
 
     @property
     def unconfirmed(self) -> dict[str, float]:
-        """Significant errors of which one is large, and that no loop confirms or contradicts."""
+        """Significant errors without an alarm that may be true.
+
+        Either one of them is large, and no loop confirms or contradicts it, or the views agree
+        better with the smaller ones.
+        """
         if self.alarm or (self.gap is not None and self.gap.contradicts):
             return {}
-        if not self.large:
+        if not self.large and not self.improves:
             return {}
         return {n: e for n, e in self.errors.items() if abs(e) > _SIGNIFICANT * self._sigma(n)}
+
+    @property
+    def improves(self) -> bool:
+        """Whether the views agree better with the error `best`, not by chance."""
+        return self.support is not None and self.support[1] - self.support[0] > _CHANCE
 
     @property
     def large(self) -> dict[str, float]:
@@ -184,8 +194,8 @@ def _determined(name: str, sigma: float) -> bool:
     return sigma < _MAX_SIGMA * TOLERANCES[name]
 
 
-def _large(name: str, error: float, sigma: float) -> bool:
-    return abs(error) > max(TOLERANCES[name], _SIGNIFICANT * sigma)
+def _large(name: str, error: float, sigma: float, factor: float = 1.0) -> bool:
+    return abs(error) > max(factor * TOLERANCES[name], _SIGNIFICANT * sigma)
 
 
 def check_calibration(
@@ -242,8 +252,14 @@ def check_calibration(
         _large(name, one.errors[_NUMBERS[name]], sigma[_NUMBERS[name]])
         for name, one in found.items()
     )
-    gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
-    alarm = gap is not None and gap.closes and _gain(best, views) > _CHANCE
+    number = _NUMBERS[name_of_best]
+    certain = abs(best.errors[number]) > _SIGNIFICANT * sigma[number]
+    improves = certain and _gain(best, views) > _CHANCE
+    gap = None
+    if large or improves:
+        gap = loop_gap(views, refined, best.poses, best.errors, options)
+    # A smaller error must explain a gap.
+    alarm = improves and gap is not None and gap.closes and (large or gap.significant)
     if alarm:  # alternative explanations
         found |= {name: estimated(name) for name in determined if name not in found}
     elif (closed := by_loop()).alarm:
@@ -462,12 +478,13 @@ def _check_by_loop(
         return none
     found: dict[str, tuple[float, Gap]] = {}
     for name in sigmas:
-        error, corrected = loop.closing_error(poses, uncorrected, _NUMBERS[name], TOLERANCES[name])
+        step = _FIRST_STEP * TOLERANCES[name]
+        error, corrected = loop.closing_error(poses, uncorrected, _NUMBERS[name], step)
         gap = loop.gap(uncorrected, corrected)
-        if not (gap.closes and _large(name, error, sigmas[name])):
+        if not (gap.closes and _large(name, error, sigmas[name], _BY_LOOP)):
             continue
         kept = loop.kept_by_views(poses, _NUMBERS[name], error)
-        if _large(name, kept, sigmas[name]) and kept / error > _KEPT:
+        if _large(name, kept, sigmas[name], _BY_LOOP) and kept / error > _KEPT:
             found[name] = error, gap
     if not found:
         return none
