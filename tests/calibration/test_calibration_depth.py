@@ -18,6 +18,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import calibrated
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -236,3 +237,23 @@ def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
         board_planes(recording, BOARD, "amplitude", wall=False)
     with pytest.raises(InputError, match="no board of 9 x 7"):
         board_planes(views.select(0, 1), Board(9, 7, 0.1), "amplitude", wall=False)
+
+
+def test_camera_without_errors_is_not_corrected_in_room() -> None:
+    """Pixels of other walls are near a wall in its corners, all in front of it."""
+    camera = Pinhole(96, 72, 60.0, 60.0, 47.5, 35.5)
+    rays = np.concatenate([camera.rays(), np.ones((72, 96, 1))], -1).astype(float)
+    rng = np.random.default_rng(3)
+    frames = []
+    for k in range(40):
+        turn = k * np.pi / 20
+        R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        place, size = rng.uniform(-0.7, 0.7, 3), np.array([2.2, 1.4, 1.8])
+        d = rays @ R.T
+        z = ((np.sign(d) * size - place) / d).min(-1)  # the box around the camera
+        z = z + rng.normal(0, 0.002, z.shape)
+        frames.append(RangeFrame(k, k / 10, camera, z.astype(np.float32)))
+    views, _ = scene_planes(Recording.of(ArraySource(frames), "room", "test"), 3, 0)
+    fit = calibrate_depth(views, camera)
+    assert np.abs(fit.correction.bias_m).max() < 0.002
+    assert fit.bias_after_m < 0.001

@@ -17,7 +17,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.registration.plane_detection import detect_planes
-from tofuse.registration.prepared_view import prepare_view
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.sensor.noise import NoiseModel
 
@@ -26,6 +26,7 @@ _SEARCHED = 60  # maximum number of frames
 _ERROR_M, _SIGMAS = 0.08, 4.0
 _MAX_SIGMA_M = 0.04  # noisier pixels are uninformative, and may wrap
 _MIN_PIXELS = 200
+_PARALLEL = np.cos(np.radians(20.0))  # of the normals of a plane and of its pixels
 _MIN_COSINE = 0.3  # of incidence: oblique floors are specular, and errors of rays matter
 _RIM = 2  # width in pixels of the margin of a plane, where pixels mix light
 _MAX_BOARD_PX = 1.0  # largest reprojection error of a detected board
@@ -98,8 +99,10 @@ def board_planes(
         T, _ = found
         normal = T[:3, 2]
         plane = normal / (normal @ T[:3, 3])
-        mask = _on_plane(frame, plane, noise)
-        if not wall:
+        mask = _near_plane(frame, plane, noise)
+        if wall:
+            mask &= _parallel(frame, prepare_view(frame, SurfaceOptions()), plane)
+        else:
             outline = np.concatenate([board.outline, np.zeros((4, 1))], 1)
             corner_px = frame.camera.project(se3.transform(T, outline))
             if not np.isfinite(corner_px).all():
@@ -141,15 +144,16 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
         camera = camera or frame.camera
         rng = np.random.default_rng([seed, frame.index])
         taken = np.zeros(frame.depth.shape, bool)
+        view = prepare_view(frame, SurfaceOptions())
         for found in detect_planes(
-            prepare_view(frame, SurfaceOptions()),
+            view,
             rng,
             max_planes=planes,
             min_fraction=0.1,
             thickness=0.01,
         ):
             plane = found.normal / found.offset
-            mask = _on_plane(frame, plane, noise) & ~taken
+            mask = _near_plane(frame, plane, noise) & _parallel(frame, view, plane) & ~taken
             taken |= mask
             views += _view(frame, plane, np.eye(3) * _NO_INFORMATION, mask, noise)
     if camera is None or not views:
@@ -161,8 +165,8 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
     return views, camera
 
 
-def _on_plane(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
-    """Return the mask (H, W) of pixels on a plane, within noise and systematic errors."""
+def _near_plane(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
+    """Return the mask (H, W) of pixels near a plane, within noise and systematic errors."""
     points = points_from_z(frame.camera, frame.z).astype(float)
     off = np.abs(points @ plane - 1) / np.linalg.norm(plane)
     sigma = noise.sigma(frame)
@@ -172,6 +176,19 @@ def _on_plane(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
     closed = cv2.morphologyEx(near.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     inner = cv2.erode(closed, np.ones((size, size), np.uint8), borderValue=1)
     return np.asarray(near & inner.astype(bool))
+
+
+def _parallel(frame: RangeFrame, view: PreparedView, plane: Float64) -> Bool:
+    """Return the mask (H, W) of pixels on surfaces parallel to a plane.
+
+    In a corner, the other wall is near the plane as well, all on one side of it.
+    """
+    parallel = view.normals @ (plane / np.linalg.norm(plane)) > _PARALLEL
+    height, width = frame.depth.shape
+    resized = cv2.resize(
+        parallel.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return np.asarray(resized > 0)
 
 
 def _view(
