@@ -8,17 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from boxes_in_room import views_in_room
 from tofuse.calibration.board import Board
 from tofuse.calibration.depth import DepthFit, calibrate_depth, compose
 from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.cli import main
 from tofuse.errors import InputError
+from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import calibrated
-from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -242,17 +243,11 @@ def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
 def test_camera_without_errors_is_not_corrected_in_room() -> None:
     """Pixels of other walls are near a wall in its corners, all in front of it."""
     camera = Pinhole(96, 72, 60.0, 60.0, 47.5, 35.5)
-    rays = np.concatenate([camera.rays(), np.ones((72, 96, 1))], -1).astype(float)
     rng = np.random.default_rng(3)
-    frames = []
-    for k in range(40):
-        turn = k * np.pi / 20
-        R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
-        place, size = rng.uniform(-0.7, 0.7, 3), np.array([2.2, 1.4, 1.8])
-        d = rays @ R.T
-        z = ((np.sign(d) * size - place) / d).min(-1)  # the box around the camera
-        z = z + rng.normal(0, 0.002, z.shape)
-        frames.append(RangeFrame(k, k / 10, camera, z.astype(np.float32)))
+    turns = np.stack([np.zeros(40), 2 * np.pi * np.arange(40) / 40, np.zeros(40)], 1)
+    poses = se3.exp(np.concatenate([np.zeros((40, 3)), turns], 1))
+    poses[:, :3, 3] = rng.uniform(-0.7, 0.7, (40, 3))
+    frames = views_in_room(camera, poses, 0.002, 3)
     views, _ = scene_planes(Recording.of(ArraySource(frames), "room", "test"), 3, 0)
     fit = calibrate_depth(views, camera)
     assert np.abs(fit.correction.bias_m).max() < 0.002

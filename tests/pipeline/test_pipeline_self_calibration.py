@@ -8,8 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from boxes_in_room import views_in_room
 from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.evaluation.trajectory import displacement
+from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
@@ -172,6 +174,28 @@ def test_bound_without_loop_includes_focal_length_error(recording) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [0.99, 1.01, 1.02])
+def test_bound_includes_focal_length_error_of_a_percent(wrong) -> None:
+    """In a sweep to both sides and back, which closes loops without a full turn."""
+    camera = Pinhole(100, 100, 50.0, 50.0, 49.5, 49.5)
+    s = 2 * np.pi * np.arange(60) / 59
+    turns = np.stack([0.15 * np.sin(2 * s), 1.2 * np.sin(s), np.zeros(60)], 1)
+    poses = se3.exp(np.concatenate([np.zeros((60, 3)), turns], 1))
+    poses[:, :3, 3] = np.stack([0.4 * np.sin(s), 0.1 * np.sin(s), 0.4 * (np.cos(s) - 1)], 1)
+    frames = views_in_room(camera, poses, 0.005, 0)
+    stated = replace(camera, fx=wrong * 50, fy=wrong * 50)
+    recording = Recording.of(ArraySource([replace(f, camera=stated) for f in frames]), "", "test")
+    result = reconstruct(recording, COARSE)
+    error, _ = displacement(poses, result.trajectory)
+    assert error < result.diagnostics.accuracy.position_m
+    if wrong == 1.02:
+        assert error < 0.004
+        assert result.diagnostics.calibrated is not None
+    else:
+        assert "unchecked_calibration" in [r.code for r in result.diagnostics.reasons]
+
+
 def test_correct_focal_length_is_unchanged(recording) -> None:
     result = reconstruct(recording, COARSE)
     assert result.diagnostics.calibrated is None

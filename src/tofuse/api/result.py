@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.cli.progress import TerminalProgress
 from tofuse.errors import InputError
+from tofuse.filters.foreground import Foreground
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.evaluating import Evaluation, evaluate
@@ -26,6 +27,7 @@ from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import reconstruct as reconstruct_recording
 from tofuse.pipeline.reconstruct import view_kind
 from tofuse.pipeline.report_files import write_report_files
+from tofuse.pipeline.run import quick_findings, with_findings
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.recording import Recording
 from tofuse.results.card import SEPARATOR, card
@@ -251,7 +253,8 @@ def reconstruct(
 ) -> Result:
     """Reconstruct a recording: trajectory, pose graph, fused cloud and surface, diagnostics.
 
-    Frames that can't be read are skipped and counted.
+    Frames that can't be read are skipped and counted. As at the start of `tofuse run`, a quick
+    inspection of the recording precedes: its severe findings rule out the verdict "good".
 
     Parameters
     ----------
@@ -284,10 +287,12 @@ def reconstruct(
         )
     with _shown(progress) as seen:
         fitted = adapted(_configuration(config, recording), recording, threads, seen)
+        turning = any(isinstance(part, Foreground) for part in fitted.filters)
+        findings = quick_findings(recording, fitted, turning=turning)
         found = reconstruct_recording(
             recording, fitted, seed=seed, threads=threads, loops=loops, progress=seen
         )
-    return Result.of(found, recording, fitted)
+    return Result.of(with_findings(found, findings, turning=turning), recording, fitted)
 
 
 def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:

@@ -139,9 +139,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     indices = frozenset(recording.indices.tolist())
     loops = tuple(read_loops(options.loops, indices)) if options.loops else ()
     # At the start, so that problems of the recording are reported before hours of work.
-    findings = _findings(recording, turning=options.object)
-    if any(isinstance(part, Unwrap) for part in config.corrections):
-        findings = tuple(f for f in findings if f.code != "phase_wrap")
+    findings = quick_findings(recording, config, turning=options.object)
     for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
     return _Job(opening, recording, config, seed, loops, findings)
@@ -196,12 +194,26 @@ def _key(inputs: Sequence[str | Path], options: Options, job: _Job) -> str:
     return digest(facts, files, without=options.out)
 
 
-def _findings(recording: Recording, *, turning: bool) -> tuple[Finding, ...]:
-    """Return the findings of a quick inspection; none if its frames can't be read."""
+def quick_findings(
+    recording: Recording, config: Config, *, turning: bool = False
+) -> tuple[Finding, ...]:
+    """Return the findings of a quick inspection; none if no frames can be read.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    config
+        How it is reconstructed; what its corrections remove is no finding.
+    turning
+        Whether the camera shows a turning object.
+    """
     try:
-        return inspect_recording(recording, turning=turning, quick=True).findings
+        findings = inspect_recording(recording, turning=turning, quick=True).findings
     except InputError:
         return ()
+    unwraps = any(isinstance(part, Unwrap) for part in config.corrections)
+    return tuple(f for f in findings if not (unwraps and f.code == "phase_wrap"))
 
 
 def with_findings(

@@ -52,7 +52,7 @@ def self_calibrated(
     """
     best, corrected = first, CameraErrors()
     for _ in range(_ROUNDS):
-        shown = _shown(best)
+        shown = _shown(best, corrected)
         if shown is None:
             break
         check, error = shown
@@ -79,12 +79,20 @@ def in_words(wrong: CameraErrors) -> str:
     return " and ".join(errors_in_words({name: e for name, e in errors.items() if e}))
 
 
-def _shown(result: Reconstruction) -> tuple[CalibrationCheck, CameraErrors] | None:
-    """Return the calibration error that explains the views best; None without an alarm."""
+def _shown(
+    result: Reconstruction, corrected: CameraErrors
+) -> tuple[CalibrationCheck, CameraErrors] | None:
+    """Return the calibration error that explains the views best; None without an alarm.
+
+    After a correction, also what is left of the same error, though it may be within the tolerance.
+    """
     found = _check_of(result)
-    if found is None or not found.alarm:
+    if found is None:
         return None
     best = found.best
+    left = found.improves and best in found.unconfirmed and getattr(corrected, _FIELDS[best])
+    if not (found.alarm or left):
+        return None
     values = {_FIELDS[best]: found.errors[best], _SIGMAS[best]: found.sigmas[best]}
     try:
         return found, CameraErrors(**values)

@@ -258,8 +258,8 @@ def check_calibration(
     gap = None
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
-    # A smaller error must explain a gap.
-    alarm = improves and gap is not None and gap.closes and (large or gap.significant)
+    # Views agree better with a smaller error, and a loop closes, if multipath is the cause as well.
+    alarm = large and improves and gap is not None and gap.closes
     if alarm:  # alternative explanations
         found |= {name: estimated(name) for name in determined if name not in found}
     elif (closed := by_loop()).alarm:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.recordings.depth_counts import INVALID_DEPTH
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
@@ -39,8 +40,8 @@ def from_arrays(
     Parameters
     ----------
     depth
-        (N, H, W), or N images (H, W); 0 or NaN where invalid. Floats are in metres and integers in
-        millimetres, unless `depth_unit_m` is given.
+        (N, H, W), or N images (H, W); 0 or NaN where invalid, in integers also 65535. Floats are in
+        metres and integers in millimetres, unless `depth_unit_m` is given.
     camera
         A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
         depth images.
@@ -155,7 +156,12 @@ def _to_metres(
                 where="depth",
                 remedy="use depth_unit_m=0.001 if it is in millimetres",
             )
-    return lambda image: image.astype(np.float64) * scale
+
+    def to_metres(image: NDArray[Any]) -> Float64:
+        metres = image.astype(np.float64) * scale
+        return np.where(image == INVALID_DEPTH, 0.0, metres) if whole else metres
+
+    return to_metres
 
 
 def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
