@@ -233,3 +233,14 @@ def test_evaluate_needs_frame_timestamps(
     data = json.loads(capsys.readouterr().out)
     assert data["associated"] == len(recording)
     assert data["ate_rms_m"] < 1e-6
+
+
+@pytest.mark.parametrize(("rate", "warns"), [(1.0, False), (30.0, True)])
+def test_different_clocks_are_reported(rate, warns, tmp_path: Path, capfd) -> None:
+    """The timestamps of a recording without any count seconds."""
+    line = "0 0 0 0 0 1"
+    for name, step in (("estimate.txt", 1.0), ("reference.txt", 1 / rate)):
+        rows = (f"{k * step:.6f} {0.1 * k * k:.3f} {line}" for k in range(60))
+        (tmp_path / name).write_text("\n".join(rows))
+    assert main(["evaluate", str(tmp_path / "estimate.txt"), str(tmp_path / "reference.txt")]) == 0
+    assert ("only 2 of 60 estimated poses" in capfd.readouterr().err) == warns

@@ -139,8 +139,8 @@ def test_fewer_correspondences_do_not_improve_the_error():
     few = replace(many, correspondences=40, error=0.4 * 0.7)
     assert few.error < many.error
     assert mean_error(few) == pytest.approx(mean_error(many)) == pytest.approx(0.7)
-    assert Confirmation().objection(few)
-    assert Confirmation().objection(many)
+    assert Confirmation().rejection_reason(few)
+    assert Confirmation().rejection_reason(many)
 
 
 def test_better_of_guess_and_identity_is_used():

@@ -248,7 +248,7 @@ def test_evidence_without_free_space_depends_on_margin():
     ]
     right, other_room, slides = (case.probability for case in cases)
     assert right > 0.9 > 0.7 > other_room > slides
-    assert "degenerate" in cases[2].objection()
+    assert "degenerate" in cases[2].rejection_reason()
 
 
 # Registration

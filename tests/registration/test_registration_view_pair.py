@@ -281,10 +281,10 @@ def test_probability_follows_evidence():
 
 
 def test_reason_names_contrary_evidence():
-    words = Evidence.of(agreement_of(0.1, 0.2), 0.01, 2).objection()
+    words = Evidence.of(agreement_of(0.1, 0.2), 0.01, 2).rejection_reason()
     for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
         assert part in words
-    assert Evidence.of(agreement_of(0.6, 0.0), 0.3).objection() == ""
+    assert Evidence.of(agreement_of(0.6, 0.0), 0.3).rejection_reason() == ""
 
 
 def test_usual_fit_of_camera_decides_acceptance(pair):

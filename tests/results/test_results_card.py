@@ -36,7 +36,10 @@ def test_improvement_is_suggested() -> None:
         Reason("uncertain_poses", ((0, 1),), "The poses may be off."),
     )
     (last,) = card(of(KNOWN, "degraded", reasons))[-1:]
-    assert last == "to improve: revisit these places, or keep corners and texture in view there"
+    assert (
+        last
+        == "to improve: return to places seen before, or keep corners and texture in view there"
+    )
 
 
 def test_unbounded_and_unassessed_accuracy() -> None:

@@ -639,6 +639,12 @@ def evaluate(arguments: argparse.Namespace) -> int:
         reference_error_m=arguments.reference_error,
     )
     data, error, interval = found.to_dict(), found.error, found.ate_interval_m
+    if error.mostly_unmatched:
+        print(
+            f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
+            "pose within 20 ms: check that both files have the same clock",
+            file=sys.stderr,
+        )
     if arguments.json:
         emit(data)
         return 0
@@ -688,8 +694,8 @@ def optimize(arguments: argparse.Namespace) -> int:
         count = int(left_out.sum())
         before, after = graph.chi2(~left_out), done.graph.chi2(~left_out)
         print(
-            f"{count} edge{'' if count == 1 else 's'} inconsistent with the others and "
-            f"down-weighted; squared error of the others {before:.6g} to {after:.6g}"
+            f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with "
+            f"the others; squared error of the others {before:.6g} to {after:.6g}"
         )
     for piece in done.parts if len(done.parts) > 1 else ():
         print(

@@ -73,6 +73,8 @@ class TrajectoryError:
         (A, 2) rows of the associated poses in the estimate and in the reference.
     position_errors
         (A, 3) aligned estimate minus reference, m, in the reference's world.
+    estimated
+        Number of estimated poses, associated or not.
     """
 
     associated: int
@@ -84,6 +86,12 @@ class TrajectoryError:
     T_reference_estimate: Float64
     pairs: Intp
     position_errors: Float64
+    estimated: int
+
+    @property
+    def mostly_unmatched(self) -> bool:
+        """Whether most poses of both have no counterpart, as if the clocks differed."""
+        return self.associated < 0.5 * self.estimated and self.coverage < 0.5
 
     def ate_within(self, reference_m: float) -> tuple[float, float]:
         """Return bounds of the true ATE in m, for a reference with an rms error of `reference_m`.
@@ -96,6 +104,7 @@ class TrajectoryError:
         """Return the figures as plain data, angles in degrees."""
         return {
             "associated": self.associated,
+            "estimated": self.estimated,
             "coverage": self.coverage,
             "ate_rms_m": self.ate_rms_m,
             "ate_max_m": self.ate_max_m,
@@ -156,6 +165,7 @@ def evaluate_trajectory(
         T_reference_estimate=T_align,
         pairs=pairs,
         position_errors=errors,
+        estimated=int(np.isfinite(estimate).all((1, 2)).sum()),
     )
 
 

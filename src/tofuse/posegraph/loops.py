@@ -185,7 +185,7 @@ class Confirmation(Bounded):
     min_fraction: Annotated[float, Bounds(0, 1)] = 0.3
     max_error: Annotated[float, Bounds(0, exclusive=True)] = 0.65
 
-    def objection(self, registration: Registration) -> str:
+    def rejection_reason(self, registration: Registration) -> str:
         """Return why a registration is rejected; empty if it is accepted.
 
         A method that verifies its pose itself (`believed`) decides.
@@ -230,16 +230,16 @@ class Confirmation(Bounded):
                 break  # it searched for rival poses itself
         if not found:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
-        best = max(found, key=lambda r: (not self.objection(r), r.inlier_ratio, -r.error))
-        objection = self.objection(best)
-        reason = objection or (
+        best = max(found, key=lambda r: (not self.rejection_reason(r), r.inlier_ratio, -r.error))
+        rejection_reason = self.rejection_reason(best)
+        reason = rejection_reason or (
             f"{best.inlier_ratio:.0%} of the points correspond, with an error of "
             f"{mean_error(best):.2f} of the resolution"
         )
         record = LoopRecord(
-            i, j, not objection, reason, overlap=best.inlier_ratio, rms_m=best.rms_m
+            i, j, not rejection_reason, reason, overlap=best.inlier_ratio, rms_m=best.rms_m
         )
-        if objection:
+        if rejection_reason:
             return ClosedLoop(record)
         return ClosedLoop(record, best.T_target_source, best.information)
 

@@ -55,7 +55,7 @@ _NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0
 _WEAK_PRIOR = ProjectiveOptions(
     levels=_NEAR, prior_m=3.0, prior_rad=3.0, constrained=1e6, common_tilt=0.0, common_slope=0.0
 )
-_REJECTED = "does not fit as views of this camera usually do, or not the same from both ends"
+_REJECTED = "fits worse than is typical of this camera, or alignments from both ends disagree"
 _TOO_FAR = "looks similar, but the trajectory can't have drifted that far"
 # Selection of the views that are tried: neighbours overlap by most of an image.
 _SPACING = Spacing(angle=0.15, distance=0.08, most=200)
@@ -387,16 +387,16 @@ class _RevisitLoops(Loops):
         """Accept or reject the registration of frames (i, j)."""
         if made is None:
             return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
-        objection = self._objection(made)
+        reason = self._rejection_reason(made)
         record = LoopRecord(
             *pair,
-            not objection,
-            objection or f"right with a probability of {made.probability:.0%}",
+            not reason,
+            reason or f"right with a probability of {made.probability:.0%}",
             overlap=made.overlap,
             rms_m=made.rms_m if np.isfinite(made.rms_m) else None,
             free_space_violation=made.violation,
         )
-        if objection:
+        if reason:
             return ClosedLoop(record)
         return ClosedLoop(record, made.T_target_source, made.information)
 
@@ -510,7 +510,7 @@ class _RevisitLoops(Loops):
         away = se3.inverse(T) @ T_i_k @ other @ T_m_j
         return bool(np.linalg.norm(away[:3, 3]) < _SAME_M and se3.angle(away) < _SAME_RAD)
 
-    def _objection(self, made: Registration) -> str:
+    def _rejection_reason(self, made: Registration) -> str:
         if made.overlap is not None and made.overlap < _MIN_OVERLAP:
             return f"only {made.overlap:.0%} of the points project into the other view"
         if len(made.unobservable) > _MAX_DEGENERATE:

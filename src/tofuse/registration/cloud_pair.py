@@ -345,7 +345,7 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     if lead is not None and len(found.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
     evidence = views.evidence(after, lead, len(found.unobservable))
-    reason = evidence.objection()
+    reason = evidence.rejection_reason()
     return replace(
         found,
         margin=lead,

@@ -104,7 +104,7 @@ class Evidence:
             return logistic(float(self.followed @ self.model.followed))
         return logistic(float(self.searched @ self.model.searched))
 
-    def objection(self) -> str:
+    def rejection_reason(self) -> str:
         """Return the reason why the pose is rejected; empty if it is accepted."""
         if self.probability >= ACCEPTED:
             return ""
@@ -112,15 +112,18 @@ class Evidence:
         if self.support < _LITTLE_SUPPORT:
             problems.append(f"only {self.support:.0%} of the points of both views support the pose")
         if self.margin is not None and self.margin < _SMALL_LEAD:
-            lead = max(self.margin, 0.0)
-            problems.append(f"another pose fits nearly as well, with {lead:.1%} less support")
+            how = "as well or better"
+            if self.margin > 0:
+                how = f"nearly as well, with a score lower by {self.margin:.1%} of the points"
+            problems.append(f"another pose fits {how}")
         if self.contradiction > CONTRADICTION:
             problems.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
         if self.degenerate:
             plural = "direction is" if self.degenerate == 1 else "directions are"
             problems.append(f"{self.degenerate} {plural} degenerate")
-        return (
-            "; ".join(problems) or f"the pose is right with a probability of {self.probability:.0%}"
+        return "; ".join(problems) or (
+            f"the probability that the pose is right is {self.probability:.0%}, below "
+            f"{ACCEPTED:.0%}"
         )
 
 

@@ -304,7 +304,7 @@ class _Pair:
         self, pose: _Pose, evidence: Evidence, rival: Candidate | None
     ) -> Registration:
         """Return a pose as a registration."""
-        reason = evidence.objection()
+        reason = evidence.rejection_reason()
         found = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
         return replace(
             found,

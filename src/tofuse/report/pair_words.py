@@ -117,7 +117,10 @@ def runner_up(result: PairResult) -> str:
         metres, angle = away
         parts.append(f"{metres:.3f} m and {np.degrees(angle):.1f}\N{DEGREE SIGN} away")
     if result.found.margin is not None:
-        parts.append(f"fits {percent(result.found.margin)} fewer of the points")
+        margin = result.found.margin
+        parts.append(
+            f"fits {percent(abs(margin))} {'more' if margin < 0 else 'fewer'} of the points"
+        )
     return ", ".join(parts)
 
 

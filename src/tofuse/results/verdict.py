@@ -76,7 +76,7 @@ ADVICE: dict[str, str] = {
     "view.",
     "not_converged": "Use more iterations, or record with smaller steps between frames.",
     "inconsistent_poses": "Use the refined poses, or find what distorted the given ones.",
-    "uncertain_poses": "Revisit these places, or keep corners and texture in view there.",
+    "uncertain_poses": "Return to places seen before, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",
     "unchecked_calibration": "Turn the camera more, and return to the start.",

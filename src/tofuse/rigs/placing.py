@@ -320,7 +320,7 @@ class _Placer:
         if evidence.probability >= ACCEPTED:
             return evidence.probability, ""
         if evidence.probability < PROBABLE:
-            return probability, evidence.objection()
+            return probability, evidence.rejection_reason()
         if chance > _CHANCE:
             return probability, (
                 f"another pose fits nearly as well, with {max(score - rival, 0.0):.1%} fewer of "
