@@ -1,10 +1,11 @@
 """Why statements of the thesis do not hold here: the experiments with one thing changed at a time.
 
 Chapters 4 and 5 are run with the method of the thesis as in `tofuse experiments`, and again with an
-ideal camera, another simulated recording, a larger resolution (correspondences within 10 cm instead
-of 2), or all points of the target instead of 1000. A statement that does not agree at first, but
-does with a change, depends on what was changed. Statements about the synthetic data (section 5.6)
-are judged by other noise seeds. Rows are the statements that do not agree as in chapter 4.
+ideal camera, larger errors of the distance, another simulated recording, a larger resolution
+(correspondences within 10 cm instead of 2), all points of the target instead of 1000, or both. A
+statement that does not agree at first, but does with a change, depends on what was changed.
+Statements about the synthetic data (section 5.6) are judged by other noise seeds. Rows are the
+statements that do not agree as in chapter 4.
 
     python benchmarks/thesis_causes.py [--cases rail box] [--draws 3] [--variants ideal resolution]
 """
@@ -21,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.lab.experiments.cases import CASES, DRAWS, run_case
 from tofuse.lab.experiments.page import NAMES
 from tofuse.lab.experiments.peaks import sweep_peaks
-from tofuse.lab.experiments.statements import Results, judge_all
+from tofuse.lab.experiments.statements import STATEMENTS, Results, judge_all
 from tofuse.lab.simulation.effects import Effects
 from tofuse.pipeline.progress import Silent
 
@@ -103,10 +104,11 @@ def main() -> None:
     print(f"{agree} of {len(first)} statements agree as in chapter 4\n")
     print(f"| Section | Statement | {' | '.join(VARIANTS[name].title for name in names)} | Here |")
     print("|" + "---|" * (len(names) + 3))
+    quotes = {one.name: one.quote for one in STATEMENTS}
     for statement, (section, outcome, numbers) in first.items():
         if outcome != "agrees":
             cells = [found[name].get(statement, ("", "", ""))[1] for name in names]
-            print(f"| {section} | {statement} | {' | '.join(cells)} | {numbers} |")
+            print(f"| {section} | {quotes[statement]} | {' | '.join(cells)} | {numbers} |")
 
 
 if __name__ == "__main__":

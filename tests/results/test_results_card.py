@@ -42,6 +42,21 @@ def test_improvement_is_suggested() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("cause", "advice"),
+    [
+        ("faulty_recording", "correct the input as the inspection proposes"),
+        ("calibration_alarm", "check the camera's calibration"),
+    ],
+)
+def test_cause_precedes_its_consequences(cause, advice) -> None:
+    reasons = (
+        Reason("disconnected", ((0, 9),), "Parts are not connected."),
+        Reason(cause, ((0, 1),), "The depth unit is wrong."),
+    )
+    assert card(of(KNOWN, "degraded", reasons))[-1].startswith(f"to improve: {advice}")
+
+
 def test_unbounded_and_unassessed_accuracy() -> None:
     assert bound(Accuracy(), 5.0) == "accuracy not assessed"
     assert weakest_frame(Accuracy()) == ""

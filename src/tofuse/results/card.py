@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.results.ranges import in_words, runs_of
-from tofuse.results.types import Reconstruction
+from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import ADVICE, ranked
 
 SEPARATOR = " · "
@@ -22,11 +24,17 @@ def card(result: Reconstruction) -> list[str]:
     parts.append(f"{int(result.has_pose.sum())} of {readable} frames{loops}")
     if weakest := weakest_frame(d.accuracy):
         parts.append(f"weakest: {weakest}")
-    if d.verdict != "good":
-        advice = [ADVICE[r.code] for r in ranked(d.reasons) if r.code in ADVICE]
-        if advice:
-            parts.append(f"to improve: {advice[0][0].lower()}{advice[0][1:].rstrip('.')}")
+    if d.verdict != "good" and (advice := _advice(d.reasons)):
+        parts.append(f"to improve: {advice[0].lower()}{advice[1:].rstrip('.')}")
     return parts
+
+
+def _advice(reasons: Sequence[Reason]) -> str:
+    """Return what to do about the most severe reason, or about one that may cause all others."""
+    by_code = {r.code: ADVICE.get(r.code, "") for r in ranked(reasons)}
+    if "faulty_recording" in by_code:
+        return "Correct the input as the inspection proposes."
+    return by_code.get("calibration_alarm") or next(filter(None, by_code.values()), "")
 
 
 def bound(a: Accuracy, diagonal_m: float) -> str:
