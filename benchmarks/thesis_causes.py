@@ -3,9 +3,10 @@
 Chapters 4 and 5 are run with the method of the thesis as in `tofuse experiments`, and again with an
 ideal camera, larger errors of the distance, another simulated recording, a larger resolution
 (correspondences within 10 cm instead of 2), all points of the target instead of 1000, or both, and
-a door that reflects 80 % of the light as a mirror does instead of 30 %. A statement that does not agree at first, but does with a change, depends on what was changed.
-Statements about the synthetic data (section 5.6) are judged by other noise seeds. Rows are the
-statements that do not agree as in chapter 4.
+a door that reflects 80 % of the light as a mirror does instead of 30 %. A statement that does not
+agree at first, but does with a change, depends on what was changed. Statements about the synthetic
+data (section 5.6) are judged by other noise seeds. Rows are the statements that do not agree as in
+chapter 4.
 
     python benchmarks/thesis_causes.py [--cases rail box] [--draws 3] [--variants ideal resolution]
 """
