@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from made_phones import make_stray
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.evaluation.deviation import deviation
@@ -158,6 +159,12 @@ def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
         tofuse_ply(tmp_path / f"scans/{k}.ply", points)
     with pytest.raises(InputError, match=r"takes .*range"):
         tofuse.judge(tofuse.open(tmp_path / "scans"), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_poses_in_recording_of_phone_are_read(tmp_path) -> None:
+    make_stray(tmp_path)
+    phone = tofuse.open(tmp_path)
+    np.testing.assert_allclose(poses_for(phone, tmp_path), phone.reference)
 
 
 def tofuse_ply(path, points) -> None:

@@ -426,7 +426,7 @@ def _judge(commands: Any) -> None:
         "trajectory",
         type=Path,
         metavar="TRAJECTORY",
-        help="a trajectory in any supported format, or a result",
+        help="a trajectory in any supported format, a result, or a recording with poses",
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
     _overwrite(p)

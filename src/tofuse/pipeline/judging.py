@@ -29,7 +29,7 @@ from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, pr
 from tofuse.evaluation.deviation import Deviation, fitted
 from tofuse.evaluation.deviation import deviation as deviation_of
 from tofuse.evaluation.trajectory import displacement, distances_between
-from tofuse.files.trajectory_formats import read_poses
+from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
@@ -43,6 +43,7 @@ from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.pair_measurements import measured_pairs
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import read_reference
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly
@@ -139,9 +140,9 @@ def judge(
     recording
         Range images, as of `tofuse.open`.
     trajectory
-        A file of any format of `files.trajectory_formats`, the folder of a result, or (N, 4, 4)
-        T_world_camera of the frames, NaN where there is none. Timed poses are assigned to the
-        nearest frames in time, within 20 ms.
+        A file of any format of `files.trajectory_formats`, the folder of a result, a recording with
+        poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
+        assigned to the nearest frames in time, within 20 ms.
     tolerance_m
         Accuracy required of good poses, m; see `Config`.
     threads
@@ -356,6 +357,17 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
     return f"{by}'s poses: ±{length(rms + own)} (95 %); these: ±{length(own)}."
 
 
+def _read(path: Path) -> TimedPoses:
+    """Read a trajectory, or the poses in a recording, such as those of a phone."""
+    try:
+        return read_poses(path)
+    except InputError as no_trajectory:
+        try:
+            return read_reference(path)
+        except InputError:
+            raise no_trajectory from None
+
+
 def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64:
     """Return the (N, 4, 4) poses of a recording's frames, NaN where there is none; see `judge`.
 
@@ -368,7 +380,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
     if isinstance(trajectory, str | Path):
         path = Path(trajectory)
         where = str(path)
-        poses = read_poses(path).of_frames(recording.timestamps, recording.indices)
+        poses = _read(path).of_frames(recording.timestamps, recording.indices)
     else:
         poses = np.array(trajectory, float)
         if poses.shape != (len(recording), 4, 4):
