@@ -36,7 +36,7 @@ from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import UsualFit
+from tofuse.registration.verification import FitStatistics
 from tofuse.sensor.models import camera_model
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
@@ -109,7 +109,7 @@ def outcome(
     perturbation = np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, np.radians(0.5), 3)])
     targets = [Target(views[a], np.eye(4))]
     aligned = align(views[b], targets, truth @ se3.exp(perturbation), options)
-    if not UsualFit().assess(aligned).usual:
+    if not FitStatistics().assess(aligned).usual:
         return None
     plain: Float64 = np.linalg.inv(aligned.information + np.diag(1e-6 / UNITS**2))
     return Outcome(

@@ -20,8 +20,8 @@ from tofuse.registration.sample_consensus import (
     Pairs,
     consensus,
     information_of,
-    loose_directions,
     motion_of,
+    weakly_constrained_directions,
 )
 from tofuse.registration.surface_options import SurfaceOptions
 
@@ -163,7 +163,7 @@ def test_information_is_inverse_covariance():
 def test_collinear_points_leave_rotation_about_line_unconstrained():
     along = np.linspace(-1, 1, 30)[:, None] * [1.0, 0, 0] + [0, 0, 2.0]
     pairs = Pairs(along, along, np.full(30, 1e-4))
-    (loose,) = loose_directions(information_of(pairs, np.eye(4)))
+    (loose,) = weakly_constrained_directions(information_of(pairs, np.eye(4)))
     # Rotation about the line through z = 2, which also translates the camera.
     expected = np.array([0, 2.0, 0, 1.0, 0, 0])
     assert abs(loose @ expected) / np.linalg.norm(expected) > 0.999

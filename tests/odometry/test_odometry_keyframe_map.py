@@ -13,7 +13,7 @@ from tofuse.odometry import keyframe_map, relocalization
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.verification import UsualFit
+from tofuse.registration.verification import FitStatistics
 
 VIEW = surface(seen(at(0, 0.3, 0), 0))
 
@@ -128,7 +128,7 @@ def test_most_similar_keyframe_is_found(around) -> None:
 
 
 def relocalizer():
-    return Relocalizer(SearchOptions(), UsualFit())
+    return Relocalizer(SearchOptions(), FitStatistics())
 
 
 def counted(monkeypatch):
@@ -185,7 +185,7 @@ def test_newest_and_most_similar_keyframes_are_searched(around, monkeypatch) -> 
 
 def test_no_search_without_options(around, monkeypatch) -> None:
     asked = counted(monkeypatch)
-    assert Relocalizer(None, UsualFit()).links(VIEW, around[0], 9) == ()
+    assert Relocalizer(None, FitStatistics()).links(VIEW, around[0], 9) == ()
     assert asked == []
 
 

@@ -11,7 +11,7 @@ import pytest
 from tofuse.evaluation.cross_view import CrossViewConsistency, PairConsistency
 from tofuse.geometry import se3
 from tofuse.pipeline.checks import Evidence, judge, stretches
-from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of
+from tofuse.posegraph.accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.calibration_check import CalibrationCheck, Gap
 from tofuse.posegraph.covariances import GraphCovariances
@@ -98,9 +98,11 @@ def evidence(
         poses,
         Optimisation(graph, (1.0, 0.5), settled, parts=parts),
         seen() if images is None else images,
-        Accuracy() if sigma is None else accuracy_of(GraphCovariances(graph), Shown(), 1.0),
+        Accuracy()
+        if sigma is None
+        else accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0),
         diagonal_m=1.0,
-        knows_errors=sigma is not None,
+        has_covariances=sigma is not None,
         given=frozenset(given),
         **more,
     )

@@ -16,7 +16,7 @@ from tofuse.lab.simulation.record import simulate_recording
 from tofuse.posegraph import accuracy
 from tofuse.posegraph.accuracy import (
     Accuracy,
-    Shown,
+    ObservedErrors,
     accuracy_of,
     covariances_of,
     degenerate_directions,
@@ -51,13 +51,13 @@ def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
 def test_coverage_of_error_bounds(loops, monkeypatch) -> None:
     """With noise alone, which the covariance models completely."""
-    monkeypatch.setattr(accuracy, "HIDDEN", 1.0)
+    monkeypatch.setattr(accuracy, "UNOBSERVED_ERROR_FACTOR", 1.0)
     rng = np.random.default_rng(11)
     solve = LevenbergMarquardt(robust="none").optimise
     found = np.array(
         [displacement(TRUE, solve(walk(rng, loops=loops)).graph.poses) for _ in range(300)]
     )
-    bound = accuracy_of(GraphCovariances(walk(loops=loops)), Shown(), 2.0)
+    bound = accuracy_of(GraphCovariances(walk(loops=loops)), ObservedErrors(), 2.0)
     for column, limit in zip(found.T, (bound.position_m, bound.rotation_rad), strict=True):
         assert 0.91 < np.mean(column < limit) < 0.985
         assert limit < 2.5 * np.median(column)
@@ -69,49 +69,62 @@ def test_coverage_of_error_bounds(loops, monkeypatch) -> None:
 
 
 def test_uncertainty_is_largest_at_ends_without_loops() -> None:
-    a = accuracy_of(GraphCovariances(walk(loops=())), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(walk(loops=())), ObservedErrors(), 1.0)
     assert a.worst is not None
     assert a.worst.frame in (0, N - 1)
-    assert a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), Shown(), 1.0).position_m
+    assert (
+        a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0).position_m
+    )
 
 
 def test_errors_shown_by_recording_are_added() -> None:
-    plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
-    more = accuracy_of(GraphCovariances(walk()), Shown(0.03, 0.02, 0.04), 1.0)
+    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
+    more = accuracy_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04), 1.0)
     assert more.position_m > 0.05
     assert more.position_m == pytest.approx(
-        np.hypot(plain.position_m, accuracy.HIDDEN * 0.05), rel=1e-6
+        np.hypot(plain.position_m, accuracy.UNOBSERVED_ERROR_FACTOR * 0.05), rel=1e-6
     )
     assert more.rotation_rad > plain.rotation_rad
-    bent = accuracy_of(GraphCovariances(walk()), Shown(calibration_m=0.2, calibration_rad=0.1), 1.0)
+    bent = accuracy_of(
+        GraphCovariances(walk()), ObservedErrors(calibration_m=0.2, calibration_rad=0.1), 1.0
+    )
     assert bent.position_m > 0.2
     assert bent.rotation_rad > 0.1
-    C = covariances_of(GraphCovariances(walk()), Shown(0.03, 0.02, 0.04))
+    C = covariances_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04))
     np.testing.assert_array_equal(C[0], 0)
     assert np.trace(C[5, :3, :3]) > 0.05**2
 
 
 def test_split_half_errors_replace_too_small_covariance() -> None:
-    plain = accuracy_of(GraphCovariances(walk()), Shown(), 1.0)
-    stated = plain.position_m / accuracy.HIDDEN
-    assert accuracy_of(GraphCovariances(walk()), Shown(split_m=0.3 * stated), 1.0) == plain
+    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
+    stated = plain.position_m / accuracy.UNOBSERVED_ERROR_FACTOR
+    assert accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.3 * stated), 1.0) == plain
     known = GraphCovariances(walk())
-    one, more = (accuracy_of(known, Shown(split_m=k * stated), 1.0) for k in (2, 4))
+    one, more = (accuracy_of(known, ObservedErrors(split_m=k * stated), 1.0) for k in (2, 4))
     # They are rms errors, and a 95 % bound on them is larger.
     assert one.position_m > 2 * plain.position_m
     assert more.position_m == pytest.approx(2 * one.position_m)
     assert more.rotation_rad == plain.rotation_rad
-    C = [covariances_of(GraphCovariances(walk()), Shown(split_m=m))[5] for m in (0.0, 3 * stated)]
+    C = [
+        covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=m))[5]
+        for m in (0.0, 3 * stated)
+    ]
     assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
     np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
 
 
 def test_larger_of_refinement_and_split_half_errors_counts() -> None:
     """Both stand for errors that pairs of views share."""
-    moved = accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5), 1.0)
-    assert accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.5, split_m=0.1), 1.0) == moved
-    split = accuracy_of(GraphCovariances(walk()), Shown(split_m=0.5), 1.0)
-    assert accuracy_of(GraphCovariances(walk()), Shown(moved_m=0.1, split_m=0.5), 1.0) == split
+    moved = accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5), 1.0)
+    assert (
+        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5, split_m=0.1), 1.0)
+        == moved
+    )
+    split = accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.5), 1.0)
+    assert (
+        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.1, split_m=0.5), 1.0)
+        == split
+    )
 
 
 @pytest.mark.parametrize("direction", [X, TURN])
@@ -119,7 +132,7 @@ def test_unmeasured_direction_is_unbounded(direction) -> None:
     """Whatever information noise has suggested; frames on both sides stay bounded."""
     graph = walk()
     slide = dict.fromkeys((4, 5, 6), direction)
-    a = accuracy_of(GraphCovariances(bounded(graph, slide)), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(bounded(graph, slide)), ObservedErrors(), 1.0)
     assert a.unbounded == (4, 5, 6)
     assert a.worst is not None
     assert a.worst.frame in (4, 5, 6)
@@ -147,7 +160,7 @@ def test_slightly_different_directions_do_not_bound_each_other() -> None:
         slides = {i, j} & set(range(5, 10))
         x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, 1, 2))]
         directions.append(np.array([[*x, 0, 0, 0]]) if slides else np.zeros((0, 6)))
-    a = accuracy_of(GraphCovariances(without_degenerate(graph, directions)), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(without_degenerate(graph, directions)), ObservedErrors(), 1.0)
     assert set(range(5, 10)) <= set(a.unbounded)
     assert not set(range(5)) & set(a.unbounded)
 
@@ -211,7 +224,7 @@ def as_frame(z, index) -> RangeFrame:
 
 def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
     graph = bounded(walk(), {5: X})
-    C = covariances_of(GraphCovariances(graph), Shown())[5]
+    C = covariances_of(GraphCovariances(graph), ObservedErrors())[5]
     sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
     assert sigma[1] < 0.05
     assert sigma[2] > 1
@@ -220,13 +233,13 @@ def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
 def test_degenerate_start_leaves_rest_bounded() -> None:
     """Relative to the first frame, all poses would be unbounded."""
     graph = bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})
-    a = accuracy_of(GraphCovariances(graph), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0)
     assert a.unbounded == (0, 1)
 
 
 def test_extrapolated_motion_bounds_nothing() -> None:
     graph = walk(loops=())
-    a = accuracy_of(GraphCovariances(bounded(graph, {}, [(9, 8)])), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(bounded(graph, {}, [(9, 8)])), ObservedErrors(), 1.0)
     assert set(a.unbounded) in ({*range(9)}, {*range(9, N)})
     assert np.isinf(a.position_m)
 
@@ -235,7 +248,7 @@ def test_disconnected_parts_are_unbounded() -> None:
     graph = walk(loops=())
     keep = np.arange(N - 1) != 8
     columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
-    a = accuracy_of(GraphCovariances(replace(graph, **columns)), Shown(), 1.0)
+    a = accuracy_of(GraphCovariances(replace(graph, **columns)), ObservedErrors(), 1.0)
     assert a.assessed
     assert np.isinf(a.position_m)
     assert len(a.unbounded) in (5, 9)
@@ -267,7 +280,7 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
 
 def test_single_pose_is_not_assessed() -> None:
     one = build_graph([7], TRUE[:1], [])
-    assert accuracy_of(GraphCovariances(one), Shown(), 1.0) == Accuracy()
+    assert accuracy_of(GraphCovariances(one), ObservedErrors(), 1.0) == Accuracy()
 
 
 def test_displacement_ignores_common_motion() -> None:

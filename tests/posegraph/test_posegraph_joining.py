@@ -12,7 +12,7 @@ from made_rooms import OTHER, at, seen, surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
-from tofuse.posegraph.gaps import Stretch
+from tofuse.posegraph.gaps import TrackedComponent
 from tofuse.posegraph.islands import Islands
 from tofuse.posegraph.join_checks import JoinChecks
 from tofuse.posegraph.joining import Joining
@@ -40,7 +40,7 @@ def stretch(component, frames, path=PATH, every=3, dark=False, late=0.0, **scene
             frame = replace(frame, amplitude_image=None)
         views.append(PosedView(surface(frame), T, component))
     times = np.array(frames) / RATE + late
-    return Stretch(component, np.array(frames), times, poses, tuple(views))
+    return TrackedComponent(component, np.array(frames), times, poses, tuple(views))
 
 
 def linked(first, second, certain=True, off=None):
@@ -232,7 +232,7 @@ def similar_rooms():
             PosedView(surface(seen(local[k], k)), T, c) for k, T in zip(frames, poses, strict=True)
         ]
         times = np.array(frames) / RATE + 60.0 * c
-        parts.append(Stretch(c, np.array(frames), times, poses, tuple(views)))
+        parts.append(TrackedComponent(c, np.array(frames), times, poses, tuple(views)))
     return path, parts
 
 

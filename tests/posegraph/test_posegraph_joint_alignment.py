@@ -12,7 +12,7 @@ from corner_views import SHARP, corner
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels.threads import threads
-from tofuse.posegraph.accuracy import Shown, accuracy_of
+from tofuse.posegraph.accuracy import ObservedErrors, accuracy_of
 from tofuse.posegraph.build import build_graph
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.joint_alignment import Bodies, refine, spread_evenly
@@ -231,7 +231,7 @@ def test_pairs_of_a_view_do_not_accumulate_information():
         graph = build_graph(range(12), found.poses, found.edges)
         known[neighbours] = (
             len(found.edges),
-            accuracy_of(GraphCovariances(graph), Shown(), 1.0).position_m,
+            accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0).position_m,
         )
     assert known[10][0] > 2 * known[2][0]
     assert known[10][1] > 0.7 * known[2][1]

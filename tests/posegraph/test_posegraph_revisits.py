@@ -170,7 +170,7 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
     monkeypatch.setattr(revisits, "register_pair", scripted)
     # Nothing fits from the drifted pose, so that only the search can succeed.
     monkeypatch.setattr(
-        revisits.UsualFit, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
+        revisits.FitStatistics, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
     )
     found = pushed(options, frames, start)
     assert len(asked) >= 2

@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.registration.projective import Aligned
 from tofuse.registration.verification import (
-    UsualFit,
+    FitStatistics,
     comparable,
     self_scaled,
 )
@@ -39,7 +39,7 @@ def aligned(outliers=0.1, in_front=0.01, noise=2.0, albedo=0.04, compared=2000, 
 def taught(count=60, seed=0, spread=0.15, **usual):
     """Usual fit of a camera whose views have these statistics, with some spread."""
     rng = np.random.default_rng(seed)
-    known = UsualFit()
+    known = FitStatistics()
     for _ in range(count):
         several = {
             name: value * np.exp(spread * rng.standard_normal()) for name, value in usual.items()
@@ -64,7 +64,7 @@ def taught(count=60, seed=0, spread=0.15, **usual):
     ],
 )
 def test_unknown_camera_tolerates_moderate_fits(fit):
-    found = UsualFit().assess(aligned(**fit))
+    found = FitStatistics().assess(aligned(**fit))
     assert found.usual
     assert found.excess == 0
     assert found.reason == ""
@@ -80,18 +80,18 @@ def test_unknown_camera_tolerates_moderate_fits(fit):
     ],
 )
 def test_unknown_camera_rejects_extreme_fits(fit, words):
-    found = UsualFit().assess(aligned(**fit))
+    found = FitStatistics().assess(aligned(**fit))
     assert not found.usual
     assert words in found.reason
     assert 0 < found.excess < np.inf
 
 
 def test_too_few_inliers_determine_no_pose():
-    found = UsualFit().assess(aligned(compared=30, outliers=0.0))
+    found = FitStatistics().assess(aligned(compared=30, outliers=0.0))
     assert not found.usual
     assert "30 inliers are too few" in found.reason
     assert found.excess == np.inf
-    assert UsualFit().assess(aligned(compared=100, outliers=0.0)).usual
+    assert FitStatistics().assess(aligned(compared=100, outliers=0.0)).usual
 
 
 def test_usual_fit_is_learned_per_camera():
@@ -133,7 +133,7 @@ def test_few_outlier_views_do_not_change_usual_fit():
         known.learn(aligned(outliers=0.7), 2.0)
     assert not known.assess(aligned(outliers=0.7)).usual
     # The order is irrelevant.
-    other = UsualFit()
+    other = FitStatistics()
     for _ in range(15):
         other.learn(aligned(outliers=0.7), 2.0)
     assert not all(other.assess(aligned(outliers=x)).usual for x in (0.05, 0.9))
@@ -143,7 +143,7 @@ def test_stricter_limits_accept_fewer_fits():
     fits = [aligned(outliers=x) for x in np.linspace(0, 0.9, 40)]
     counts = []
     for sigmas in (1.0, 3.0, 6.0):
-        known = UsualFit(sigmas)
+        known = FitStatistics(sigmas)
         for _ in range(20):
             known.learn(aligned(), 2.0)
         found = [known.assess(fit) for fit in fits]
@@ -157,7 +157,7 @@ def test_stricter_limits_accept_fewer_fits():
 
 
 def test_noise_scale_is_learned_from_alignments():
-    known = UsualFit()
+    known = FitStatistics()
     assert known.noise_scale == 0
     assert known.rms_fraction == 0
     known.learn(aligned(noise=8.0), 2.0)
@@ -173,7 +173,7 @@ def test_noise_scale_is_learned_from_alignments():
 
 
 def test_tolerance_of_agreement_follows_rms_of_camera():
-    fine, coarse = self_scaled(UsualFit()), UsualFit()
+    fine, coarse = self_scaled(FitStatistics()), FitStatistics()
     for _ in range(10):
         coarse.learn(aligned(rms_m=0.1), 2.0)
     assert self_scaled(coarse).floor_fraction == pytest.approx(0.1)

@@ -20,7 +20,7 @@ from tofuse.registration.pose_probability import ACCEPTED, Evidence
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.verification import UsualFit
+from tofuse.registration.verification import FitStatistics
 from tofuse.registration.view_pair import follow, register_pair
 
 # 40 degrees and 0.5 m apart.
@@ -292,7 +292,7 @@ def test_usual_fit_of_camera_decides_acceptance(pair):
     box = ((0.0, 0.2, 1.05), (0.35, 0.4, 0.1), 0.0)
     target, near = surface(pair[1]), A @ se3.exp([0.02, 0, 0, 0, 0.02, 0])
     plain, blocked = (surface(seen(near, 8, boxes=b)) for b in (BOXES, (*BOXES, box)))
-    usual = UsualFit()
+    usual = FitStatistics()
     for _ in range(20):
         aligned = align(target, [Target(plain, np.eye(4))], np.eye(4), ProjectiveOptions())
         usual.learn(aligned, target.depth)

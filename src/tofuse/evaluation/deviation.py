@@ -28,7 +28,7 @@ from scipy.special import fdtri, gammaincinv  # scipy.stats takes long to import
 from tofuse.arrays import Float64, Intp
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
-from tofuse.posegraph.accuracy import Shown, accuracy_of
+from tofuse.posegraph.accuracy import ObservedErrors, accuracy_of
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.robust import Settings
@@ -178,7 +178,7 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
     chance = float(fdtri(fit.unknowns, fit.spare, _LEVEL))
     estimate = problem.smallest(x, _USUAL * fit.unknowns)
     bound = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
-    known = accuracy_of(GraphCovariances(graph), Shown(), 0.0)
+    known = accuracy_of(GraphCovariances(graph), ObservedErrors(), 0.0)
     own = float(np.hypot(known.position_m, fit.depth_m * known.rotation_rad))
     return Deviation(
         problem.norm(estimate),

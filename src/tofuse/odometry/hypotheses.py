@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
-from tofuse.registration.verification import PATIENT, Assessment, UsualFit
+from tofuse.registration.verification import PATIENT, Assessment, FitStatistics
 
 # Minimum score of a rotated start relative to that of no rotation: a flat wall fits any.
 _MIN_SCORE_RATIO = 1.03
@@ -102,7 +102,7 @@ class Hypotheses:
         T_smoothed: Float64 | None,
         T_last: Float64,
         options: ProjectiveOptions,
-        usual: UsualFit,
+        usual: FitStatistics,
     ) -> None:
         self.whole, self.view, self.references = whole, view, references
         self.T_predicted, self.T_last = T_predicted, T_last

@@ -21,7 +21,7 @@ from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import registration_of
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import UsualFit, comparable
+from tofuse.registration.verification import FitStatistics, comparable
 
 
 class KeyframeTracker(Tracker):
@@ -30,7 +30,7 @@ class KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
-        self._usual = UsualFit()
+        self._usual = FitStatistics()
         self._relocalizer = Relocalizer(search if options.searches else None, self._usual)
         self._motion = MotionModel()
         self._segmentation = MotionSegmentation(self._relocalizer)

@@ -7,7 +7,7 @@ from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import DISTINCT_M, SearchOptions, differ
-from tofuse.registration.verification import UsualFit, comparable
+from tofuse.registration.verification import FitStatistics, comparable
 from tofuse.registration.view_pair import register_pair
 
 # A search costs about as much as tracking 40 frames. With one per 40 frames, a lost camera costs no
@@ -28,7 +28,7 @@ class Relocalizer:
         How views of this camera usually fit.
     """
 
-    def __init__(self, search: SearchOptions | None, usual: UsualFit) -> None:
+    def __init__(self, search: SearchOptions | None, usual: FitStatistics) -> None:
         self._search, self._usual = search, usual
         self._budget = float(_FREE_SEARCHES)
         # Registrations of the last view, as several hypotheses need the same pair.

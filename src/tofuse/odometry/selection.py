@@ -15,7 +15,7 @@ from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.agreement import MIN_LEAD, AgreementOptions, agreement
 from tofuse.registration.projective import UNITS
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD
-from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
+from tofuse.registration.verification import FitStatistics, finely_scaled, self_scaled
 
 # Weight of the deviation from the predicted motion, as a fraction of the points: small, as a wrong
 # pose loses more where the scene constrains it.
@@ -31,7 +31,7 @@ class HypothesisSelector:
 
     def __init__(
         self,
-        usual: UsualFit,
+        usual: FitStatistics,
         motion: MotionModel,
         segmentation: MotionSegmentation,
         relocalizer: Relocalizer,

@@ -21,7 +21,7 @@ from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.stage_results import BackEndInput, Optimised, Refined
 from tofuse.pipeline.tracked_graph import TrackedGraph
-from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of, covariances_of
+from tofuse.posegraph.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of
 from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.cut_edges import cut_edges
@@ -103,7 +103,7 @@ class Assessment:
         loops = tuple(c.record for c in closed.loops)
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
-        if stored.knows_errors:
+        if stored.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
         records = self._records(covariances)
         posed, entries = self.tracked.posed, self.log.entries
@@ -117,7 +117,7 @@ class Assessment:
             accuracy=accuracy,
             diagonal_m=model.cloud.diagonal_m,
             tolerance_m=self.config.tolerance_m,
-            knows_errors=stored.knows_errors,
+            has_covariances=stored.has_covariances,
             refinement=refined.refinement,
             given=frozenset((g.i, g.j) for g in self.given if g.by_user),
             depths=tuple(
@@ -151,7 +151,7 @@ class Assessment:
 
         Not assessed if covariances of registrations are unrealistic.
         """
-        if not self.stored.knows_errors:
+        if not self.stored.has_covariances:
             return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
         refinement = refined.refinement
         known = images_only = GraphCovariances(self._measured(refined.graph, refinement))
@@ -167,7 +167,9 @@ class Assessment:
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = self._by_calibration(refinement.calibration_check)
-        shown = Shown(*moved, excess, *calibration, refinement.split_m, refinement.split_rad)
+        shown = ObservedErrors(
+            *moved, excess, *calibration, refinement.split_m, refinement.split_rad
+        )
         covariances = covariances_of(known, shown)
         del known  # only one large factor is in memory
         accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)

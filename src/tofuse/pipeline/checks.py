@@ -74,7 +74,7 @@ class Evidence:
         Diagonal of the model.
     tolerance_m
         Tolerance of the poses; None for a fraction of the model's diagonal.
-    knows_errors
+    has_covariances
         Whether covariances of registrations are realistic, which ICP's are not.
     refinement
         Result of the refinement of all views.
@@ -109,7 +109,7 @@ class Evidence:
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
     diagonal_m: float = 0.0
     tolerance_m: float | None = None
-    knows_errors: bool = False
+    has_covariances: bool = False
     refinement: Refinement | None = None
     given: frozenset[tuple[int, int]] = frozenset()
     depths: tuple[float, ...] = ()
@@ -167,7 +167,7 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
             *_depths(evidence),
             *_registrations(evidence),
             *_loops(evidence),
-            *(_uncertainty(evidence) if evidence.knows_errors else _drift(evidence)),
+            *(_uncertainty(evidence) if evidence.has_covariances else _drift(evidence)),
             *_optimiser(evidence),
             *_external_sensors(evidence),
             *_images(evidence),
@@ -322,7 +322,7 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
             "correspondence."
         )
         yield Reason("weak_registration", weak, text)
-    if e.knows_errors:
+    if e.has_covariances:
         return  # degenerate or unconverged registrations are included in the bounds
     free = {index for index, r in pairs if len(r.unobservable)}
     if len(free) > MAX_DEGENERATE * len(pairs):

@@ -12,7 +12,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Step
 from tofuse.posegraph.external_sensors import SensorData
-from tofuse.posegraph.gaps import Stretch
+from tofuse.posegraph.gaps import TrackedComponent
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link
@@ -163,7 +163,7 @@ class FrameLog:
         ]
         return FrameLog(entries, self.interruptions, self.repeated)
 
-    def stretches(self, views: ViewStore[PreparedView]) -> list[Stretch]:
+    def stretches(self, views: ViewStore[PreparedView]) -> list[TrackedComponent]:
         """Return the components as tracked, in the order in which they began."""
         members: dict[int, list[Entry]] = {}
         for entry in self.posed:
@@ -173,7 +173,7 @@ class FrameLog:
         for component, entries in members.items():
             poses = [e.step.T_component_camera for e in entries if e.step is not None]
             found.append(
-                Stretch(
+                TrackedComponent(
                     component,
                     np.array([e.record.index for e in entries], np.intp),
                     np.array([e.record.timestamp for e in entries]),

@@ -58,7 +58,7 @@ class Observations:
         self._checks = _EvenSample(_CHECKED_IMAGES, images.part(1.0))
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None
-        self._knows_errors = False
+        self._has_covariances = False
 
     def add(self, ready: Ready, step: Step) -> None:
         """Store what joining, loops and refinement need of a frame with a pose."""
@@ -68,7 +68,7 @@ class Observations:
             self._ambiguity_m = ready.frame.ambiguity_m
         if surface is not None:
             # Covariances of trackers with prepared views are realistic; those of ICP are too small.
-            self._knows_errors = True
+            self._has_covariances = True
             self.views.push(surface, T, step.component, _reduced)
         view: Frame = ready.clean
         # Methods on prepared views need no points, which take long to compute.
@@ -107,7 +107,7 @@ class Observations:
             self._checks.images,
             self._depths,
             self._ambiguity_m,
-            self._knows_errors,
+            self._has_covariances,
             self.views,
         )
 

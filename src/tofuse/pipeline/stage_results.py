@@ -77,7 +77,7 @@ class BackEndInput:
         Typical radial range of each posed frame, m, by index.
     ambiguity_m
         Ambiguity range of the camera, if known.
-    knows_errors
+    has_covariances
         Whether covariances of registrations are realistic; those of ICP are too small.
     views
         Prepared views, spaced by motion.
@@ -89,5 +89,5 @@ class BackEndInput:
     checks: Sequence[Spilled[RangeFrame]]
     depths: dict[int, float]
     ambiguity_m: float | None
-    knows_errors: bool
+    has_covariances: bool
     views: ViewStore[PreparedView]

@@ -35,7 +35,7 @@ _OPEN = np.array([30.0] * 3 + [10.0] * 3)
 _UNMEASURED_FRACTION = 0.05
 # Ratio of the total error to that in which views differ: errors of the sensor that all views of a
 # place share are invisible.
-HIDDEN = 1.6
+UNOBSERVED_ERROR_FACTOR = 1.6
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
@@ -89,7 +89,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ObservedErrors:
     """Errors that the recording shows and the covariance does not include.
 
     Attributes
@@ -273,7 +273,9 @@ def without_degenerate(
     return replace(graph, information=information)
 
 
-def accuracy_of(covariances: GraphCovariances, shown: Shown, diagonal_m: float) -> Accuracy:
+def accuracy_of(
+    covariances: GraphCovariances, shown: ObservedErrors, diagonal_m: float
+) -> Accuracy:
     """Return the bounds on the errors of the poses of a graph.
 
     Parameters
@@ -299,8 +301,8 @@ def accuracy_of(covariances: GraphCovariances, shown: Shown, diagonal_m: float) 
         first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
         return Accuracy(assessed=True, worst=first, unbounded=free)
     extra = shown.beyond(stated)
-    of_all = HIDDEN * np.hypot(stated.bounds, extra)
-    of_each = HIDDEN * np.hypot(stated.single, extra)
+    of_all = UNOBSERVED_ERROR_FACTOR * np.hypot(stated.bounds, extra)
+    of_each = UNOBSERVED_ERROR_FACTOR * np.hypot(stated.single, extra)
     of_each = np.where(unbounded[stated.positions], np.inf, of_each)
     worst = int(np.argmax((of_each / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
@@ -314,7 +316,7 @@ def accuracy_of(covariances: GraphCovariances, shown: Shown, diagonal_m: float) 
     )
 
 
-def covariances_of(covariances: GraphCovariances, shown: Shown) -> Float64:
+def covariances_of(covariances: GraphCovariances, shown: ObservedErrors) -> Float64:
     """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
 
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
@@ -323,7 +325,7 @@ def covariances_of(covariances: GraphCovariances, shown: Shown) -> Float64:
     more = np.repeat(shown.beyond(_Stated.by(covariances)) ** 2 / 3, 3)
     C = covariances.of_poses.copy()
     C[1:] += np.diag(more)
-    return HIDDEN**2 * C
+    return UNOBSERVED_ERROR_FACTOR**2 * C
 
 
 def _single(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:

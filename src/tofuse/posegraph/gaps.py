@@ -36,7 +36,7 @@ _ENDS, _MIN_COMPARED = 5, 10
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class TrackedComponent:
     """A component as tracked.
 
     Attributes
@@ -71,7 +71,9 @@ class Stretch:
         return float(np.median([v.depth for v in self.views])) if self.views else 1.0
 
 
-def motion_over(before: Stretch, after: Stretch, T: Mapping[int, Float64]) -> Float64:
+def motion_over(
+    before: TrackedComponent, after: TrackedComponent, T: Mapping[int, Float64]
+) -> Float64:
     """Return the motion (4, 4) from the end of one component to the start of another.
 
     `T` are their poses (4, 4) in a common frame, by component.
@@ -80,7 +82,7 @@ def motion_over(before: Stretch, after: Stretch, T: Mapping[int, Float64]) -> Fl
     return np.asarray(se3.inverse(end) @ T[after.component] @ after.poses[0], np.float64)
 
 
-def end_speeds(stretch: Stretch, *, end: bool) -> Float64:
+def end_speeds(stretch: TrackedComponent, *, end: bool) -> Float64:
     """Return (n, 2) speeds, m/s and rad/s, of the motions next to the start, or to the end."""
     some = slice(-_AROUND, None) if end else slice(None, _AROUND)
     poses, times = stretch.poses[some], stretch.times[some]
@@ -90,7 +92,7 @@ def end_speeds(stretch: Stretch, *, end: bool) -> Float64:
     return _lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
 
 
-def largest_motion(before: Stretch, after: Stretch) -> Float64:
+def largest_motion(before: TrackedComponent, after: TrackedComponent) -> Float64:
     """Return (2,) how far, m and rad, the camera can have moved in a gap; infinite if unknown."""
     around = np.concatenate([end_speeds(before, end=True), end_speeds(after, end=False)])
     if len(around) < _AROUND // 4:
@@ -99,7 +101,7 @@ def largest_motion(before: Stretch, after: Stretch) -> Float64:
     return np.asarray(np.maximum(_FASTER * around.max(0), HANDHELD) * elapsed)
 
 
-def odometry_over(before: Stretch, after: Stretch) -> Link | None:
+def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | None:
     """Return the motion over a gap by odometry; None without any, or if it is too uncertain.
 
     Its errors are those of the tracked motions on both sides, and grow as in a random walk.
@@ -137,14 +139,14 @@ def _lengths(T: Float64) -> Float64:
     return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(se3.angle(T))], 1)
 
 
-def extrapolated(before: Stretch, after: Stretch) -> Link | None:
+def extrapolated(before: TrackedComponent, after: TrackedComponent) -> Link | None:
     """Return the motion over a gap, extrapolated from both sides; None if it is too uncertain."""
     elapsed = float(after.times[0] - before.times[-1])
     n = _ENDS
     if min(len(before.frames), len(after.frames)) < n or elapsed <= 0:
         return None
 
-    def velocities(stretch: Stretch, some: slice) -> Float64:
+    def velocities(stretch: TrackedComponent, some: slice) -> Float64:
         poses, times = stretch.poses[some], stretch.times[some]
         return np.stack(
             [
@@ -169,7 +171,9 @@ def extrapolated(before: Stretch, after: Stretch) -> Link | None:
     return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), how)
 
 
-def _link_over_gap(before: Stretch, after: Stretch, T: Float64, sigma: Float64, how: str) -> Link:
+def _link_over_gap(
+    before: TrackedComponent, after: TrackedComponent, T: Float64, sigma: Float64, how: str
+) -> Link:
     """Return the link, given T (4, 4) from the frame after to the one before, and (6,) sigmas."""
     made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
     return Link(int(before.frames[-1]), int(after.frames[0]), made, certain=False, how=how)

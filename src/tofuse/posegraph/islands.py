@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.posegraph.cut_edges import sides_without
-from tofuse.posegraph.gaps import Stretch, View
+from tofuse.posegraph.gaps import TrackedComponent, View
 from tofuse.registration.base import Link
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD
 
@@ -82,7 +82,7 @@ class Islands:
         Stored views by frame.
     """
 
-    def __init__(self, stretches: Sequence[Stretch]) -> None:
+    def __init__(self, stretches: Sequence[TrackedComponent]) -> None:
         self.stretches = {s.component: s for s in stretches}
         self.component_of = {int(f): s.component for s in stretches for f in s.frames}
         self.views = {v.index: v for s in stretches for v in s.views}
@@ -183,7 +183,7 @@ class Islands:
             far.append(metres / self.depth_of(i) + float(se3.angle(T)))
         return max(far)
 
-    def in_time(self, c: int, d: int) -> tuple[Stretch, Stretch]:
+    def in_time(self, c: int, d: int) -> tuple[TrackedComponent, TrackedComponent]:
         """Return two components in the order in which they began."""
         first, second = self.stretches[c], self.stretches[d]
         return (first, second) if first.frames[0] < second.frames[0] else (second, first)

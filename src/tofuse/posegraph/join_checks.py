@@ -12,7 +12,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.posegraph.gaps import (
     CONVERGENCE,
-    Stretch,
+    TrackedComponent,
     View,
     end_speeds,
     largest_motion,
@@ -24,7 +24,7 @@ from tofuse.registration.base import Link, Registration
 from tofuse.registration.pose_probability import CONTRADICTION
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import differ
-from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
+from tofuse.registration.verification import IN_SIGHT, PATIENT, FitStatistics, self_scaled
 from tofuse.registration.view_pair import follow
 
 # View pairs that verify a join, besides those of the links; and their smallest overlap.
@@ -62,7 +62,7 @@ class JoinChecks:
 
     def __init__(self, islands: Islands) -> None:
         self._islands = islands
-        self.usual = UsualFit()
+        self.usual = FitStatistics()
         self._contradiction = CONTRADICTION
         stretches = list(islands.stretches.values())
         known = np.concatenate([end_speeds(s, end=True) for s in stretches])
@@ -235,7 +235,7 @@ def link_of(first: View, second: View, found: Registration | None) -> Link | Non
     return Link(first.index, second.index, found, found.stands_alone, found.how)
 
 
-def _tracking_failures(stretches: Sequence[Stretch]) -> int:
+def _tracking_failures(stretches: Sequence[TrackedComponent]) -> int:
     """Number of components that end where the next frame of the recording begins another one."""
     first = {(s.recording, int(s.frames[0])) for s in stretches}
     return sum((s.recording, int(s.frames[-1]) + 1) in first for s in stretches)

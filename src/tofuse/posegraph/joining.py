@@ -23,7 +23,7 @@ from tofuse.arrays import Float64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.posegraph.cut_edges import cut_edges
-from tofuse.posegraph.gaps import Stretch, View, extrapolated, odometry_over
+from tofuse.posegraph.gaps import TrackedComponent, View, extrapolated, odometry_over
 from tofuse.posegraph.islands import How, Island, Islands, Join
 from tofuse.posegraph.join_checks import VERIFY, JoinChecks, link_of
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
@@ -107,7 +107,7 @@ class Joining(Bounded):
 
     def join(
         self,
-        stretches: Sequence[Stretch],
+        stretches: Sequence[TrackedComponent],
         links: Sequence[Link],
         search: SearchOptions | None = None,
     ) -> list[Group]:
@@ -141,7 +141,7 @@ class Joining(Bounded):
 
 class _Joiner:
     def __init__(
-        self, options: Joining, stretches: Sequence[Stretch], search: SearchOptions
+        self, options: Joining, stretches: Sequence[TrackedComponent], search: SearchOptions
     ) -> None:
         self._options, self._search = options, search
         self._islands = Islands(stretches)

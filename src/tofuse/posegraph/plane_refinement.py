@@ -21,7 +21,7 @@ from tofuse.posegraph.refinement import (
     Refiner,
     Refining,
     moved_to,
-    without_losers,
+    with_unsupported_views_fixed,
 )
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import Frame
@@ -54,7 +54,7 @@ class Planes(Bounded, Refining):
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPoints:
+class SampledPoints:
     """What is kept of a view: some (n, 3) of its points in its frame, and their median range, m."""
 
     index: int
@@ -62,7 +62,7 @@ class KeptPoints:
     points: Float64
 
     @classmethod
-    def of(cls, view: Frame, most: int) -> KeptPoints:
+    def of(cls, view: Frame, most: int) -> SampledPoints:
         """Keep at most so many points, at an even stride."""
         points = view.points[:: max(1, -(-len(view) // most))].astype(np.float64)
         depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
@@ -72,11 +72,13 @@ class KeptPoints:
 class _Planes(Refiner):
     def __init__(self, options: Planes) -> None:
         self._options = options
-        self._store: ViewStore[KeptPoints] = ViewStore(Spacing(most=options.max_views, loosest=1e6))
+        self._store: ViewStore[SampledPoints] = ViewStore(
+            Spacing(most=options.max_views, loosest=1e6)
+        )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(KeptPoints.of(view, self._options.points), T_component_camera)
+        self._store.push(SampledPoints.of(view, self._options.points), T_component_camera)
 
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
@@ -94,7 +96,7 @@ class _Planes(Refiner):
         if not len(found.pairs) or mean[1] < mean[0] - CHANCE:
             return unchanged
         lost = found.after < found.before - MAX_LOSS
-        after = without_losers(before, found.poses, lost)
+        after = with_unsupported_views_fixed(before, found.poses, lost)
         edges = tuple(_edges(found, [view.index for view in views], lost))
         return replace(moved_to(unchanged, at, after), edges=edges)
 

@@ -264,7 +264,7 @@ class _Joint(Refiner):
             return unchanged
         if fell(gained):  # the camera may be the cause
             return replace(unchanged, calibration_check=evidence.calibration())
-        after = without_losers(before, refined.poses, gained < -MAX_LOSS)
+        after = with_unsupported_views_fixed(before, refined.poses, gained < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were at the optimum already; the measurements give their covariances.
             after = before
@@ -428,7 +428,7 @@ def _priors(ids: Sequence[int], measured: SensorPriors) -> Priors:
     )
 
 
-def without_losers(before: Float64, after: Float64, lost: Bool) -> Float64:
+def with_unsupported_views_fixed(before: Float64, after: Float64, lost: Bool) -> Float64:
     """Return the refined poses, with views that lost support fixed to their nearest neighbour.
 
     Parameters

@@ -41,7 +41,7 @@ from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import DISTINCT_M, SearchOptions
-from tofuse.registration.verification import UsualFit
+from tofuse.registration.verification import FitStatistics
 from tofuse.registration.view_descriptor import view_descriptor
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -210,7 +210,7 @@ class _RevisitLoops(Loops):
         self._given_loops = given
         self._seen: dict[int, _Entry] = {}
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
-        self._usual = UsualFit()
+        self._usual = FitStatistics()
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
         self._path_length: dict[int, Float64] = {}
@@ -377,7 +377,7 @@ class _RevisitLoops(Loops):
 
     def _guessed(
         self, target: View, source: View
-    ) -> tuple[PreparedView, PreparedView, Float64, UsualFit]:
+    ) -> tuple[PreparedView, PreparedView, Float64, FitStatistics]:
         """Arguments of `register_near`, with the guess of the trajectory."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Bare: otherwise the data derived for the comparison would stay in memory.
@@ -519,14 +519,14 @@ class _RevisitLoops(Loops):
 
 
 def register_near(
-    source: PreparedView, target: PreparedView, guess: Float64, usual: UsualFit
+    source: PreparedView, target: PreparedView, guess: Float64, usual: FitStatistics
 ) -> Registration | None:
     """Register two views from the guess (4, 4) T_target_source of the trajectory."""
     return follow(source, target, guess, usual=usual)
 
 
 def register_anywhere(
-    source: PreparedView, target: PreparedView, usual: UsualFit, options: SearchOptions
+    source: PreparedView, target: PreparedView, usual: FitStatistics, options: SearchOptions
 ) -> Registration | None:
     """Register two views by exhaustive search, without a guess."""
     return register_pair(source, target, usual=usual, options=options, rival_m=DISTINCT_M)

@@ -190,7 +190,7 @@ def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
     return np.asarray(np.einsum("kai,kaj,k->ij", J, J, weight), np.float64)
 
 
-def loose_directions(information: Float64) -> Float64:
+def weakly_constrained_directions(information: Float64) -> Float64:
     """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
     values, vectors = np.linalg.eigh(information * _UNITS[:, None] * _UNITS)
     loose = vectors[:, values < 1].T * _UNITS
@@ -213,7 +213,7 @@ def registration_of(pairs: Pairs, found: Consensus, margin: float) -> Registrati
         error=float(distance.sum() / (len(pairs) * typical)),
         rms_m=float(np.sqrt((distance**2).mean())),
         information=information,
-        unobservable=loose_directions(information),
+        unobservable=weakly_constrained_directions(information),
         margin=margin,
     )
 

@@ -1,9 +1,10 @@
 """Verification of alignments against the fit statistics of the camera.
 
 The quality of fit at the right pose depends on the camera: 92 % of the compared pixels are inliers
-for a smoothing phone, two thirds for a stereo camera. Instead of a fixed limit, `UsualFit`
+for a smoothing phone, two thirds for a stereo camera. Instead of a fixed limit, `FitStatistics`
 estimates the distribution of a few statistics from accepted alignments, starting with a wide prior.
-Outliers by more than `UsualFit.sigmas` are not rejected, but have to be compared with rival poses.
+Outliers by more than `FitStatistics.sigmas` are not rejected, but have to be compared with rival
+poses.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Assessment:
     conflict: bool = False
 
 
-class UsualFit:
+class FitStatistics:
     """Distribution of the fit statistics of correct alignments of this camera.
 
     Location and spread of each statistic are the median and the scaled median absolute deviation
@@ -174,7 +175,7 @@ def both_ways_agree(
     return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
 
 
-def self_scaled(usual: UsualFit) -> AgreementOptions:
+def self_scaled(usual: FitStatistics) -> AgreementOptions:
     """Return options that tolerate the usual errors of this camera."""
     plain = AgreementOptions()
     return replace(
@@ -184,7 +185,7 @@ def self_scaled(usual: UsualFit) -> AgreementOptions:
     )
 
 
-def finely_scaled(usual: UsualFit) -> AgreementOptions:
+def finely_scaled(usual: FitStatistics) -> AgreementOptions:
     """Return options that distinguish rival poses of one image by errors beyond the usual ones."""
     coarse = self_scaled(usual)
     if not usual.is_known:

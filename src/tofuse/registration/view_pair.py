@@ -38,7 +38,7 @@ from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 from tofuse.registration.verification import (
     COARSE,
     PATIENT,
-    UsualFit,
+    FitStatistics,
     both_ways_agree,
     comparable,
     self_scaled,
@@ -96,7 +96,7 @@ def register_pair(
     target: PreparedView,
     guess: Float64 | None = None,
     *,
-    usual: UsualFit | None = None,
+    usual: FitStatistics | None = None,
     options: SearchOptions | None = None,
     always_search: bool = False,
     proposals: Callable[[], Float64] | None = None,
@@ -153,7 +153,7 @@ def follow(
     target: PreparedView,
     guess: Float64,
     *,
-    usual: UsualFit | None = None,
+    usual: FitStatistics | None = None,
     uncertainty: UncertaintyOptions | None = None,
 ) -> Registration | None:
     """Register two prepared views from a guess (4, 4) without a search; None if they don't fit.
@@ -181,7 +181,7 @@ class _Pair:
 
     source: PreparedView
     target: PreparedView
-    usual: UsualFit
+    usual: FitStatistics
     compared: AgreementOptions
     distinct_m: float
     uncertainty: UncertaintyOptions | None
@@ -191,7 +191,7 @@ class _Pair:
         cls,
         source: PreparedView,
         target: PreparedView,
-        usual: UsualFit | None,
+        usual: FitStatistics | None,
         uncertainty: UncertaintyOptions | None,
         rival_m: float = math.inf,
     ) -> _Pair:
@@ -203,7 +203,7 @@ class _Pair:
             view.with_falloff(_VIGNETTING) if view.unknown_falloff else view
             for view in (source, target)
         )
-        usual = usual or UsualFit()
+        usual = usual or FitStatistics()
         depth = 0.5 * (source.depth + target.depth)
         compared = self_scaled(usual)
         compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))

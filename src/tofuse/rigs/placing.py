@@ -250,7 +250,7 @@ class _Placer:
         best = rivals[0] if rivals else _Set({}, 0.0)
         poses = dict(best.poses)
         while len(poses) > 1:
-            found = {c: self._belief(poses, c, rivals) for c in poses if c}
+            found = {c: self._pose_probability(poses, c, rivals) for c in poses if c}
             probability.update({c: belief for c, (belief, _) in found.items()})
             weakest = min(found, key=lambda c: found[c][0])
             if not found[weakest][1]:
@@ -283,7 +283,7 @@ class _Placer:
                 scores.append(gain)
         return scores
 
-    def _belief(
+    def _pose_probability(
         self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Set]
     ) -> tuple[float, str]:
         """Return the probability that a camera's pose is correct, and why it is rejected, if it is.

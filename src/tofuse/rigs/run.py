@@ -20,7 +20,7 @@ from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run_options import Options, resolve
-from tofuse.posegraph.accuracy import HIDDEN
+from tofuse.posegraph.accuracy import UNOBSERVED_ERROR_FACTOR
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import Known, NoRefinement
@@ -202,7 +202,9 @@ def _fixed(
     tied to the first ones of their cameras.
     """
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
-    covariances = [c.covariance / HIDDEN**2 + np.diag(_AT_LEAST) for c in rig.cameras]
+    covariances = [
+        c.covariance / UNOBSERVED_ERROR_FACTOR**2 + np.diag(_AT_LEAST) for c in rig.cameras
+    ]
     covariances[0] = np.diag(_AT_LEAST)
     known = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]

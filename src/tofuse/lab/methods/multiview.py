@@ -19,7 +19,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.posegraph.external_sensors import SensorPriors
-from tofuse.posegraph.plane_refinement import KeptPoints
+from tofuse.posegraph.plane_refinement import SampledPoints
 from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
@@ -120,11 +120,11 @@ class _Relaxation(Refiner):
 
     def __init__(self, method: Relaxing) -> None:
         self._method = method
-        self._store: ViewStore[KeptPoints] = ViewStore(Spacing(most=method.views, loosest=1e6))
+        self._store: ViewStore[SampledPoints] = ViewStore(Spacing(most=method.views, loosest=1e6))
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(KeptPoints.of(view, self._method.points), T_component_camera)
+        self._store.push(SampledPoints.of(view, self._method.points), T_component_camera)
 
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None

@@ -90,7 +90,7 @@ class PlaneSets(Bounded, Registrar):
         rival = max((score for k, score in enumerate(scores) if k != best), default=0.0)
         _, pairs, T = poses[best]
         margin = scores[best] - max(rival, 0.0)
-        return self._told(a, b, pairs, T, len(poses), depth, margin)
+        return self._registration(a, b, pairs, T, len(poses), depth, margin)
 
     def _prepared(self, view: Frame) -> PreparedView:
         if not isinstance(view, RangeFrame):
@@ -146,7 +146,7 @@ class PlaneSets(Bounded, Registrar):
                 pairs.append((i, best))
         return pairs
 
-    def _told(
+    def _registration(
         self,
         a: list[Plane],
         b: list[Plane],
