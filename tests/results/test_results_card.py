@@ -62,6 +62,7 @@ def test_unbounded_and_unassessed_accuracy() -> None:
     assert weakest_frame(Accuracy()) == ""
     loose = Accuracy(np.inf, 0.1, np.inf, True, WorstFrame(4, np.inf, 0.1), (4, 5, 6, 9))
     assert bound(loose, 5.0) == "accuracy not bounded over 5 m"
+    assert bound(loose, 1790.4) == "accuracy not bounded over 1790 m"
     assert weakest_frame(loose) == "frames 4-6, 9, not bounded"
 
 

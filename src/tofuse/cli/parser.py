@@ -249,9 +249,9 @@ def _run(commands: Any) -> None:
         action="store_true",
         help="average static segments into one frame each",
     )
-    g.add_argument("--min-depth", type=_metres, metavar="M", help="discard points closer than this")
+    g.add_argument("--min-depth", type=_depth, metavar="M", help="discard points closer than this")
     g.add_argument(
-        "--max-depth", type=_metres, metavar="M", help="discard points farther than this"
+        "--max-depth", type=_depth, metavar="M", help="discard points farther than this"
     )
 
 
@@ -811,8 +811,16 @@ _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 def _length(text: str) -> float:
     """A positive length in m, given as 30mm, 3cm, 0.03m or 0.03."""
+    value = _depth(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length above 0, such as 30mm")
+    return value
+
+
+def _depth(text: str) -> float:
+    """A length in m of 0 or more, with a unit as in `_length`."""
     match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(mm|cm|m)?\s*", text)
     value = _number(match[1]) * _UNITS_M[match[2] or "m"] if match else math.nan
-    if not 0 < value < math.inf:
+    if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
     return value

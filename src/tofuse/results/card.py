@@ -50,8 +50,13 @@ def bound(a: Accuracy, diagonal_m: float) -> str:
     if not a.assessed:
         return "accuracy not assessed"
     if not np.isfinite(a.position_m):
-        return f"accuracy not bounded over {diagonal_m:.3g} m"
-    return f"±{length(a.position_m)} (95 %) over {diagonal_m:.3g} m, {100 * a.relative:.2g} %"
+        return f"accuracy not bounded over {_extent(diagonal_m)}"
+    return f"±{length(a.position_m)} (95 %) over {_extent(diagonal_m)}, {100 * a.relative:.2g} %"
+
+
+def _extent(metres: float) -> str:
+    """Return the size of a model as text: three digits, and no exponent."""
+    return f"{metres:.0f} m" if metres >= 100 else f"{metres:.3g} m"
 
 
 def weakest_frame(a: Accuracy) -> str:
