@@ -813,7 +813,7 @@ def _length(text: str) -> float:
     """A positive length in m, given as 30mm, 3cm, 0.03m or 0.03."""
     value = _depth(text)
     if value == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length above 0, such as 30mm")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
     return value
 
 
