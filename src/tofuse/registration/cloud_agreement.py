@@ -84,7 +84,7 @@ class CloudMap:
 
     @property
     def tree(self) -> KdTree:
-        """k-d tree over the averaged points."""
+        """kd-tree over the averaged points."""
         return tree_of(self.view)
 
     @cached_property

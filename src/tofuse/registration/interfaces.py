@@ -195,7 +195,7 @@ class Matcher(Protocol):
     takes: ClassVar[frozenset[str]]
 
     def prepare(self, target: Points) -> Search:
-        """Precompute what depends on the target only, a k-d tree for example."""
+        """Precompute what depends on the target only, a kd-tree for example."""
         ...
 
 

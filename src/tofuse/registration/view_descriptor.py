@@ -100,7 +100,7 @@ def pairwise_dissimilarity(descriptors: Float32, i: Intp, j: Intp, shift: float)
 def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     """Return candidate pairs i < j of similar descriptors (N, 2, 9, 12), some for each view.
 
-    A k-d tree over the first principal components of blocks of cells is queried for each view at
+    A kd-tree over the first principal components of blocks of cells is queried for each view at
     each shift (see `dissimilarity`). Callers compare the candidates cell by cell. Consecutive views
     are left out, as these are always similar.
     """

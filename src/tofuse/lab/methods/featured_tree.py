@@ -1,4 +1,4 @@
-"""A k-d tree that also compares features, and sums over balls."""
+"""A kd-tree that also compares features, and sums over balls."""
 
 from __future__ import annotations
 
