@@ -250,9 +250,7 @@ def _run(commands: Any) -> None:
         help="average static segments into one frame each",
     )
     g.add_argument("--min-depth", type=_depth, metavar="M", help="discard points closer than this")
-    g.add_argument(
-        "--max-depth", type=_depth, metavar="M", help="discard points farther than this"
-    )
+    g.add_argument("--max-depth", type=_depth, metavar="M", help="discard points farther than this")
 
 
 def _source(p: Any) -> None:
