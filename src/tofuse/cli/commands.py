@@ -630,6 +630,7 @@ def noise(arguments: argparse.Namespace) -> int:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
+    from tofuse.evaluation.trajectory import MAX_GAP_S
     from tofuse.pipeline.evaluating import evaluate as evaluate_poses
 
     found = evaluate_poses(
@@ -642,7 +643,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            "pose within 20 ms: check that both files have the same clock",
+            f"pose within {1000 * MAX_GAP_S:.0f} ms: check that both files have the same clock",
             file=sys.stderr,
         )
     if arguments.json:

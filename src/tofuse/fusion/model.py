@@ -49,7 +49,7 @@ class ModelBuilder:
     options
         How views are fused.
     spill
-        The store of views; by default a sixth of the memory for voxels, the rest on disk.
+        The store of views; by default a tenth of the memory for voxels, the rest on disk.
     """
 
     def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:

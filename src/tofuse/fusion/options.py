@@ -23,7 +23,7 @@ class Fusion(Bounded):
         Connected pieces of the surface with fewer vertices are removed.
     memory_mb
         Maximum memory for the voxels: beyond it, the model is made region by region, with the same
-        result. A sixth as much may be used for stored views; what does not fit is on disk until it
+        result. A tenth as much may be used for stored views; what does not fit is on disk until it
         is fused.
     holes_m
         Holes in the surface with a border no longer than this are closed; 0 closes none.

@@ -496,7 +496,11 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         )
     elif found.unconfirmed:
         cure = " or ".join(camera_in_words(found.unconfirmed))
-        why = "but no loop closure confirms it" if found.large else "which is a usual tolerance"
+        why = (
+            "but no loop closure confirms it"
+            if found.large
+            else "which is within the usual tolerance"
+        )
         text = f"Views agree better with {cure}, {why}: the stated accuracy includes its effect."
     else:
         return

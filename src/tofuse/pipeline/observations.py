@@ -48,14 +48,13 @@ class Observations:
     def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
-        images = Scratch(checked_bytes(config.memory_mb))
         self.views: ViewStore[PreparedView] = ViewStore(Spacing(), always=ends, scratch=scratch)
         self.loops = config.loops.start(seed, given, self.views, config.search)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
         self._places = Spacing(enough=_ENOUGH).places()
-        self._checks = _EvenSample(_CHECKED_IMAGES, images.part(1.0))
+        self._checks = _EvenSample(_CHECKED_IMAGES, Spill(checked_bytes(config.memory_mb)))
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None
         self._has_covariances = False

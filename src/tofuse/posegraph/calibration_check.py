@@ -258,7 +258,7 @@ def check_calibration(
     gap = None
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
-    # Views agree better with a smaller error, and a loop closes, if multipath is the cause as well.
+    # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
     alarm = large and improves and gap is not None and gap.closes
     if alarm:  # alternative explanations
         found |= {name: estimated(name) for name in determined if name not in found}

@@ -33,6 +33,7 @@ from tofuse.posegraph.view_store import (
     PosedView,
     SampledView,
     Spilled,
+    SpilledCoarseView,
     ViewStore,
     sampled_points,
 )
@@ -315,7 +316,7 @@ def _in_submaps(
     """Refine submap by submap."""
     ids = [p.index for p in posed]
     refined, parts = refine_submaps(
-        [_Spilled.of(p, options, store.coarse) for p in posed],
+        [_coarse(p, options, store.coarse) for p in posed],
         poses,
         options.alignment,
         options.submap,
@@ -346,26 +347,12 @@ def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return m, rad
 
 
-@dataclass(frozen=True, eq=False)
-class _Spilled:
-    """The coarse version of a view, possibly on disk."""
-
-    middle: Float64
-    kept: Spilled[CoarseView]
-
-    @classmethod
-    def of(
-        cls, posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
-    ) -> _Spilled:
-        surface = _surface(posed)
-        points = sampled_points(surface, options.alignment.points)
-        coarse = CoarseView.of(surface, points)
-        return cls(coarse.middle, Spilled(coarse, spill))
-
-    @property
-    def coarse(self) -> CoarseView:
-        """See `HasCoarseView`."""
-        return self.kept.get()
+def _coarse(
+    posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
+) -> SpilledCoarseView:
+    surface = _surface(posed)
+    coarse = CoarseView.of(surface, sampled_points(surface, options.alignment.points))
+    return SpilledCoarseView(coarse.middle, Spilled(coarse, spill))
 
 
 def _surface(posed: PosedView[PreparedView]) -> PreparedView:

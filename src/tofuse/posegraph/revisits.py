@@ -32,6 +32,7 @@ from tofuse.posegraph.view_store import (
     PosedView,
     Spacing,
     Spilled,
+    SpilledCoarseView,
     ViewStore,
     overlaps,
     sampled_points,
@@ -76,17 +77,10 @@ _VIEWS_PER_BUDGET = 200
 
 
 @dataclass(frozen=True, eq=False)
-class _Entry:
+class _Entry(SpilledCoarseView):
     """What candidates are selected by: little memory per view."""
 
-    middle: Float64
     descriptor: Float32
-    kept: Spilled[CoarseView]
-
-    @property
-    def coarse(self) -> CoarseView:
-        """See `HasCoarseView`."""
-        return self.kept.get()
 
 
 @part("loops", "revisits")
@@ -341,7 +335,7 @@ class _RevisitLoops(Loops):
         surface = posed.view.without_caches()
         coarse = CoarseView.of(surface, sampled_points(surface, _POINTS))
         kept = Spilled(coarse, self._store.coarse)
-        return _Entry(coarse.middle, view_descriptor(surface), kept)
+        return _Entry(coarse.middle, kept, view_descriptor(surface))
 
     def _learn(self, posed: Sequence[View]) -> None:
         """Learn the usual fit of neighbouring views of this camera."""

@@ -231,6 +231,27 @@ class Spilled(Generic[T]):
         finalize(self, self._spill.drop, self._number).atexit = False
 
 
+@dataclass(frozen=True, eq=False)
+class SpilledCoarseView:
+    """The coarse version of a view, possibly on disk; see `HasCoarseView`.
+
+    Attributes
+    ----------
+    middle
+        (3,) centroid of its points, in its camera's frame, m.
+    kept
+        Where it is.
+    """
+
+    middle: Float64
+    kept: Spilled[CoarseView]
+
+    @property
+    def coarse(self) -> CoarseView:
+        """The coarse view; read from disk if it is not in memory."""
+        return self.kept.get()
+
+
 class PosedView(Generic[V]):
     """A view with its pose.
 

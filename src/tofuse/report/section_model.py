@@ -96,12 +96,12 @@ def _thinned(scene: Scene) -> str:
 
 def views(s: Subject) -> Values:
     """Return the drawings from above and from the side, and the table of sizes."""
-    if len(s.points) == 0:
+    if len(s.scene.points) == 0:
         return dict.fromkeys(("views", "sizes", "views_legend", "views_note"), "") | {
             "true_sizes": False
         }
     R = s.straight
-    points = s.points @ R.T
+    points = s.scene.points @ R.T
     true = None if s.truth is None else s.truth @ R.T
     path = s.scene.after[:, :3, 3] @ R.T
     measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)

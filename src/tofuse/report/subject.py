@@ -37,9 +37,10 @@ class Subject:
         (N,) frame index of each row of the trajectory.
     rows
         The row of each frame index.
-    points, truth
-        (N, 3) and (K, 3) finite points of the model, at random, and of the true surfaces, world
-        frame.
+    scene
+        What the 3D view shows; plans and sizes are of its points, too.
+    truth
+        (K, 3) finite points of the true surfaces, world frame.
     straight
         (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright by
         `Reconstruction.T_up_world`, and rotated so that the model is aligned with them.
@@ -51,7 +52,6 @@ class Subject:
     rows: dict[int, int]
     reference: Float64 | None
     scene: Scene
-    points: Float64
     truth: Float64 | None
     straight: Float64
 
@@ -67,18 +67,18 @@ class Subject:
         ):
             reference = None
         scene = make_scene(result, rows, reference)
-        points, truth = scene.points, extras.truth_points
+        truth = extras.truth_points
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]
         true = truth.astype(float) if truth is not None and len(truth) else None
         up = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
-        shown = points @ up.T if true is None else true @ up.T
+        shown = scene.points @ up.T if true is None else true @ up.T
         turn = (
             display_axes.upright_axes(shown, OUTER)
             if true is None
             else display_axes.box_axes(shown)
         )
-        return cls(result, extras, index, rows, reference, scene, points, true, turn @ up)
+        return cls(result, extras, index, rows, reference, scene, true, turn @ up)
 
 
 def _row_indices(result: Reconstruction) -> Float64:
