@@ -96,8 +96,8 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
     given = parser.parse_args()
     print(
-        "| Folder | in the main component | ATE rms, mm | wrong | of these unmarked | loops"
-        " | verdict | s |\n|---|---|---|---|---|---|---|---|"
+        "| Folder | in the main component | ATE rms, mm | wrong "
+        "| wrong and not marked uncertain | loops | verdict | s |\n|---|---|---|---|---|---|---|---|"
     )
     for name in given.cases:
         title, made = CASES[name]

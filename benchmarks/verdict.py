@@ -246,8 +246,8 @@ def line(run: Run) -> str:
 def table(runs: Sequence[Run]) -> Iterator[str]:
     """Yield the table by family."""
     yield (
-        "| family | runs | error within bound | bounded | median bound / error | right, good"
-        " | wrong, good |"
+        "| family | runs | error within bound | bounded | median bound / error "
+        "| good, of the right runs | good, of the wrong runs |"
     )
     yield "|---|---|---|---|---|---|---|"
     families = [*dict.fromkeys(run.family for run in runs)]
@@ -271,7 +271,7 @@ def named(runs: Sequence[Run]) -> Iterator[str]:
 
     Only runs count whose recording is right and good without the fault, if that was run.
     """
-    yield "| fault | runs | right and good | of the others, named |"
+    yield "| fault | runs | right and good | fault reported, of the other runs |"
     yield "|---|---|---|---|"
     fine = {run.name: run.right and run.verdict == "good" for run in runs}
     for cause, codes in CAUSES.items():
