@@ -97,7 +97,8 @@ def main() -> None:
     given = parser.parse_args()
     print(
         "| Folder | in the main component | ATE rms, mm | wrong "
-        "| wrong and not marked uncertain | loops | verdict | s |\n|---|---|---|---|---|---|---|---|"
+        "| wrong and not marked uncertain | loops | verdict | s |\n"
+        "|---|---|---|---|---|---|---|---|"
     )
     for name in given.cases:
         title, made = CASES[name]
