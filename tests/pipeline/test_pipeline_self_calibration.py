@@ -174,9 +174,8 @@ def test_bound_without_loop_includes_focal_length_error(recording) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", [0.99, 1.01, 1.02])
-def test_bound_includes_focal_length_error_of_a_percent(wrong) -> None:
+@pytest.mark.parametrize("wrong", [0.99, 1.003, 1.01, 1.02])
+def test_bound_includes_focal_length_error(wrong) -> None:
     """In a sweep to both sides and back, which closes loops without a full turn."""
     camera = Pinhole(100, 100, 50.0, 50.0, 49.5, 49.5)
     s = 2 * np.pi * np.arange(60) / 59
@@ -192,7 +191,7 @@ def test_bound_includes_focal_length_error_of_a_percent(wrong) -> None:
     if wrong == 1.02:
         assert error < 0.004
         assert result.diagnostics.calibrated is not None
-    else:
+    elif wrong != 1.003:
         assert "unchecked_calibration" in [r.code for r in result.diagnostics.reasons]
 
 

@@ -55,6 +55,8 @@ def test_correct_camera_raises_no_alarm():
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert not found.alarm
     assert found.gap is None
+    # What the views estimate still counts: less than the uncertainty of the estimate.
+    assert 0 < found.moved[0] < 3 * found.focal_sigma * found.motion["focal"][0]
 
 
 def test_focal_length_without_rotation_is_undetermined():
@@ -71,6 +73,18 @@ def test_focal_length_without_rotation_is_undetermined():
 
     assert sigma(views, truth) > 0.1
     assert sigma(turned, path(12)) < 0.02
+
+
+def test_single_step_estimates_whole_error() -> None:
+    """Although it weights residuals robustly; reweighted least squares finds 0.7 of it."""
+
+    def step(offset: float) -> float:
+        views, refined = kept(offset)
+        return float(
+            response(views, refined.poses, refined.pairs, OPTIONS).estimate()[kernels.OFFSET]
+        )
+
+    assert step(0.02) - step(0.005) == pytest.approx(0.015, rel=0.2)
 
 
 def test_focal_length_error_scales_sideways_motion() -> None:

@@ -187,15 +187,15 @@ class Assessment:
     def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
         """Return how far (m, rad) the poses may be off by the calibration (95 %).
 
-        That is the gap of a loop that a better calibration would close, or the motion by one with
-        which views agree better, unless a loop contradicts; and the uncertainty of a correction.
+        That is the gap of a loop that a better calibration would close, or the motion by the one
+        that the views estimate, unless a loop contradicts; and the uncertainty of a correction.
         """
         if check is None:
             return 0.0, 0.0
         errors = [np.zeros(2)]
         if check.alarm and check.gap is not None:
             errors.append(np.array(check.gap.before))
-        elif check.unconfirmed:
+        elif not check.contradicted:
             errors.append(np.array(check.moved))
         for part in self.config.corrections:
             if isinstance(part, CameraErrors):

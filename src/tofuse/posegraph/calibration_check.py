@@ -38,7 +38,7 @@ from tofuse.posegraph.view_store import SampledView
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
 TOLERANCES = {"focal": 0.01, "offset": 0.01}
 # Significance of an error in standard deviations, for an alarm and for a closer look; and the
-# fraction of the tolerance that one Gauss-Newton step, which falls short, must show for the latter.
+# fraction of the tolerance that one Newton step must show for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
 # A loop is closed if its error is below this, m and rad.
 _CLOSED = (0.01, np.radians(0.5))
@@ -145,7 +145,8 @@ class CalibrationCheck:
     motion
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
-        Rms motion (m, rad) of the poses, after alignment, if `best` is corrected.
+        Rms motion (m, rad) of the poses, after alignment, if the estimated error is corrected: that
+        of `best`, else the error with the larger effect of those that the views determine.
     """
 
     alarm: bool = False
@@ -164,13 +165,18 @@ class CalibrationCheck:
         return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
 
     @property
+    def contradicted(self) -> bool:
+        """Whether a loop shows that the estimated errors are not those of the camera."""
+        return not self.alarm and self.gap is not None and self.gap.contradicts
+
+    @property
     def unconfirmed(self) -> dict[str, float]:
         """Significant errors without an alarm that may be true.
 
         Either one of them is large, and no loop confirms or contradicts it, or the views agree
         better with the smaller ones.
         """
-        if self.alarm or (self.gap is not None and self.gap.contradicts):
+        if self.alarm or self.contradicted:
             return {}
         if not self.large and not self.improves:
             return {}
@@ -214,9 +220,12 @@ def check_calibration(
     sensitivity = response(views, poses, pairs, options, priors=priors)
     estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
     determined = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
+    motion = {name: _motion(poses, sensitivity.motion[k]) for name, k in _NUMBERS.items()}
+    small = [np.array(motion[n]) * abs(float(estimate[_NUMBERS[n]])) for n in determined]
     without_error = CalibrationCheck(
         focal_sigma=float(sigma[kernels.FOCAL]),
-        motion={name: _motion(poses, sensitivity.motion[k]) for name, k in _NUMBERS.items()},
+        motion=motion,
+        moved=tuple(max(small, key=lambda m: m[0], default=np.zeros(2)).tolist()),
     )
     likely = [
         name

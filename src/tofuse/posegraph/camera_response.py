@@ -28,8 +28,8 @@ class Response:
     Attributes
     ----------
     gradient, information
-        (M, ERRORS) of each pair i < j, both directions together: first derivative of half its
-        squared residuals at zero error, and half the second.
+        (M, ERRORS) of each pair i < j, both directions together: first and second derivative of its
+        robust cost (Tukey's biweight) at zero error.
     motion
         (ERRORS, N, 6) twist by which each pose follows, per unit of the error.
     """
@@ -39,7 +39,7 @@ class Response:
     motion: Float64
 
     def estimate(self) -> Float64:
-        """(ERRORS,) least-squares estimate of each error alone, by one Gauss-Newton step."""
+        """(ERRORS,) estimate of each error alone, by one Newton step."""
         return np.asarray(
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
@@ -63,6 +63,22 @@ class Response:
             np.add.at(of_view, ends, left)
         spread = np.sqrt((of_view**2).sum(0))
         return np.asarray(spread / np.maximum(self.information.sum(0), 1e-12), np.float64)
+
+
+def _robust_curvature(limit: float) -> float:
+    """Second derivative of the biweight over its weight, both expected for normal residuals.
+
+    Reweighted least squares holds the weights constant, and their curvature exceeds that of the
+    cost. A single step with it falls short, and a sandwich estimate by it is too small (Huber 1981,
+    Robust Statistics, section 3.2: the mean of psi').
+
+    Parameters
+    ----------
+    limit
+        Residual with zero weight, in standard deviations; the tails beyond are neglected.
+    """
+    square = 1 / limit**2
+    return (1 - 6 * square + 15 * square**2) / (1 - 2 * square + 3 * square**2)
 
 
 def response(
@@ -130,5 +146,6 @@ def response(
         first[:, k] = g[:, 6 + k] + (mixed * rest).sum(1) + (slope * follow).sum(1)
         second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * follow).sum(1)
         second[:, k] += np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
+    second *= _robust_curvature(options.robust)
     half = len(pairs)
     return Response(first[:half] + first[half:], second[:half] + second[half:], motion)
