@@ -28,11 +28,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from leaders import Board, Score
-from leaders.graphs import Graphs
-from leaders.sequences_board import Sequences
-from leaders.statements import statements
-from leaders.two_views import TwoViews
+from boards import Board, Score
+from boards.graphs import Graphs
+from boards.sequences_board import Sequences
+from boards.statements import statements
+from boards.two_views import TwoViews
 from sequences import DATA, OUT
 from tofuse.files.atomic import write_text
 from tofuse.kernels.threads import threads

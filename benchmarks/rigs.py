@@ -38,7 +38,7 @@ from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wan
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
-from tofuse.rigs.calibrate import calibrate, calibrate_cameras, loosest
+from tofuse.rigs.calibrate import calibrate, calibrate_cameras, largest_sigmas
 from tofuse.rigs.check import compare
 from tofuse.rigs.hand_eye import Track, hand_eye
 from tofuse.rigs.inputs import Camera, open_cameras
@@ -290,7 +290,7 @@ def real() -> None:
     for camera, T in zip(rig.cameras[1:], reference[1:], strict=True):
         e = se3.log(se3.inverse(camera.T_rig_camera) @ T)
         C, R = camera.covariance, camera.random_covariance
-        metres, radians = loosest(camera)
+        metres, radians = largest_sigmas(camera)
         print(
             f"{camera.name:<16}{1e3 * np.linalg.norm(e[:3]):7.1f}"
             f"{np.degrees(np.linalg.norm(e[3:])):7.2f}{1e3 * metres:7.1f}{np.degrees(radians):7.2f}"

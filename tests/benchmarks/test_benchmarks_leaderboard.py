@@ -86,7 +86,7 @@ def test_failed_case_is_reported_and_not_stored(board, monkeypatch, tmp_path, ca
 
 
 def test_initial_guess_errors_match_column(board):
-    from leaders import two_views
+    from boards import two_views
 
     rng = np.random.default_rng(0)
     middle = np.array([0.1, -0.2, 2.0])
@@ -98,7 +98,7 @@ def test_initial_guess_errors_match_column(board):
 
 
 def test_statements_compare_rates_and_errors(board):
-    from leaders.statements import statements
+    from boards.statements import statements
 
     def row(right, off):
         return {"start2": [{"right": right, "off": off, "seconds": 0.1}] * 4}

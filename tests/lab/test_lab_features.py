@@ -26,7 +26,7 @@ from tofuse.registration.sample_consensus import (
 from tofuse.registration.surface_options import SurfaceOptions
 
 CAMERA = Pinhole(176, 132, 200.0, 200.0, 87.5, 65.5)
-WAYS = ("samples", "compatible")
+METHODS = ("samples", "compatible")
 
 
 def poster(T_world_camera, *, seed=0, noise=0.004, plain=False):
@@ -90,14 +90,14 @@ def made_pairs(right, wrong, *, seed=0, sigma=0.01, spread=1.0):
 # Consensus
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("right", "wrong"), [(60, 0), (40, 60), (30, 120)])
-def test_inliers_are_separated_from_outliers(way, right, wrong):
+def test_inliers_are_separated_from_outliers(method, right, wrong):
     for seed in range(3):
         pairs, T = made_pairs(right, wrong, seed=seed)
         missed = np.linalg.norm(se3.transform(T, pairs.source) - pairs.target, axis=1)
         most = np.count_nonzero(missed < 0.03)  # three standard deviations
-        found = consensus(pairs, ConsensusOptions(way), np.random.default_rng(seed))
+        found = consensus(pairs, ConsensusOptions(method), np.random.default_rng(seed))
         shift, turn = off(found[0].T_target_source, T)
         assert shift < 0.03
         assert turn < 0.6
@@ -114,14 +114,14 @@ def test_compatible_pairs_are_found_among_many_outliers():
     assert np.count_nonzero(found.inliers[:20]) >= 18
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_pairs_are_weighted_by_their_noise(way):
+@pytest.mark.parametrize("method", METHODS)
+def test_pairs_are_weighted_by_their_noise(method):
     """Half of the points are much noisier: they are inliers too, but have little weight."""
     sigma = np.where(np.arange(80) % 2, 0.003, 0.05)
     errors = []
     for seed in range(5):
         pairs, T = made_pairs(80, 0, seed=seed, sigma=sigma)
-        found = consensus(pairs, ConsensusOptions(way), np.random.default_rng(0))[0]
+        found = consensus(pairs, ConsensusOptions(method), np.random.default_rng(0))[0]
         assert found.inliers.mean() > 0.85
         assert found.inliers[sigma > 0.01].mean() > 0.8
         weighted = se3.transform(se3.inverse(T) @ found.T_target_source, pairs.source)
@@ -169,11 +169,11 @@ def test_collinear_points_leave_rotation_about_line_unconstrained():
     assert abs(loose @ expected) / np.linalg.norm(expected) > 0.999
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_inconsistent_pairs_are_rejected(way):
+@pytest.mark.parametrize("method", METHODS)
+def test_inconsistent_pairs_are_rejected(method):
     pairs, _ = made_pairs(0, 40)
     with pytest.raises(RegistrationError, match="of 40 pairs of points not even 10 agree"):
-        consensus(pairs, ConsensusOptions(way, inliers=10), np.random.default_rng(0))
+        consensus(pairs, ConsensusOptions(method, inliers=10), np.random.default_rng(0))
 
 
 def test_same_seed_gives_same_result():
@@ -276,7 +276,7 @@ def test_clouds_are_rejected(images):
         (Features, {"channel": "infrared"}),
         (Features, {"ratio": 0.0}),
         (Features, {"count": 2}),
-        (ConsensusOptions, {"way": "chance"}),
+        (ConsensusOptions, {"method": "chance"}),
         (ConsensusOptions, {"inliers": 2}),
         (ConsensusOptions, {"confidence": 1.0}),
     ],

@@ -15,7 +15,7 @@ from tofuse.lab.methods.bergevin import Bergevin
 from tofuse.lab.methods.multiview import Cloud, Pairs, relaxed
 from tofuse.lab.methods.pulli import Pulli, spread
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
-from tofuse.posegraph.refinement import Refining
+from tofuse.posegraph.refinement import RefinementMethod
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.prepared_view import PreparedView
 
@@ -123,7 +123,7 @@ def test_views_without_overlap_are_unchanged(method):
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_methods_are_registered_as_refinements(method):
     assert parts.known("refinement")[parts.name_of(method)] is type(method)
-    assert parts.from_dict(Refining, parts.to_dict(method), where="test") == method
+    assert parts.from_dict(RefinementMethod, parts.to_dict(method), where="test") == method
 
 
 def test_bergevin_is_independent_of_view_order():

@@ -26,7 +26,7 @@ class Spaced(Revisits):
     most: int = 200
 
     def start(self, seed, given, views, search=None):
-        spacing = Spacing(angle=1e-6, distance=1e-6, most=self.most, loosest=1)
+        spacing = Spacing(angle=1e-6, distance=1e-6, most=self.most, max_stretch=1)
         return super().start(seed, given, views, search, spacing=spacing)
 
 

@@ -10,7 +10,7 @@ import pytest
 from tofuse.pipeline.assessment import on_a_single_link
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import LoopRecord
-from tofuse.posegraph.islands import Join
+from tofuse.posegraph.merged_components import Join
 from tofuse.registration.base import Link, Registration
 
 FOUND = Registration(np.eye(4), True, 5, 100, 100, 0.1, 0.01, np.eye(6))

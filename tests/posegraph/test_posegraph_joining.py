@@ -13,9 +13,9 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
 from tofuse.posegraph.gaps import TrackedComponent
-from tofuse.posegraph.islands import Islands
 from tofuse.posegraph.join_checks import JoinChecks
 from tofuse.posegraph.joining import Joining
+from tofuse.posegraph.merged_components import MergedComponents
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.search import SearchOptions
@@ -272,9 +272,9 @@ def test_join_by_single_link_is_reconsidered() -> None:
 
 def test_short_gap_does_not_support_distant_pose(three) -> None:
     """A single link is used at once if it implies no motion; but not if it implies motion."""
-    islands = Islands(three[:2])
-    checks = JoinChecks(islands)
-    a, b = islands.all
+    merged = MergedComponents(three[:2])
+    checks = JoinChecks(merged)
+    a, b = merged.all
     right = se3.inverse(PATH[0]) @ PATH[12]
     assert checks.is_near(a, b, right, IN_SIGHT)
     assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), IN_SIGHT)
@@ -418,9 +418,9 @@ def test_failed_tries_lower_probability(three, monkeypatch) -> None:
     right = probable(a[-1], b[0], 0.96)
     joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2], SearchOptions())
     joiner.add(right)
-    assert joiner._probability(*joiner._islands.all, [right]) == pytest.approx(0.96)
+    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(0.96)
     joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
-    assert joiner._probability(*joiner._islands.all, [right]) == pytest.approx(24 / 28)
+    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(24 / 28)
     joiner.decide(single=True)
     assert len(joiner.groups()) == 2
 

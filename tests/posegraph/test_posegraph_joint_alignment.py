@@ -194,7 +194,7 @@ def test_view_that_loses_support_stays_with_neighbours():
 
 def test_view_store_is_bounded():
     view = surfaces(path(1))[0]
-    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10, loosest=1e6))
+    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10, max_stretch=1e6))
     for k in range(400):
         store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
         assert len(store.views) <= 10

@@ -187,7 +187,7 @@ def test_less_information_never_reduces_sigma(information):
     found = Patches(H, np.zeros((7, 7)), np.diag(diagonal), np.diag(diagonal), *nothing, 0, 2.0, 2)
     options = UncertaintyOptions(noise_pixels=1.0)
     sigma = _sigmas(covariance_of_patches(found, options))
-    assert 0.9 * options.loosest < sigma[2] < 1.1 * options.loosest
+    assert 0.9 * options.max_sigma < sigma[2] < 1.1 * options.max_sigma
     np.testing.assert_allclose(sigma[[0, 1, 3, 4, 5]], 0.1, rtol=1e-3)
 
 

@@ -11,8 +11,8 @@ from rich.table import Table
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
 from tofuse.results.run_json import plain
-from tofuse.rigs.calibrate import Calibration, loosest
-from tofuse.rigs.check import Moved
+from tofuse.rigs.calibrate import Calibration, largest_sigmas
+from tofuse.rigs.check import CameraMotion
 
 
 def tables(rig: Rig) -> list[Table]:
@@ -24,7 +24,7 @@ def tables(rig: Rig) -> list[Table]:
         where.add_column(title, justify="right", no_wrap=True)
     for camera in rig.cameras:
         T = camera.T_rig_camera
-        metres, radians = loosest(camera)
+        metres, radians = largest_sigmas(camera)
         values = (
             f"{np.degrees(float(se3.angle(T))):.2f}",
             f"{1000 * metres:.2g}",
@@ -55,13 +55,13 @@ def exit_status(found: Calibration) -> int:
     return 3 if found.rig.unplaced else 0
 
 
-def check_lines(cameras: Sequence[Moved]) -> list[str]:
+def check_lines(cameras: Sequence[CameraMotion]) -> list[str]:
     """Return one line for each camera."""
     width = max(len(camera.name) for camera in cameras)
     return [f"{camera.name:<{width}}  {_outcome(camera)}" for camera in cameras]
 
 
-def _outcome(camera: Moved) -> str:
+def _outcome(camera: CameraMotion) -> str:
     if camera.reason:
         return f"not checked: {camera.reason}"
     by = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
@@ -76,7 +76,7 @@ def _outcome(camera: Moved) -> str:
     return f"unchanged, within {by} ({sigma})"
 
 
-def check_json(cameras: Sequence[Moved]) -> dict[str, Any]:
+def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:
     """Return the check as plain data."""
     rows = [
         {
@@ -97,6 +97,6 @@ def check_json(cameras: Sequence[Moved]) -> dict[str, Any]:
     return data
 
 
-def check_status(cameras: Sequence[Moved]) -> int:
+def check_status(cameras: Sequence[CameraMotion]) -> int:
     """Return 3 if some camera has moved or could not be checked, else 0."""
     return 3 if any(camera.moved or camera.reason for camera in cameras) else 0

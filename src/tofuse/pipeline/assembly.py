@@ -18,9 +18,9 @@ from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.islands import Join
 from tofuse.posegraph.joining import Group
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.merged_components import Join
 from tofuse.results.types import Reconstruction
 
 

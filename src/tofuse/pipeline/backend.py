@@ -20,8 +20,8 @@ from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
-from tofuse.posegraph.islands import Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.merged_components import Join
 from tofuse.posegraph.neighbour_check import worse_neighbours
 from tofuse.results.types import Component, Diagnostics, Reconstruction
 

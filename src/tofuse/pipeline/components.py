@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
-from tofuse.posegraph.islands import How, Join
 from tofuse.posegraph.joining import Group
+from tofuse.posegraph.merged_components import How, Join
 from tofuse.results.ranges import runs
 from tofuse.results.types import Component, Reconstruction
 

@@ -20,7 +20,7 @@ from tofuse.posegraph.external_sensors import ExternalSensor
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.loops import LoopDetector
-from tofuse.posegraph.refinement import NoRefinement, Refining
+from tofuse.posegraph.refinement import NoRefinement, RefinementMethod
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.search import SearchOptions
 from tofuse.results.run_json import read_run_json
@@ -76,7 +76,7 @@ class Config(Bounded):
     loops: LoopDetector
     optimiser: Optimiser
     fusion: Fusion
-    refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
+    refinement: RefinementMethod = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
     priors: tuple[ExternalSensor, ...] = ()

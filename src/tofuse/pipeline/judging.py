@@ -166,7 +166,7 @@ def judge(
     check_views(given, kind)
     compared_images = _Images(recording)
 
-    def made(led: Recording, by: Config) -> tuple[Reconstruction, Views, Seen]:
+    def made(led: Recording, by: Config) -> tuple[Reconstruction, Views, ViewSupport]:
         result, views = with_views(led, by, threads=threads, progress=progress)
         return result, views, compared_images.under(result.trajectory)
 
@@ -199,7 +199,7 @@ def judge(
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ViewSupport:
     """Cross-view consistency of overlapping images under given poses."""
 
     cross_view: CrossViewConsistency
@@ -228,12 +228,12 @@ class _Images:
         self._recording = recording
         self._views: dict[int, PreparedView | None] = {}
 
-    def under(self, poses: Float64) -> Seen:
+    def under(self, poses: Float64) -> ViewSupport:
         """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
         rows = evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
         found = [(k, view) for k in rows if (view := self._view(k)) is not None]
         chosen = [k for k, _ in found]
-        return Seen(compare_views([view for _, view in found], poses[chosen]))
+        return ViewSupport(compare_views([view for _, view in found], poses[chosen]))
 
     def _view(self, k: int) -> PreparedView | None:
         """Return the k-th frame as a prepared view; None if it can't be read."""
@@ -449,8 +449,8 @@ def _reasons(
     poses: Float64,
     accuracy: Accuracy,
     deviation: Deviation | None,
-    seen: Seen,
-    after: Seen,
+    seen: ViewSupport,
+    after: ViewSupport,
     refined: Reconstruction,
     tolerance_m: float | None,
 ) -> Iterator[Reason]:

@@ -14,8 +14,8 @@ from tofuse.pipeline.frame_log import Entry
 from tofuse.posegraph.accuracy import degenerate_directions, without_degenerate
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.islands import Join
 from tofuse.posegraph.loops import ClosedLoop
+from tofuse.posegraph.merged_components import Join
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.view_store import ViewStore
 from tofuse.registration.prepared_view import PreparedView

@@ -1,4 +1,4 @@
-"""Verification of joins: whether views, drift and elapsed time permit the pose of two islands."""
+"""Verification of joins: whether views, drift and elapsed time permit the relative pose."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tofuse.posegraph.gaps import (
     largest_motion,
     motion_over,
 )
-from tofuse.posegraph.islands import DRIFT, Island, Islands, transformed
+from tofuse.posegraph.merged_components import DRIFT, MergedComponent, MergedComponents, transformed
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.pose_probability import CONTRADICTION
@@ -49,8 +49,8 @@ class JoinChecks:
 
     Parameters
     ----------
-    islands
-        The islands.
+    merged
+        The merged components.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class JoinChecks:
         (2,) m/s and rad/s that the camera hardly exceeds; inf where unknown.
     """
 
-    def __init__(self, islands: Islands) -> None:
-        self._islands = islands
+    def __init__(self, merged: MergedComponents) -> None:
+        self._merged = merged
         self.usual = FitStatistics()
         self._contradiction = CONTRADICTION
-        stretches = list(islands.stretches.values())
+        stretches = list(merged.stretches.values())
         known = np.concatenate([end_speeds(s, end=True) for s in stretches])
         # Motions at which tracking failed may have been faster than all others.
         unknown = np.full((_tracking_failures(stretches), 2), np.inf)
@@ -77,7 +77,7 @@ class JoinChecks:
     def _learn_from_neighbours(self) -> None:
         """Learn the usual fit and contradiction from neighbouring views of one component."""
         pairs = [
-            (a, b) for s in self._islands.stretches.values() for a, b in itertools.pairwise(s.views)
+            (a, b) for s in self._merged.stretches.values() for a, b in itertools.pairwise(s.views)
         ]
         some = np.linspace(0, len(pairs) - 1, min(len(pairs), _LEARN)).round().astype(int)
         options = ProjectiveOptions(levels=PATIENT)
@@ -97,25 +97,21 @@ class JoinChecks:
             self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _overlapping(
-        self, a: Island, b: Island, T_a_b: Float64
+        self, a: MergedComponent, b: MergedComponent, T_a_b: Float64
     ) -> list[tuple[View, View, Float64, Agreement]]:
         """View pairs of both sides that overlap most under T_a_b: T_i_j, and their agreement."""
         compare = self_scaled(self.usual)
         ours = [
-            self._islands.views[i]
-            for i in self._islands.views
-            if self._islands.component_of[i] in a.T
+            self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in a.T
         ]
         theirs = [
-            self._islands.views[i]
-            for i in self._islands.views
-            if self._islands.component_of[i] in b.T
+            self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in b.T
         ]
         near: list[tuple[float, int, int]] = []
         if not ours or not theirs:
             return []
-        Ta = np.stack([self._islands.T_island(a, v.index) for v in ours])
-        Tb = np.stack([T_a_b @ self._islands.T_island(b, v.index) for v in theirs])
+        Ta = np.stack([self._merged.T_merged(a, v.index) for v in ours])
+        Tb = np.stack([T_a_b @ self._merged.T_merged(b, v.index) for v in theirs])
         for p, v in enumerate(ours):
             between = se3.inverse(Ta[p]) @ Tb
             apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.depth
@@ -131,17 +127,17 @@ class JoinChecks:
                 break
         return found
 
-    def contradicts(self, a: Island, b: Island, link: Link) -> bool:
+    def contradicts(self, a: MergedComponent, b: MergedComponent, link: Link) -> bool:
         """Return whether views of both sides contradict each other more than neighbours do.
 
-        Islands have drifted, the more the longer the path from the link. A contradiction at the
+        Components have drifted, the more the longer the path from the link. A contradiction at the
         implied pose counts only if no pose within the drift removes it, and is ignored where the
         drift may exceed the range of convergence of an alignment.
         """
         overlap = against = 0.0
-        T_a_b = self._islands.T_a_b(a, b, link)
-        i, j = self._islands.ends(a, link)
-        from_i, from_j = self._islands.path(a, i), self._islands.path(b, j)
+        T_a_b = self._merged.T_a_b(a, b, link)
+        i, j = self._merged.ends(a, link)
+        from_i, from_j = self._merged.path(a, i), self._merged.path(b, j)
         for first, second, T, at_implied in self._overlapping(a, b, T_a_b):
             drift = DRIFT * (from_i[first.index] + from_j[second.index])
             if drift > CONVERGENCE:
@@ -164,7 +160,7 @@ class JoinChecks:
             limit = max(limit, _SAME_PLACE)
         return overlap > 0 and against / overlap > limit
 
-    def is_near(self, a: Island, b: Island, T_a_b: Float64, far: float) -> bool:
+    def is_near(self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, far: float) -> bool:
         """Return whether the camera had no time to move far between both sides, and T_a_b agrees.
 
         `far` is a fraction of the depth, and rad. A pose further away than the camera can have
@@ -173,7 +169,7 @@ class JoinChecks:
         T = {**a.T, **transformed(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
-                before, after = self._islands.in_time(c, d)
+                before, after = self._merged.in_time(c, d)
                 elapsed = float(after.times[0] - before.times[-1])
                 if before.recording != after.recording or elapsed < 0:
                     continue
@@ -192,7 +188,7 @@ class JoinChecks:
         return bool(np.linalg.norm(between[:3, 3]) <= limit * depth and se3.angle(between) <= limit)
 
     def confirming(
-        self, a: Island, b: Island, T_a_b: Float64, known: list[Link], count: int
+        self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, known: list[Link], count: int
     ) -> list[Link]:
         """Return registrations of other view pairs, `count` at most, that agree with T_a_b."""
         seen = {frozenset((link.i, link.j)) for link in known}
@@ -209,12 +205,12 @@ class JoinChecks:
                 found.append(replace(link, certain=False))
         return found
 
-    def reachable(self, a: Island, b: Island, T_a_b: Float64) -> bool:
+    def reachable(self, a: MergedComponent, b: MergedComponent, T_a_b: Float64) -> bool:
         """Return whether the camera had the time to move from one side to the other."""
         T = {**a.T, **transformed(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
-                first, second = self._islands.in_time(c, d)
+                first, second = self._merged.in_time(c, d)
                 if first.recording != second.recording:
                     continue
                 between = motion_over(first, second, T)

@@ -24,8 +24,8 @@ from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.gaps import TrackedComponent, View, extrapolated, odometry_over
-from tofuse.posegraph.islands import How, Island, Islands, Join
 from tofuse.posegraph.join_checks import VERIFY, JoinChecks, link_of
+from tofuse.posegraph.merged_components import How, Join, MergedComponent, MergedComponents
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.registration.base import Link
 from tofuse.registration.pose_probability import logistic
@@ -144,8 +144,8 @@ class _Joiner:
         self, options: Joining, stretches: Sequence[TrackedComponent], search: SearchOptions
     ) -> None:
         self._options, self._search = options, search
-        self._islands = Islands(stretches)
-        self._checks = JoinChecks(self._islands)
+        self._merged = MergedComponents(stretches)
+        self._checks = JoinChecks(self._merged)
         self._links: list[Link] = []
         self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
@@ -155,13 +155,13 @@ class _Joiner:
 
     def add(self, link: Link) -> None:
         """Add a link."""
-        if {link.i, link.j} <= self._islands.component_of.keys():
+        if {link.i, link.j} <= self._merged.component_of.keys():
             self._links.append(link)
             self._tried.add((link.i, link.j))
-            self._islands.remember_ends(link)
+            self._merged.remember_ends(link)
 
     def decide(self, *, single: bool = False) -> None:
-        """Join islands as long as links support it, those with the largest weight first.
+        """Join merged components as long as links support it, those with the largest weight first.
 
         A single link is considered only at the end (`single`), unless the gap is too
         short to reach another place: another room may look the same, and only links elsewhere
@@ -170,12 +170,12 @@ class _Joiner:
         while True:
             proposals = []
             for (a, b), links in self._links_between().items():
-                found = self._proposal(self._islands.all[a], self._islands.all[b], links)
+                found = self._proposal(self._merged.all[a], self._merged.all[b], links)
                 if found is not None:
                     weight, chosen = found
                     proposals.append((-weight, a, b, chosen))
             for _, a, b, chosen in sorted(proposals, key=lambda p: p[:3]):
-                first, second = self._islands.all[a], self._islands.all[b]
+                first, second = self._merged.all[a], self._merged.all[b]
                 if len(chosen) < 2 and not (single or self._need_not_wait(first, second, chosen)):
                     continue
                 if self._join(first, second, chosen):
@@ -183,9 +183,9 @@ class _Joiner:
             else:
                 return
 
-    def _need_not_wait(self, a: Island, b: Island, links: list[Link]) -> bool:
-        """Whether a single link may join two islands before all searches are done."""
-        T_a_b = self._islands.T_a_b(a, b, _best(links))
+    def _need_not_wait(self, a: MergedComponent, b: MergedComponent, links: list[Link]) -> bool:
+        """Whether a single link may join two merged components before all searches are done."""
+        T_a_b = self._merged.T_a_b(a, b, _best(links))
         if np.isfinite(self._checks.speed).all():
             return self._checks.is_near(a, b, T_a_b, IN_SIGHT)
         # Unordered views are joined one by one, so that the next is compared with more of them.
@@ -193,21 +193,21 @@ class _Joiner:
         return any(link.certain for link in links) or bool(self._confirming(a, b, T_a_b, links))
 
     def _links_between(self) -> dict[tuple[int, int], list[Link]]:
-        """Links by the positions (a, b), a < b, of the islands that they connect."""
-        place = {c: k for k, island in enumerate(self._islands.all) for c in island.T}
+        """Links by the positions (a, b), a < b, of the merged components that they connect."""
+        place = {c: k for k, merged in enumerate(self._merged.all) for c in merged.T}
         found: dict[tuple[int, int], list[Link]] = {}
         for link in self._links:
-            a, b = sorted(place[self._islands.component_of[f]] for f in (link.i, link.j))
+            a, b = sorted(place[self._merged.component_of[f]] for f in (link.i, link.j))
             if a != b:
                 found.setdefault((a, b), []).append(link)
         return found
 
     def search_links(self) -> None:
-        """Register views of different islands, most similar first, within the budget."""
-        views = sorted(self._islands.views.values(), key=lambda v: v.index)
-        if len(self._islands.all) < 2 or len(views) < 2:
+        """Register views of different merged components, most similar first, within the budget."""
+        views = sorted(self._merged.views.values(), key=lambda v: v.index)
+        if len(self._merged.all) < 2 or len(views) < 2:
             return
-        component = np.array([self._islands.component_of[v.index] for v in views])
+        component = np.array([self._merged.component_of[v.index] for v in views])
         descriptors = np.stack([view_descriptor(v.view) for v in views])
         if len(descriptors) <= _ALL:
             i, j = np.nonzero(np.triu(component[:, None] != component))
@@ -220,11 +220,11 @@ class _Joiner:
         order = np.lexsort((j, i, far))
         between: dict[tuple[int, int], int] = {}
         for k in order.tolist():
-            if self._searches < 1 or len(self._islands.all) < 2:
+            if self._searches < 1 or len(self._merged.all) < 2:
                 return
             first, second = views[i[k]], views[j[k]]
             pair = first.index, second.index
-            if pair in self._tried or self._islands.is_joined(first, second):
+            if pair in self._tried or self._merged.is_joined(first, second):
                 continue
             ends = (int(component[i[k]]), int(component[j[k]]))
             between[ends] = between.get(ends, 0) + 1
@@ -243,12 +243,12 @@ class _Joiner:
         views could be compared.
         """
         weak = [
-            island.joins[k]
-            for island in self._islands.all
-            for k in cut_edges([self._islands.components(join) for join in island.joins])
+            merged.joins[k]
+            for merged in self._merged.all
+            for k in cut_edges([self._merged.components(join) for join in merged.joins])
         ]
         for join in weak:
-            self._islands.cut(join)
+            self._merged.cut(join)
         if weak:
             self._proposals.clear()
             self._refused.clear()
@@ -256,11 +256,11 @@ class _Joiner:
 
     def bridge_gaps(self) -> None:
         """Connect components across gaps by odometry, or by the motion before and after."""
-        ordered = sorted(self._islands.stretches.values(), key=lambda s: int(s.frames[0]))
+        ordered = sorted(self._merged.stretches.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
             a, b = (
-                self._islands.island_of(before.component),
-                self._islands.island_of(after.component),
+                self._merged.of_component(before.component),
+                self._merged.of_component(after.component),
             )
             if a is b or before.recording != after.recording:
                 continue
@@ -270,22 +270,22 @@ class _Joiner:
             ]
             for link, how in bridges:
                 if link is not None and not self._checks.contradicts(a, b, link):
-                    self._islands.merge(a, b, link, [Join(link, how, True)])
+                    self._merged.merge(a, b, link, [Join(link, how, True)])
                     break
 
     def groups(self) -> list[Group]:
         """Return the joined groups, the main one first, then by decreasing size."""
-        stretches, found = self._islands.stretches, []
-        for island in self._islands.all:
-            order = sorted(island.T, key=lambda c: int(stretches[c].frames[0]))
+        stretches, found = self._merged.stretches, []
+        for merged in self._merged.all:
+            order = sorted(merged.T, key=lambda c: int(stretches[c].frames[0]))
             first = order[0]
-            to_first = se3.inverse(island.T[first])
+            to_first = se3.inverse(merged.T[first])
             found.append(
                 Group(
-                    {c: to_first @ island.T[c] for c in order},
-                    tuple(island.joins),
-                    sum(len(stretches[c].frames) for c in island.T),
-                    self._islands.bridged_from(island, first),
+                    {c: to_first @ merged.T[c] for c in order},
+                    tuple(merged.joins),
+                    sum(len(stretches[c].frames) for c in merged.T),
+                    self._merged.bridged_from(merged, first),
                 )
             )
         began = [int(stretches[next(iter(g.T_group_component))].frames[0]) for g in found]
@@ -308,20 +308,20 @@ class _Joiner:
         return link_of(first, second, found)
 
     def _proposal(
-        self, a: Island, b: Island, between: list[Link]
+        self, a: MergedComponent, b: MergedComponent, between: list[Link]
     ) -> tuple[float, list[Link]] | None:
-        """The consistent links between two islands, and their weight; None if there are none."""
+        """The consistent links between merged components, and their weight; None without one."""
         key = _key(a, b, between)
         if key in self._refused:
             return None
         if key in self._proposals:
             return self._proposals[key]
-        T = [self._islands.T_a_b(a, b, link) for link in between]
+        T = [self._merged.T_a_b(a, b, link) for link in between]
         n = len(between)
         agree = np.ones((n, n), bool)
         for p in range(n):
             for q in range(p + 1, n):
-                agree[p, q] = agree[q, p] = self._islands.consistent(
+                agree[p, q] = agree[q, p] = self._merged.consistent(
                     a, b, between[p], between[q], T[p], T[q]
                 )
         weights = [_weight(link) for link in between]
@@ -335,10 +335,10 @@ class _Joiner:
         self._proposals[key] = weight, [between[k] for k in chosen]
         return self._proposals[key]
 
-    def _join(self, a: Island, b: Island, links: list[Link]) -> bool:
-        """Join two islands if the pose of the links is verified."""
+    def _join(self, a: MergedComponent, b: MergedComponent, links: list[Link]) -> bool:
+        """Join two merged components if the pose of the links is verified."""
         best = _best(links)
-        T_a_b = self._islands.T_a_b(a, b, best)
+        T_a_b = self._merged.T_a_b(a, b, best)
         extra = self._confirming(a, b, T_a_b, links)
         certain = any(link.certain for link in links)
         minimum = self._options.min_probability
@@ -349,15 +349,15 @@ class _Joiner:
             or self._checks.contradicts(a, b, best)
             or not self._checks.reachable(a, b, T_a_b)
         ):
-            between = self._links_between()[self._islands.positions(a, b)]
+            between = self._links_between()[self._merged.positions(a, b)]
             self._refused.add(_key(a, b, between))
             return False
         joins = [Join(link, "links", link is best, probability) for link in [*links, *extra]]
-        self._islands.merge(a, b, best, joins)
+        self._merged.merge(a, b, best, joins)
         return True
 
-    def _probability(self, a: Island, b: Island, links: Sequence[Link]) -> float:
-        """Probability that consistent links between two islands are right.
+    def _probability(self, a: MergedComponent, b: MergedComponent, links: Sequence[Link]) -> float:
+        """Probability that consistent links between two merged components are right.
 
         Odds multiply as far as views are independent, and are divided by the number of tried view
         pairs (Bonferroni).
@@ -369,18 +369,20 @@ class _Joiner:
             if p <= 0:
                 continue
             new = min(
-                [1.0, *(self._islands.apart(a, b, link, other) / IN_SIGHT for other in counted)]
+                [1.0, *(self._merged.apart(a, b, link, other) / IN_SIGHT for other in counted)]
             )
             total += new * float(np.log(p / (1 - p)))
             counted.append(link)
-        ours = {f for f, c in self._islands.component_of.items() if c in a.T}
-        theirs = {f for f, c in self._islands.component_of.items() if c in b.T}
+        ours = {f for f, c in self._merged.component_of.items() if c in a.T}
+        theirs = {f for f, c in self._merged.component_of.items() if c in b.T}
         tried = sum(
             (i in ours and j in theirs) or (i in theirs and j in ours) for i, j in self._tried
         )
         return logistic(total - float(np.log(max(tried, 1))))
 
-    def _confirming(self, a: Island, b: Island, T_a_b: Float64, known: list[Link]) -> list[Link]:
+    def _confirming(
+        self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, known: list[Link]
+    ) -> list[Link]:
         count = VERIFY if self._options.min_probability else _CONFIRM
         return self._checks.confirming(a, b, T_a_b, known, count)
 
@@ -390,8 +392,8 @@ def _best(links: Sequence[Link]) -> Link:
     return max(links, key=lambda link: (link.certain, _weight(link)))
 
 
-def _key(a: Island, b: Island, between: Sequence[Link]) -> tuple[int, ...]:
-    """Key of a decision: two islands, and the number of links between them."""
+def _key(a: MergedComponent, b: MergedComponent, between: Sequence[Link]) -> tuple[int, ...]:
+    """Key of a decision: two merged components, and the number of links between them."""
     return (*sorted(a.T), -1, *sorted(b.T), -1, len(between))
 
 

@@ -18,8 +18,8 @@ from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.refinement import (
     MAX_LOSS,
     Refinement,
+    RefinementMethod,
     Refiner,
-    Refining,
     moved_to,
     with_unsupported_views_fixed,
 )
@@ -30,7 +30,7 @@ from tofuse.registration.prepared_view import PreparedView
 
 @part("refinement", "planes")
 @dataclass(frozen=True)
-class Planes(Bounded, Refining):
+class Planes(Bounded, RefinementMethod):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
     See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
@@ -49,7 +49,7 @@ class Planes(Bounded, Refining):
     points: Annotated[int, Bounds(100)] = 5000
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
-        """See `Refining.start`."""
+        """See `RefinementMethod.start`."""
         return _Planes(self)
 
 
@@ -73,7 +73,7 @@ class _Planes(Refiner):
     def __init__(self, options: Planes) -> None:
         self._options = options
         self._store: ViewStore[SampledPoints] = ViewStore(
-            Spacing(most=options.max_views, loosest=1e6)
+            Spacing(most=options.max_views, max_stretch=1e6)
         )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:

@@ -130,7 +130,7 @@ class Refiner(Protocol):
         ...
 
 
-class Refining(Protocol):
+class RefinementMethod(Protocol):
     """A method that refines poses after loop closure."""
 
     part_kind: ClassVar[str] = "refinement"
@@ -142,11 +142,11 @@ class Refining(Protocol):
 
 @part("refinement", "none")
 @dataclass(frozen=True)
-class NoRefinement(Refining):
+class NoRefinement(RefinementMethod):
     """Leaves the poses as they are after the optimisation."""
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
-        """See `Refining.start`."""
+        """See `RefinementMethod.start`."""
         return _Idle()
 
 
@@ -164,7 +164,7 @@ class _Idle(Refiner):
 
 
 @dataclass(frozen=True, eq=False)
-class Known(Refining):
+class AlreadyRefined(RefinementMethod):
     """Keeps poses that were refined before, with the measurements of that refinement.
 
     Attributes
@@ -177,12 +177,12 @@ class Known(Refining):
     stated: tuple[Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
-        """See `Refining.start`."""
-        return _Known(self)
+        """See `RefinementMethod.start`."""
+        return _AlreadyRefined(self)
 
 
-class _Known(_Idle):
-    def __init__(self, known: Known) -> None:
+class _AlreadyRefined(_Idle):
+    def __init__(self, known: AlreadyRefined) -> None:
         self._known = known
 
     def finish(
@@ -201,7 +201,7 @@ class _Known(_Idle):
 
 @part("refinement", "joint")
 @dataclass(frozen=True)
-class Joint(Bounded, Refining):
+class Joint(Bounded, RefinementMethod):
     """Joint alignment of all overlapping views (eq 2.8), see `refine`.
 
     Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The
@@ -228,7 +228,7 @@ class Joint(Bounded, Refining):
         return RefineOptions(neighbours=self.neighbours)
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
-        """See `Refining.start`."""
+        """See `RefinementMethod.start`."""
         return _Joint(self, views)
 
 

@@ -176,7 +176,7 @@ class Spacing:
         the median depth.
     most
         When there are more, every other one is dropped, and the required motion is doubled.
-    loosest
+    max_stretch
         Largest factor on the required motion, so that the views of a place suffice however long the
         path is.
     enough
@@ -187,12 +187,14 @@ class Spacing:
     angle: float = 0.03
     distance: float = 0.015
     most: int = 300
-    loosest: float = 4.0
+    max_stretch: float = 4.0
     enough: int = 16
 
     def places(self) -> PlaceCounts:
         """Return counts of the places that are as wide as the largest required motion."""
-        return PlaceCounts(self.loosest * self.angle, self.loosest * self.distance, self.enough)
+        return PlaceCounts(
+            self.max_stretch * self.angle, self.max_stretch * self.distance, self.enough
+        )
 
 
 class Storable(Protocol):
@@ -351,8 +353,8 @@ class ViewStore(Generic[V]):
         ):
             return False
         self._last = T_component_camera, component
-        loosest = 2 * self._stretch > s.loosest
-        return not loosest or self._places.keeps(view.depth, T_component_camera, component)
+        max_stretch = 2 * self._stretch > s.max_stretch
+        return not max_stretch or self._places.keeps(view.depth, T_component_camera, component)
 
     def of(self, frames: Collection[int]) -> list[PosedView[V]]:
         """Views of some frames."""
@@ -361,7 +363,7 @@ class ViewStore(Generic[V]):
     def _add(self, posed: PosedView[V]) -> None:
         self.views.append(posed)
         s = self._spacing
-        if len(self.views) > s.most and 2 * self._stretch <= s.loosest:
+        if len(self.views) > s.most and 2 * self._stretch <= s.max_stretch:
             self._drop_every_other()
             self._last = self.views[-1].T_component_camera, self.views[-1].component
             self._stretch *= 2

@@ -22,8 +22,8 @@ from tofuse.registration.reduce import reduced
 from tofuse.registration.sample_consensus import (
     Consensus,
     ConsensusOptions,
+    Method,
     Pairs,
-    Way,
     are_distinct,
     consensus,
     motion_of,
@@ -71,7 +71,7 @@ class Fpfh(Bounded, Registrar):
     signed
         Whether the orientation of the normals is known. Arrays of points are assumed to be seen
         from their origin.
-    way, inliers, leaders
+    method, inliers, seeds
         Options of the consensus, see `ConsensusOptions`.
     refine
         Whether the pose is refined by generalised ICP (`CoarseToFine`, starting at the resolution
@@ -82,9 +82,9 @@ class Fpfh(Bounded, Registrar):
     reach: Annotated[float, Bounds(1, 100)] = 5.0
     neighbours: Annotated[int, Bounds(4, 1000)] = 12
     signed: bool = False
-    way: Way = "compatible"
+    method: Method = "compatible"
     inliers: int = 6
-    leaders: int = 100
+    seeds: int = 100
     refine: bool = True
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -94,9 +94,9 @@ class Fpfh(Bounded, Registrar):
 
     def _consensus(self, size: float) -> ConsensusOptions:
         return ConsensusOptions(
-            self.way,
+            self.method,
             inliers=self.inliers,
-            leaders=self.leaders,
+            seeds=self.seeds,
             distinct_m=_DISTINCT * size,
             distinct_rad=_DISTINCT_RAD,
         )

@@ -24,7 +24,7 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.registration.base import Registration
 
-Way = Literal["samples", "compatible"]
+Method = Literal["samples", "compatible"]
 
 _SAMPLE = 3
 _BATCH = 256
@@ -52,7 +52,7 @@ class ConsensusOptions(Bounded):
 
     Attributes
     ----------
-    way
+    method
         "samples": RANSAC; "compatible": second-order compatibility.
     sigmas
         Inlier threshold, in standard deviations of the pair.
@@ -62,18 +62,18 @@ class ConsensusOptions(Bounded):
         Probability that at least one of the drawn samples is free of outliers.
     most_samples
         Maximum number of samples.
-    leaders
+    seeds
         Maximum number of seeds of consensus sets.
     distinct_m, distinct_rad
         Motions that differ by more are distinct hypotheses.
     """
 
-    way: Way = "samples"
+    method: Method = "samples"
     sigmas: Annotated[float, Bounds(0, 1000, exclusive=True)] = 3.0
     inliers: Annotated[int, Bounds(3, 1_000_000)] = 6
     confidence: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.999
     most_samples: Annotated[int, Bounds(1, 1_000_000)] = 5000
-    leaders: Annotated[int, Bounds(1, 1_000_000)] = 100
+    seeds: Annotated[int, Bounds(1, 1_000_000)] = 100
     distinct_m: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.1
     distinct_rad: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.0873
 
@@ -146,7 +146,7 @@ def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator)
     """
     found: list[Consensus] = []
     if len(pairs) >= options.inliers:
-        motions = (_sampled if options.way == "samples" else _compatible)(pairs, options, rng)
+        motions = (_sampled if options.method == "samples" else _compatible)(pairs, options, rng)
         found = [c for c in _ranked(pairs, motions, options) if c.count >= options.inliers]
     if not found:
         raise RegistrationError(
@@ -268,13 +268,13 @@ def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generat
     apart = np.minimum(one, other) > 2 * options.sigmas * sigma
     alike = ((np.abs(one - other) < options.sigmas * sigma) & apart).astype(np.float32)
     common = alike * (alike @ alike)
-    leaders = np.argsort(-common.sum(1), kind="stable")[: options.leaders]
+    seeds = np.argsort(-common.sum(1), kind="stable")[: options.seeds]
     few = min(_TOGETHER, len(pairs))
     motions = []
-    for leader in leaders:
-        row = common[leader]
+    for seed in seeds:
+        row = common[seed]
         together = np.argsort(-row, kind="stable")[: few - 1]
-        mine = np.concatenate([[leader], together[row[together] > 0]])
+        mine = np.concatenate([[seed], together[row[together] > 0]])
         if len(mine) < _SAMPLE:
             continue
         motions.append(motion_of(pairs.some(mine)))

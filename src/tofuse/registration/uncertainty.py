@@ -65,7 +65,7 @@ class UncertaintyOptions:
         Component of it common to all patches, relative to the rest.
     floor
         Minimum error of the pose, as a fraction of the change of the view.
-    loosest
+    max_sigma
         Largest sigma from the data alone, in units of 1 cm and 1 degree.
     steepness
         Lower limit of X, as a fraction of the weighted information.
@@ -78,7 +78,7 @@ class UncertaintyOptions:
     hidden: float = 0.0025
     offset: float = 3.0
     floor: float = 0.008
-    loosest: float = 1.8
+    max_sigma: float = 1.8
     steepness: float = 0.3
 
 
@@ -195,7 +195,7 @@ def _places(rows: int, columns: int, across: int, down: int) -> Float64:
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
     """Return the covariance (6, 6) of the right perturbation in m and rad, without a prior."""
-    slope, prior = _with_weak_prior(_slope(found, options), options.loosest)
+    slope, prior = _with_weak_prior(_slope(found, options), options.max_sigma)
     bread = np.asarray(np.linalg.inv(slope), np.float64)
     per_pixel = found.stride**2
     B = max(1.0, options.noise_pixels / per_pixel) * found.geometry + prior
@@ -295,7 +295,7 @@ def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
     For normal errors the ratio is two thirds. With many residuals near the limit of the loss, X is
     a difference of large numbers and may even be negative.
     """
-    least = _NO_INFORMATION * options.loosest**-2
+    least = _NO_INFORMATION * options.max_sigma**-2
     return bounded_below(found.cross, found.weighed, options.steepness, least)
 
 
@@ -311,8 +311,8 @@ def bounded_below(X: Float64, plain: Float64, fraction: float, least: float) -> 
     return np.asarray((back * np.maximum(values, fraction)) @ back.T, np.float64)
 
 
-def _with_weak_prior(X: Float64, loosest: float) -> tuple[Float64, Float64]:
-    """Raise the eigenvalues of X (7, 7) to ``loosest**-2``; return it, and the prior's B (7, 7).
+def _with_weak_prior(X: Float64, max_sigma: float) -> tuple[Float64, Float64]:
+    """Raise the eigenvalues of X (7, 7) to ``max_sigma**-2``; return it, and the prior's B (7, 7).
 
     What is added to X is the information of a prior, which counts in B as well: without it, the
     less a direction is constrained, the smaller would be its variance ``B / X**2``.
@@ -322,9 +322,9 @@ def _with_weak_prior(X: Float64, loosest: float) -> tuple[Float64, Float64]:
         X[6, :] = X[:, 6] = 0.0
         X[6, 6] = 1.0
     values, vectors = np.linalg.eigh(X)
-    missing = np.maximum(loosest**-2 - values, 0.0)
+    missing = np.maximum(max_sigma**-2 - values, 0.0)
     raised: Float64 = X + (vectors * missing) @ vectors.T
-    prior: Float64 = (vectors * np.minimum(missing, loosest**-2)) @ vectors.T
+    prior: Float64 = (vectors * np.minimum(missing, max_sigma**-2)) @ vectors.T
     return raised, prior
 
 

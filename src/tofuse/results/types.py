@@ -18,7 +18,7 @@ from tofuse.odometry.base import Status
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
-from tofuse.posegraph.islands import Join
+from tofuse.posegraph.merged_components import Join
 from tofuse.posegraph.refinement import Refinement
 from tofuse.results.ranges import Range
 from tofuse.results.samples import FrameSample

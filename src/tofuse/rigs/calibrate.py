@@ -14,7 +14,7 @@ from tofuse.errors import InputError
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.rig import Disagreement, Rig, RigCamera
-from tofuse.rigs.check import Moved, compare_in_scene
+from tofuse.rigs.check import CameraMotion, compare_in_scene
 from tofuse.rigs.inputs import Camera, open_cameras
 from tofuse.rigs.moving_rig import MovingRig, calibrate_moving
 from tofuse.rigs.static_rig import StillRig, calibrate_still, stands_still
@@ -96,7 +96,7 @@ def check(
     format: str | None = None,  # noqa: A002
     threads: int | None = None,
     progress: Progress | None = None,
-) -> tuple[Calibration, list[Moved]]:
+) -> tuple[Calibration, list[CameraMotion]]:
     """Recalibrate a rig, from one recording of each camera in the rig's order, and compare.
 
     Raises
@@ -198,7 +198,7 @@ def _of_moving(
     return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", found.notes)
 
 
-def loosest(camera: RigCamera) -> tuple[float, float]:
+def largest_sigmas(camera: RigCamera) -> tuple[float, float]:
     """Return the largest standard deviations of a camera's position, m, and rotation, rad."""
     C = camera.covariance
     both = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))

@@ -24,7 +24,7 @@ LEVEL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class CameraMotion:
     """The result for one camera of a rig.
 
     Attributes
@@ -68,7 +68,7 @@ class Moved:
         )
 
 
-def compare_in_scene(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
+def compare_in_scene(stated: Rig, found: Rig, level: float = LEVEL) -> list[CameraMotion]:
     """As `compare`, for two calibrations in one scene, where systematic errors recur."""
     anywhere = compare(stated, found, level)
     return [
@@ -90,7 +90,7 @@ def _random_only(rig: Rig) -> Rig:
     )
 
 
-def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
+def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[CameraMotion]:
     """Compare a rig with a new calibration, camera by camera in the order of `stated`.
 
     Parameters
@@ -101,8 +101,8 @@ def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
         Probability of a false alarm for the whole rig.
     """
     shared = [c for c in stated.cameras if found.camera(c.name) is not None]
-    out: list[Moved] = []
-    knocked: dict[str, Moved] = {}
+    out: list[CameraMotion] = []
+    knocked: dict[str, CameraMotion] = {}
     if len(shared) > 1:
         # Bonferroni correction for one test per camera.
         limit = level / (len(shared) - 1)
@@ -113,7 +113,7 @@ def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
             out.append(knocked[camera.name])
             continue
         why = found.unplaced.get(camera.name, "")
-        out.append(Moved(camera.name, None, 1.0, False, reason=why or "no recording of it"))
+        out.append(CameraMotion(camera.name, None, 1.0, False, reason=why or "no recording of it"))
     return out
 
 
@@ -132,10 +132,10 @@ def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCame
     return min(shared, key=moved)
 
 
-def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> Moved:
+def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> CameraMotion:
     """Test the motion of a camera relative to a reference."""
     if camera.name == reference.name:
-        return Moved(camera.name, np.eye(4), 1.0, False, sigma_m=0.0, sigma_rad=0.0)
+        return CameraMotion(camera.name, np.eye(4), 1.0, False, sigma_m=0.0, sigma_rad=0.0)
     before, C_before = _relative(reference, camera)
     now, now_reference = found.camera(camera.name), found.camera(reference.name)
     assert now is not None
@@ -151,7 +151,7 @@ def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) ->
         float(np.sqrt(max(np.linalg.eigvalsh(C[part, part])[-1], 0)))
         for part in (slice(3), slice(3, 6))
     )
-    return Moved(camera.name, T, chance, chance < limit, chance, position, rotation)
+    return CameraMotion(camera.name, T, chance, chance < limit, chance, position, rotation)
 
 
 def _relative(reference: RigCamera, camera: RigCamera) -> tuple[Float64, Float64]:

@@ -23,7 +23,7 @@ from tofuse.pipeline.run_options import Options, resolve
 from tofuse.posegraph.accuracy import UNOBSERVED_ERROR_FACTOR
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
-from tofuse.posegraph.refinement import Known, NoRefinement
+from tofuse.posegraph.refinement import AlreadyRefined, NoRefinement
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
@@ -35,7 +35,7 @@ from tofuse.results.output import write_result
 from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import ranked, verdict_of
 from tofuse.rigs.calibrate import Motion, cameras_of, moves
-from tofuse.rigs.check import Moved, compare
+from tofuse.rigs.check import CameraMotion, compare
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import View, disagreements, refine_together
 from tofuse.rigs.rig_trajectory import track_rig
@@ -150,7 +150,7 @@ def reconstruct_rig(
     times = recording.timestamps[first]
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
     T_rig_frame = source.T_rig_camera[recording.indices]
-    knocked: list[Moved] = []
+    knocked: list[CameraMotion] = []
     measured: tuple[Measured, ...] = ()
     tracked: tuple[Measured, ...] = ()
     if moves(cameras, motion):
@@ -171,7 +171,7 @@ def reconstruct_rig(
     )
     moved = bool(measured or tracked)
     fixed = _fixed(rig, source, recording, at, of_frames, follow=not moved)
-    sure = replace(given, refinement=Known(measured, (*tracked, *fixed)))
+    sure = replace(given, refinement=AlreadyRefined(measured, (*tracked, *fixed)))
     result = reconstruct(with_odometry(recording, of_frames), sure, seed=seed, progress=progress)
     names = [camera.name for camera in rig.cameras]
     of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
@@ -259,7 +259,7 @@ def _of_calibration(reason: Reason, worst: int, name: str) -> Reason:
 
 def _checked(
     rig: Rig, cameras: Sequence[Camera], recording: Recording
-) -> tuple[list[Moved], dict[tuple[int, int], tuple[float, int]]]:
+) -> tuple[list[CameraMotion], dict[tuple[int, int], tuple[float, int]]]:
     """Return the cameras that differ from the calibration, by aligning their views from there.
 
     Also the distances between the surfaces of each two at the calibrated poses, see `Placed`.
@@ -283,7 +283,7 @@ def _checked(
     return knocked, disagreements(views, stated)
 
 
-def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
+def _marked(result: Reconstruction, knocked: Sequence[CameraMotion]) -> Reconstruction:
     """Return the result with a reason for the cameras that differ from the calibration."""
     if not knocked:
         return result

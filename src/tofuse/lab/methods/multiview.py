@@ -20,7 +20,7 @@ from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.plane_refinement import SampledPoints
-from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
+from tofuse.posegraph.refinement import Refinement, RefinementMethod, Refiner, moved_to
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView
@@ -85,7 +85,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Relaxing(Bounded, Refining):
+class Relaxing(Bounded, RefinementMethod):
     """A joint refinement of all views by corresponding points.
 
     Attributes
@@ -111,7 +111,7 @@ class Relaxing(Bounded, Refining):
         ...
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
-        """See `Refining.start`."""
+        """See `RefinementMethod.start`."""
         return _Relaxation(self)
 
 
@@ -120,7 +120,9 @@ class _Relaxation(Refiner):
 
     def __init__(self, method: Relaxing) -> None:
         self._method = method
-        self._store: ViewStore[SampledPoints] = ViewStore(Spacing(most=method.views, loosest=1e6))
+        self._store: ViewStore[SampledPoints] = ViewStore(
+            Spacing(most=method.views, max_stretch=1e6)
+        )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""

@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 import pairs
+from boards import Board, Score, default_made
 from cloud_pairs import OBJECT_M
-from leaders import Board, Score, default_made
 from peers import kiss_global, o3d_global
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError

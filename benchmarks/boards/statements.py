@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from leaders import Score
+from boards import Score
 
 Scores = Mapping[str, Mapping[str, Sequence[Score]]]
 # Success rates that differ by less are comparable.

@@ -1,4 +1,4 @@
-"""Islands: components that are joined so far, in one frame each, and the paths through them."""
+"""Merged components: those joined so far, in one frame each, and the paths through them."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Join:
 
 
 @dataclass(eq=False)
-class Island:
+class MergedComponent:
     """Components that are joined so far.
 
     Attributes
     ----------
     T
-        (4, 4) T_island_component by component.
+        (4, 4) T_merged_component by component.
     joins
         Edges between them.
     """
@@ -62,8 +62,8 @@ class Island:
     joins: list[Join] = field(default_factory=list)
 
 
-class Islands:
-    """All islands; at first each component is one.
+class MergedComponents:
+    """All merged components; at first each component is one.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Islands:
     Attributes
     ----------
     all
-        The islands.
+        The merged components.
     stretches
         By component.
     component_of
@@ -86,33 +86,33 @@ class Islands:
         self.stretches = {s.component: s for s in stretches}
         self.component_of = {int(f): s.component for s in stretches for f in s.frames}
         self.views = {v.index: v for s in stretches for v in s.views}
-        self.all = [Island({s.component: np.eye(4)}) for s in stretches]
+        self.all = [MergedComponent({s.component: np.eye(4)}) for s in stretches]
         self._poses = {int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)}
         # Frames of each component that links or verification refer to.
         self._nodes = {s.component: {v.index for v in s.views} for s in stretches}
         self._paths: dict[tuple[int, ...], dict[int, float]] = {}
 
-    def island_of(self, component: int) -> Island:
-        """Return the island of a component."""
-        return next(island for island in self.all if component in island.T)
+    def of_component(self, component: int) -> MergedComponent:
+        """Return the merged component that contains a component."""
+        return next(merged for merged in self.all if component in merged.T)
 
     def is_joined(self, a: View, b: View) -> bool:
-        """Return whether two views are in one island."""
-        return self.component_of[b.index] in self.island_of(self.component_of[a.index]).T
+        """Return whether two views are in the same merged component."""
+        return self.component_of[b.index] in self.of_component(self.component_of[a.index]).T
 
-    def T_island(self, island: Island, frame: int) -> Float64:
-        """Return the (4, 4) T_island_camera of a frame."""
-        T = island.T[self.component_of[frame]] @ self._poses[frame]
+    def T_merged(self, merged: MergedComponent, frame: int) -> Float64:
+        """Return the (4, 4) T_merged_camera of a frame."""
+        T = merged.T[self.component_of[frame]] @ self._poses[frame]
         return np.asarray(T, np.float64)
 
-    def T_a_b(self, a: Island, b: Island, link: Link) -> Float64:
-        """Return the (4, 4) T_a_b that a link between two islands implies, in either direction."""
+    def T_a_b(self, a: MergedComponent, b: MergedComponent, link: Link) -> Float64:
+        """Return the (4, 4) T_a_b implied by a link between merged components, either way."""
         i, j, T = link.i, link.j, link.T_i_j
         if self.component_of[i] not in a.T:
             i, j, T = j, i, se3.inverse(T)
-        return np.asarray(self.T_island(a, i) @ T @ se3.inverse(self.T_island(b, j)), np.float64)
+        return np.asarray(self.T_merged(a, i) @ T @ se3.inverse(self.T_merged(b, j)), np.float64)
 
-    def ends(self, a: Island, link: Link) -> tuple[int, int]:
+    def ends(self, a: MergedComponent, link: Link) -> tuple[int, int]:
         """Return the frames of a link: the one in `a`, and the other."""
         return (link.i, link.j) if self.component_of[link.i] in a.T else (link.j, link.i)
 
@@ -120,29 +120,29 @@ class Islands:
         """Return the typical depth of a frame's component, m."""
         return self.stretches[self.component_of[frame]].depth
 
-    def path(self, island: Island, start: int) -> dict[int, float]:
+    def path(self, merged: MergedComponent, start: int) -> dict[int, float]:
         """Return the path lengths from a frame to those with stored views or joins.
 
         Drift grows with them. They are measured along the poses of components, and across joins:
         rotation in rad plus translation as a fraction of the depth.
         """
         # Nodes are only added, so their number identifies the set.
-        key = (start, sum(len(self._nodes[c]) for c in island.T), *sorted(island.T))
+        key = (start, sum(len(self._nodes[c]) for c in merged.T), *sorted(merged.T))
         if key not in self._paths:
-            nodes = set().union(*(self._nodes[c] for c in island.T))
-            self._paths[key] = self._path_over(nodes | {start}, island, start)
+            nodes = set().union(*(self._nodes[c] for c in merged.T))
+            self._paths[key] = self._path_over(nodes | {start}, merged, start)
         return self._paths[key]
 
-    def _path_over(self, nodes: set[int], island: Island, start: int) -> dict[int, float]:
+    def _path_over(self, nodes: set[int], merged: MergedComponent, start: int) -> dict[int, float]:
         order = sorted(nodes, key=lambda f: (self.component_of[f], f))
-        T = np.stack([self.T_island(island, f) for f in order])
+        T = np.stack([self.T_merged(merged, f) for f in order])
         row = {f: k for k, f in enumerate(order)}
         edges = [
             (row[f], row[g])
             for f, g in itertools.pairwise(order)
             if self.component_of[f] == self.component_of[g]
         ]
-        edges += [(row[join.link.i], row[join.link.j]) for join in island.joins]
+        edges += [(row[join.link.i], row[join.link.j]) for join in merged.joins]
         if not edges:
             return {start: 0.0}
         i, j = np.array(edges).T
@@ -154,7 +154,13 @@ class Islands:
         return {f: float(away[k]) for f, k in row.items()}
 
     def consistent(
-        self, a: Island, b: Island, first: Link, second: Link, T: Float64, other: Float64
+        self,
+        a: MergedComponent,
+        b: MergedComponent,
+        first: Link,
+        second: Link,
+        T: Float64,
+        other: Float64,
     ) -> bool:
         """Return whether the T_a_b of two links agree at the view of the first one.
 
@@ -163,7 +169,7 @@ class Islands:
         i, j = self.ends(a, first)
         k, m = self.ends(a, second)
         drift = DRIFT * (self.path(a, i).get(k, np.inf) + self.path(b, j).get(m, np.inf))
-        at = self.T_island(b, j)
+        at = self.T_merged(b, j)
         between = se3.inverse(T @ at) @ other @ at
         depth = self.depth_of(j)
         return bool(
@@ -171,14 +177,14 @@ class Islands:
             and se3.angle(between) <= DISTINCT_RAD + drift
         )
 
-    def apart(self, a: Island, b: Island, link: Link, other: Link) -> float:
+    def apart(self, a: MergedComponent, b: MergedComponent, link: Link, other: Link) -> float:
         """Return the distance between the views of two links, on the side where it is larger.
 
         Translation as a fraction of the depth plus rotation in rad.
         """
         far = []
-        for island, i, k in zip((a, b), self.ends(a, link), self.ends(a, other), strict=True):
-            T = se3.inverse(self.T_island(island, i)) @ self.T_island(island, k)
+        for merged, i, k in zip((a, b), self.ends(a, link), self.ends(a, other), strict=True):
+            T = se3.inverse(self.T_merged(merged, i)) @ self.T_merged(merged, k)
             metres = float(np.linalg.norm(T[:3, 3]))
             far.append(metres / self.depth_of(i) + float(se3.angle(T)))
         return max(far)
@@ -188,12 +194,12 @@ class Islands:
         first, second = self.stretches[c], self.stretches[d]
         return (first, second) if first.frames[0] < second.frames[0] else (second, first)
 
-    def positions(self, a: Island, b: Island) -> tuple[int, int]:
-        """Return the positions of two islands, ascending."""
+    def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
+        """Return the positions of two merged components, ascending."""
         first, second = sorted((self.all.index(a), self.all.index(b)))
         return first, second
 
-    def merge(self, a: Island, b: Island, link: Link, joins: list[Join]) -> None:
+    def merge(self, a: MergedComponent, b: MergedComponent, link: Link, joins: list[Join]) -> None:
         """Move the components of `b` into `a`, at the pose of a link."""
         T_a_b = self.T_a_b(a, b, link)
         a.T.update(transformed(b.T, T_a_b))
@@ -203,15 +209,15 @@ class Islands:
         self.all.remove(b)
 
     def cut(self, join: Join) -> None:
-        """Split an island at a join that alone connects its two sides."""
-        whole = self.island_of(self.components(join)[0])
+        """Split a merged component at a join that alone connects its two sides."""
+        whole = self.of_component(self.components(join)[0])
         self.all.remove(whole)
         self._paths.clear()
         edges = [self.components(other) for other in whole.joins]
         for side in sides_without(edges, whole.joins.index(join)):
             T = {c: whole.T[c] for c in whole.T if c in side}
             inside = [j for j in whole.joins if j is not join and self.components(j)[0] in side]
-            self.all.append(Island(T, inside))
+            self.all.append(MergedComponent(T, inside))
 
     def components(self, join: Join) -> tuple[int, int]:
         """Return the components that a join connects."""
@@ -222,14 +228,14 @@ class Islands:
         for frame in (link.i, link.j):
             self._nodes[self.component_of[frame]].add(frame)
 
-    def bridged_from(self, island: Island, first: int) -> dict[int, How]:
+    def bridged_from(self, merged: MergedComponent, first: int) -> dict[int, How]:
         """Return the components that no chain of links connects to the first one, and what does."""
 
         def reached(*ways: How) -> set[int]:
             out, changed = {first}, True
             joined = [
                 {self.component_of[j.link.i], self.component_of[j.link.j]}
-                for j in island.joins
+                for j in merged.joins
                 if j.how in ways
             ]
             while changed:
@@ -239,7 +245,7 @@ class Islands:
             return out
 
         by_links, by_odometry = reached("links"), reached("links", "odometry")
-        bridged: dict[int, How] = dict.fromkeys(island.T.keys() - by_links, "motion")
+        bridged: dict[int, How] = dict.fromkeys(merged.T.keys() - by_links, "motion")
         bridged.update(dict.fromkeys(by_odometry - by_links, "odometry"))
         return bridged
 

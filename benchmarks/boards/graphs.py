@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 import pose_graphs
-from leaders import Board, Score, default_made
+from boards import Board, Score, default_made
 from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import PoseGraph
 

@@ -15,7 +15,7 @@ import numpy as np
 import peers
 import sequences
 import tracking
-from leaders import Board, Score, default_made
+from boards import Board, Score, default_made
 from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import evaluate_trajectory
