@@ -166,8 +166,8 @@ def at_true_poses(recording: Recording) -> Mesh:
     config = adapted(from_method("default"), recording)
     preparation, views = Preparation(config), []
     for frame, T in zip(recording, recording.reference, strict=True):
-        ready = preparation.ready(frame, T, None, None)
-        preparation.placed(ready.filtered, T)
+        ready = preparation.process(frame, T, None, None)
+        preparation.add_pose(ready.filtered, T)
         assert isinstance(ready.filtered, RangeFrame)
         assert isinstance(ready.clean, RangeFrame)
         surface = prepare_view(ready.filtered, SurfaceOptions())

@@ -25,7 +25,7 @@ _RUN = """
 import sys
 from tofuse.cli import main
 from tofuse.pipeline import checkpoint
-checkpoint._EVERY_S, checkpoint._TIME_FRACTION = float(sys.argv[1]), 1e9
+checkpoint._INTERVAL_S, checkpoint._TIME_FRACTION = float(sys.argv[1]), 1e9
 sys.exit(main(sys.argv[2:]))
 """
 

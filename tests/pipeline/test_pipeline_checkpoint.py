@@ -28,7 +28,7 @@ from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import changed, from_method
-from tofuse.pipeline.states import StateError, decode, encode, known_types
+from tofuse.pipeline.states import StateError, decode, encode, serialisable_types
 from tofuse.posegraph.view_store import SampledView
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
@@ -166,8 +166,8 @@ def test_foreign_types_are_not_stored(state: object, tmp_path: Path) -> None:
 
 
 def test_loadable_types_have_no_side_effects() -> None:
-    assert {name.partition(".")[0] for name in known_types()} == {"tofuse"}
-    for cls in known_types().values():
+    assert {name.partition(".")[0] for name in serialisable_types()} == {"tofuse"}
+    for cls in serialisable_types().values():
         assert not issubclass(cls, BaseException | os.PathLike | tuple | type)
         assert not hasattr(cls, "__del__")
         assert not hasattr(cls, "__reduce_ex__") or cls.__reduce_ex__ is object.__reduce_ex__
@@ -230,7 +230,7 @@ def test_derived_values_are_not_stored() -> None:
     found = decode(dict(encode(view)))
     assert "patches" in vars(view)
     assert "patches" not in vars(found)
-    np.testing.assert_array_equal(found.middle, view.middle)
+    np.testing.assert_array_equal(found.centroid, view.centroid)
 
 
 FORGED: dict[str, object] = {
@@ -395,7 +395,7 @@ def test_checkpoint_is_kept_after_output_error(tmp_path: Path, monkeypatch) -> N
         (KeyboardInterrupt(), 0.0, True),
         (KeyboardInterrupt(), 60.0, False),
     ):
-        monkeypatch.setattr(checkpoint, "_WORTH_KEEPING_S", seconds)
+        monkeypatch.setattr(checkpoint, "_MIN_KEPT_RUN_S", seconds)
         kept = Checkpoints(tmp_path, "a", lambda _text: None)
         kept.save("tracking", [1])
         kept.give_up(error)
@@ -409,17 +409,17 @@ def test_digest_covers_configuration_and_input(tmp_path: Path) -> None:
     image = folder / "depth" / "0.png"
     image.write_bytes(b"one")
     out.mkdir()
-    before = digest({"seed": 0}, [folder], without=out)
+    before = digest({"seed": 0}, [folder], excluded=out)
     (out / "run.json").write_text("{}")
-    assert digest({"seed": 0}, [folder], without=out) == before
-    assert digest({"seed": 1}, [folder], without=out) != before
+    assert digest({"seed": 0}, [folder], excluded=out) == before
+    assert digest({"seed": 1}, [folder], excluded=out) != before
     status = image.stat()
     image.write_bytes(b"two")
     os.utime(image, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
-    assert digest({"seed": 0}, [folder], without=out) != before
-    alone = digest({}, [image], without=out)
+    assert digest({"seed": 0}, [folder], excluded=out) != before
+    alone = digest({}, [image], excluded=out)
     (folder / "depth" / "camera.json").write_text("{}")
-    assert digest({}, [image], without=out) != alone
+    assert digest({}, [image], excluded=out) != alone
 
 
 # Saves a state after every frame, and kills itself at the n-th event (a stage, a frame, a file or
@@ -430,7 +430,7 @@ from tofuse.cli import main
 from tofuse.cli.progress import QuietProgress
 from tofuse.pipeline import checkpoint, run
 run.write_report_files = lambda *a: (a[-1] / "report.html").write_text("report")
-checkpoint._EVERY_S, checkpoint._TIME_FRACTION = 0.0, 1e9
+checkpoint._INTERVAL_S, checkpoint._TIME_FRACTION = 0.0, 1e9
 out, last_event, last_move = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 events = moves = 0
 def counted(function):

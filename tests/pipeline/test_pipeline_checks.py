@@ -10,7 +10,7 @@ import pytest
 
 from tofuse.evaluation.cross_view import CrossViewConsistency, PairConsistency
 from tofuse.geometry import se3
-from tofuse.pipeline.checks import Evidence, judge, stretches
+from tofuse.pipeline.checks import Evidence, judge, ranges_with_status
 from tofuse.posegraph.accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.calibration_check import CalibrationCheck, Gap
@@ -103,7 +103,7 @@ def evidence(
         else accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0),
         diagonal_m=1.0,
         has_covariances=sigma is not None,
-        given=frozenset(given),
+        given_loops=frozenset(given),
         **more,
     )
 
@@ -204,7 +204,7 @@ CASES = {
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
     "disconnected": in_components(apart((7, 8))),
     "bridged_gap": in_components(Component(((5, 8),), np.eye(4), "motion")),
-    "single_link": replace(evidence(), hanging=(5, 6, 7, 8)),
+    "single_link": replace(evidence(), single_link_frames=(5, 6, 7, 8)),
     "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
@@ -261,7 +261,7 @@ def test_all_runs_of_lost_frames_are_one_reason() -> None:
     (lost,) = [r for r in judge(e)[1] if r.code == "lost_frames"]
     assert (lost.ranges, lost.frames) == (((1, 1), (3, 4)), (1, 4))
     assert lost.text == "Frames 1, 3-4 have no pose."
-    assert stretches(e.records, "skipped") == ()
+    assert ranges_with_status(e.records, "skipped") == ()
 
 
 def test_loop_error_within_expected_drift_is_no_gap() -> None:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tofuse.pipeline.assessment import on_a_single_link
+from tofuse.pipeline.assessment import single_link_frames
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.merged_components import Join
@@ -45,4 +45,4 @@ def loop(i, j, accepted=True):
 )
 def test_frames_behind_a_single_link(joins, loops, expected) -> None:
     tracked = TrackedGraph(POSED, {}, joins)
-    assert on_a_single_link(tracked, loops) == expected
+    assert single_link_frames(tracked, loops) == expected

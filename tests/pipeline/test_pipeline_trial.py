@@ -117,17 +117,17 @@ def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float
     spoil, correct = bent(0.02 * there), bent(-0.02)
     found = trial(straight, spoil, lambda frame: correct(spoil(frame)))
     assert found.strength == pytest.approx(there, abs=max(3 * found.error, 0.1))
-    assert found.helps == (there > 0)
+    assert found.is_significant == (there > 0)
 
 
 @pytest.mark.slow
 def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     spoil, correct = bent(0.02, 8.0), bent(-0.02, 21.0)
-    assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).helps
+    assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).is_significant
     worse = bent(0.02)  # the right shape, with the wrong sign
-    assert not trial(straight, spoil, lambda frame: worse(spoil(frame))).helps
+    assert not trial(straight, spoil, lambda frame: worse(spoil(frame))).is_significant
     nothing = trial(straight, plain, plain)
-    assert not nothing.helps
+    assert not nothing.is_significant
     assert not nothing.predicted
 
 
@@ -135,11 +135,11 @@ def test_trial_needs_several_consistent_runs() -> None:
     def of(*strengths: float) -> Trial:
         return Trial(strengths, (1.0,) * len(strengths))
 
-    assert not Trial((), ()).helps
-    assert not of(0.5, 0.5, 0.5).helps
-    assert of(0.5, 0.6, 0.4, 0.5).helps
-    assert not of(1.5, -0.9, 1.4, -0.2).helps
-    assert not of(0.05, 0.05, 0.06, 0.05).helps  # significant, but too small
+    assert not Trial((), ()).is_significant
+    assert not of(0.5, 0.5, 0.5).is_significant
+    assert of(0.5, 0.6, 0.4, 0.5).is_significant
+    assert not of(1.5, -0.9, 1.4, -0.2).is_significant
+    assert not of(0.05, 0.05, 0.06, 0.05).is_significant  # significant, but too small
     found = of(0.5, 0.6, 0.4, 0.5)
     assert found.strength == pytest.approx(0.5, abs=0.01)
     assert found.error == pytest.approx(np.std([0.5, 0.6, 0.4, 0.5], ddof=1) / 2, rel=0.5)
@@ -149,7 +149,7 @@ def test_single_run_of_bad_poses_does_not_decide() -> None:
     """Not even if it has most of the predicted effect."""
     strengths = np.array([0.2, 0.3, 0.25, 0.35, 0.2, 0.3, 0.25, -0.4])
     predicted = np.array([*[1.0] * 7, 12.0])
-    assert Trial(tuple(strengths * predicted), tuple(predicted)).helps
+    assert Trial(tuple(strengths * predicted), tuple(predicted)).is_significant
 
 
 def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:

@@ -204,9 +204,9 @@ def test_candidates_require_leaving_and_returning(full_turn):
     descriptors = [view_descriptor(view) for view in views]
 
     def candidates(
-        descriptors, possible=lambda i, j: True, known=(), gain=lambda i, j: 0, **options
+        descriptors, plausible=lambda i, j: True, closed=(), gain=lambda i, j: 0, **options
     ):
-        return Appearance(**options).candidates(descriptors, possible, known, gain)
+        return Appearance(**options).candidates(descriptors, plausible, closed, gain)
 
     pairs, refused = candidates(descriptors, pairs=10)
     assert (0, 18) in pairs
@@ -217,7 +217,7 @@ def test_candidates_require_leaving_and_returning(full_turn):
     assert candidates(descriptors[:2]) == ([], [])
     # A static camera does not return, and known loops are not searched again.
     assert candidates([descriptors[0]] * 8) == ([], [])
-    assert all(j < 16 or i > 3 for i, j in candidates(descriptors, known=[(0, 18)], pairs=10)[0])
+    assert all(j < 16 or i > 3 for i, j in candidates(descriptors, closed=[(0, 18)], pairs=10)[0])
     assert len(candidates(descriptors, pairs=1)[0]) == 1
     # The one that adds most information comes first, then the most similar ones.
     assert candidates(descriptors, gain=lambda i, j: i, pairs=10)[0][0] == max(pairs)
@@ -249,7 +249,7 @@ def test_plausible_drift_grows_with_path_length():
     assert options.plausible(se3.exp(np.array([0, 0, 0, 0, 0.15, 0])), *path, 2.0)
     off = se3.exp(np.array([0, 0, 0, 0, 0.25, 0]))
     assert not options.plausible(off, *path, 2.0)
-    assert options.plausible(off, *path, 2.0, unsure=0.1)
+    assert options.plausible(off, *path, 2.0, tolerance=0.1)
 
 
 def test_plausible_drift_grows_with_uncertainty() -> None:

@@ -28,7 +28,7 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
 def test_range_offset_raises_alarm(monkeypatch):
     views, refined = kept(0.06)
     # With many pairs, a part of them and of their points is as conclusive.
-    monkeypatch.setattr("tofuse.posegraph.calibration_check._ENOUGH_PAIRS", len(refined.pairs) // 2)
+    monkeypatch.setattr("tofuse.posegraph.calibration_check._MAX_PAIRS", len(refined.pairs) // 2)
     some = check_calibration(views, refined, OPTIONS, Priors.none())
     monkeypatch.undo()
     found = check_calibration(views, refined, OPTIONS, Priors.none())
@@ -143,9 +143,9 @@ def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
 
     monkeypatch.setattr("tofuse.posegraph.calibration_check.align_pairs", drifting)
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
-    monkeypatch.setattr(_Loop, "kept_by_views", lambda *args: -0.5 * args[-1])
+    monkeypatch.setattr(_Loop, "error_by_views", lambda *args: -0.5 * args[-1])
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
-    monkeypatch.setattr(_Loop, "kept_by_views", lambda *args: args[-1])
+    monkeypatch.setattr(_Loop, "error_by_views", lambda *args: args[-1])
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert found.alarm
     assert found.best == "focal"
@@ -156,7 +156,7 @@ def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
     loop = _Loop.longest(views, refined, OPTIONS)
     assert loop is not None
-    assert loop.kept_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
+    assert loop.error_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
 
 
 def test_longest_loop_uses_consecutive_views_only():

@@ -61,7 +61,7 @@ def test_result_keeps_no_equations_in_memory(swing):
     found = refine(views, drifted(truth), OPTIONS)
     assert found.before.terms.sum() > 0
     for support in (found.before, found.after):
-        for array in (support.target, support.source, support.good, support.terms):
+        for array in (support.target, support.source, support.score, support.terms):
             assert array.base is None
 
 
@@ -244,7 +244,7 @@ def test_rigidly_mounted_views_move_together():
     truth = (instants[:, None] @ mounted[None]).reshape(-1, 4, 4)
     views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
     bodies = Bodies(np.repeat(np.arange(8), 2), np.tile(mounted, (8, 1, 1)))
-    start = bodies.views(drifted(instants))
+    start = bodies.view_poses(drifted(instants))
     found = refine(views, start, OPTIONS, bodies=bodies)
     assert away(start, truth) > 0.03
     assert away(found.poses, truth) < 0.005

@@ -110,7 +110,7 @@ def test_one_step_solves_damped_system():
     lonely = PairSystem(13, graph.edges, np.zeros(13, bool))
     single = np.tile(np.eye(6), (13, 1, 1)), np.tile(np.arange(6.0), (13, 1))
     np.testing.assert_allclose(
-        lonely.solve(H, g, graph.measurements, single=single)[12], -np.arange(6.0)
+        lonely.solve(H, g, graph.measurements, unary=single)[12], -np.arange(6.0)
     )
     assert lonely.solve(H, g, graph.measurements) is None
 

@@ -134,7 +134,7 @@ def test_size_of_shared_errors_is_estimated_from_residuals(size):
         sums, row = sums_of(source, target, T)
         correlation = shared_error.patch_correlation(target.shape)
         found = shared_error.disagreement(sums[None], row[None], correlation)
-        seen.append((found.seen - found.noise) / found.expected)
+        seen.append((found.observed - found.noise) / found.expected)
     sigma = np.sqrt(max(float(np.mean(seen)), 0.0))
     # Both views have errors along their rays, which meet surfaces at an angle.
     assert sigma < 0.002 if size == 0 else 0.5 * size < sigma < 2 * size

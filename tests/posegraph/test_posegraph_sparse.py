@@ -14,7 +14,7 @@ from tofuse.posegraph import sparse
 from tofuse.posegraph.covariances import GraphCovariances, loop_errors
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.sparse import bounded, factor_size, parts_of
+from tofuse.posegraph.sparse import factor_size, parts_of, sparsify
 
 PLACES, ROUNDS = 30, 20
 LIMIT = 400_000  # the factor of all pairs has about twice as many values
@@ -61,7 +61,7 @@ def accumulated(graph: PoseGraph) -> Float64:
 def test_all_pairs_are_used_if_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     for limit in (36 * 600 * 600, 36 * 60_000):  # without and with analysis
         monkeypatch.setattr(sparse, "MAX_FACTOR", limit)
-        assert bounded(PLACES * ROUNDS, rounds(600, 1)).all()
+        assert sparsify(PLACES * ROUNDS, rounds(600, 1)).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -72,7 +72,7 @@ def test_factor_is_bounded_and_everything_remains_connected(
     n = PLACES * ROUNDS
     assert factor_size(n, edges) > 1.5 * LIMIT
     monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
-    chosen = bounded(n, edges)
+    chosen = sparsify(n, edges)
     assert LIMIT / 2 < factor_size(n, edges[chosen]) <= LIMIT
     i, j = edges.T
     assert chosen[j - i == 1].all()
@@ -80,7 +80,7 @@ def test_factor_is_bounded_and_everything_remains_connected(
     apart = edges[(i < n // 2) == (j < n // 2)]
     edges = np.concatenate([apart, [[3, n - 5], [n - 5, 3]], apart[:50]])
     monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT // 2)
-    chosen = bounded(n, edges)
+    chosen = sparsify(n, edges)
     assert not chosen.all()
     np.testing.assert_array_equal(chosen[:50], chosen[-50:])
     assert (parts_of(n, edges[chosen]) == 0).all()
@@ -91,7 +91,7 @@ def test_false_loops_are_rejected_even_if_they_are_left_out(
 ) -> None:
     graph, _ = graph_of(rounds(3000, 6), 6)
     monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
-    chosen = bounded(len(graph.ids), graph.edges)
+    chosen = sparsify(len(graph.ids), graph.edges)
     assert (~chosen).sum() > 500
     false = np.flatnonzero(~chosen)[::20]
     measured = graph.measurements.copy()
@@ -106,7 +106,7 @@ def test_errors_of_loops_that_are_left_out_are_unknown(monkeypatch: pytest.Monke
     odometry = accumulated(graph)
     known = loop_errors(graph, odometry)
     monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
-    chosen = bounded(len(graph.ids), graph.edges)[graph.loop]
+    chosen = sparsify(len(graph.ids), graph.edges)[graph.loop]
     found = loop_errors(graph, odometry)
     np.testing.assert_array_equal(np.isfinite(found), chosen)
     np.testing.assert_allclose(found[chosen], known[chosen], rtol=1e-6)
@@ -117,7 +117,7 @@ def test_poses_and_covariances_are_nearly_as_good(monkeypatch: pytest.MonkeyPatc
     whole = LevenbergMarquardt().optimise(graph).graph
     known = GraphCovariances(whole).of_poses
     monkeypatch.setattr(sparse, "MAX_FACTOR", LIMIT)
-    assert (~bounded(len(truth), graph.edges)).sum() > 500
+    assert (~sparsify(len(truth), graph.edges)).sum() > 500
     part = LevenbergMarquardt().optimise(graph).graph
     stated = GraphCovariances(part).of_poses
     # Fewer measurements: larger in every direction, but little.

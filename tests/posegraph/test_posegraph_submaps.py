@@ -12,10 +12,10 @@ from refined_submaps import refined
 from tofuse.files.spill import Scratch
 from tofuse.geometry import se3
 from tofuse.posegraph import view_store as of_views
-from tofuse.posegraph.calibration_check import CalibrationCheck, of_submaps
+from tofuse.posegraph.calibration_check import CalibrationCheck, combine_checks
 from tofuse.posegraph.refinement import Joint
-from tofuse.posegraph.submaps import cut, submaps
-from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, nearby, overlaps
+from tofuse.posegraph.submaps import partition, submaps
+from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, candidate_pairs, overlaps
 from tofuse.registration.view_descriptor import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
@@ -87,14 +87,14 @@ def test_store_spills_to_disk_and_spaces_views_by_motion(swing, tmp_path: Path) 
 def test_places_are_divided_into_equal_parts() -> None:
     rng = np.random.default_rng(0)
     places = rng.random((1000, 3)) * [40, 10, 2]
-    label = cut(places, 300)
+    label = partition(places, 300)
     counts = np.bincount(label)
     assert len(counts) == 4
     assert counts.max() - counts.min() <= 2
     # Each is a section of the path: as wide as a quarter of it.
     assert max(np.ptp(places[label == k, 0]) for k in range(4)) < 12
-    assert (cut(places[:300], 300) == 0).all()
-    np.testing.assert_array_equal(cut(np.zeros((10, 3)), 4), cut(np.zeros((10, 3)), 4))
+    assert (partition(places[:300], 300) == 0).all()
+    np.testing.assert_array_equal(partition(np.zeros((10, 3)), 4), partition(np.zeros((10, 3)), 4))
 
 
 def test_every_pair_is_in_at_most_one_submap() -> None:
@@ -115,29 +115,29 @@ def test_every_pair_is_in_at_most_one_submap() -> None:
 
 
 def test_views_of_nearby_places_are_compared(monkeypatch) -> None:
-    for name, number in (("_ALL", 50), ("_NEAREST", 12), ("_JUST_BEFORE", 5)):
+    for name, number in (("_MAX_EXHAUSTIVE", 50), ("_NEAREST", 12), ("_PREVIOUS", 5)):
         monkeypatch.setattr(of_views, name, number)
     rng = np.random.default_rng(2)
     there = np.stack([np.linspace(0, 40, 200), np.zeros(200), np.zeros(200)], 1)
     middles = np.concatenate([there, there[::-1]]) + 0.01 * rng.standard_normal((400, 3))
-    i, j = nearby(middles)
+    i, j = candidate_pairs(middles)
     assert (i < j).all()
     assert len(i) < 400 * 17
     pairs = set(zip(i.tolist(), j.tolist(), strict=True))
     assert all((k, 399 - k) in pairs for k in range(190))  # the way back
     assert all((j - n, j) in pairs for j in range(5, 400) for n in range(1, 6))
     # The same for the newest view alone, except for distant views that select it.
-    a, b = nearby(middles, 399)
+    a, b = candidate_pairs(middles, 399)
     assert set(b.tolist()) == {399}
     assert {(0, 399), (398, 399), (394, 399)} <= set(zip(a.tolist(), b.tolist(), strict=True))
-    assert len(nearby(middles[:50])[0]) == 50 * 49 // 2
+    assert len(candidate_pairs(middles[:50])[0]) == 50 * 49 // 2
 
 
 def test_nearest_views_are_overlapping_views(swing, monkeypatch) -> None:
     views, truth = swing
     kept = [SampledView.of(view, 600) for view in views]
     every, shares = overlaps(kept, truth, 0.6)
-    for name, number in (("_ALL", 10), ("_NEAREST", 20), ("_JUST_BEFORE", 5)):
+    for name, number in (("_MAX_EXHAUSTIVE", 10), ("_NEAREST", 20), ("_PREVIOUS", 5)):
         monkeypatch.setattr(of_views, name, number)
     some, of_some = overlaps(kept, truth, 0.6)
     known = {(int(i), int(j)): s for (i, j), s in zip(every, shares, strict=True)}
@@ -171,6 +171,6 @@ def test_submaps_share_camera_errors() -> None:
         CalibrationCheck(alarm=True, errors={"focal": 0.05}, best="focal"),
     )
     other = CalibrationCheck(alarm=True, errors={"focal": 0.04}, best="focal")
-    assert not of_submaps([]).alarm
-    assert not of_submaps([quiet, alarm]).alarm
-    assert of_submaps([quiet, alarm, other]).errors == {"focal": 0.05}
+    assert not combine_checks([]).alarm
+    assert not combine_checks([quiet, alarm]).alarm
+    assert combine_checks([quiet, alarm, other]).errors == {"focal": 0.05}

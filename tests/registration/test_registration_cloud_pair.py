@@ -167,11 +167,14 @@ def test_range_sphere_stores_free_space(scans):
     cloud = CloudFrame.of(scans[0])
     sphere = RangeSphere.of(cloud, viewpoint_of(cloud))
     points = scans[0][::50].astype(float)
-    assert np.nanmedian(sphere.before(0.5 * points) / np.linalg.norm(0.5 * points, axis=1)) > 0.9
-    assert np.mean(sphere.before(points) <= 1e-3) > 0.99
-    assert np.nanmax(sphere.before(1.5 * points)) <= 0
+    assert (
+        np.nanmedian(sphere.distance_in_front(0.5 * points) / np.linalg.norm(0.5 * points, axis=1))
+        > 0.9
+    )
+    assert np.mean(sphere.distance_in_front(points) <= 1e-3) > 0.99
+    assert np.nanmax(sphere.distance_in_front(1.5 * points)) <= 0
     # No measurements straight down.
-    assert np.isnan(sphere.before(np.array([[0.0, 0, -1]]))).all()
+    assert np.isnan(sphere.distance_in_front(np.array([[0.0, 0, -1]]))).all()
 
 
 # Agreement
@@ -227,7 +230,7 @@ def test_flying_pixels_do_not_contradict_correct_pose():
     assert cloud_agreement(*views, true).contradiction < 0.002
     # They do lie in free space of the other view.
     seen = se3.transform(true, source[mixed].astype(float))
-    assert np.mean(views[1].sphere.before(seen) > 0.1) > 0.1
+    assert np.mean(views[1].sphere.distance_in_front(seen) > 0.1) > 0.1
     # Surfaces do contradict a wrong pose.
     wrong = cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0]))
     assert wrong.contradiction > 0.05
@@ -442,11 +445,11 @@ def test_candidates_of_same_pose_are_not_rivals():
     views, truth = peaks_views(0.1, 101)
     source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
     both = cloud_pair._Views.of(source, target, np.random.default_rng(0))
-    best = both.judged(T)
-    beside = both.judged(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
-    elsewhere = both.judged(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
+    best = both.evaluated(T)
+    beside = both.evaluated(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
+    elsewhere = both.evaluated(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
     assert both.differ(beside.T_target_source, T)
     assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
-    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NOWHERE
+    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NO_RIVAL
     found = register_clouds(source, target, None, np.random.default_rng(0))
     assert found.probability > 0.5

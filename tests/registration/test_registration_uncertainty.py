@@ -15,9 +15,9 @@ from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import (
     Patches,
     UncertaintyOptions,
+    bounded_by_prior,
     covariance,
     covariance_of_patches,
-    no_worse_than,
     patches,
     with_prior,
 )
@@ -204,9 +204,9 @@ def test_uncertainty_is_bounded_by_prediction():
     turned = se3.exp(np.array([0.0, 0, 0, 0.4, -0.3, 0.2]))[:3, :3]
     axes = np.kron(np.eye(2), turned)
     known = axes @ np.diag([1e-6, 1e-5, 1e-4, 1e-6, 1e-5, 1e-4]) @ axes.T
-    np.testing.assert_array_equal(no_worse_than(known, prior), known)
+    np.testing.assert_array_equal(bounded_by_prior(known, prior), known)
     loose = known + 36.0 * np.outer(axes[:, 1], axes[:, 1])
-    cut = no_worse_than(loose, prior)
+    cut = bounded_by_prior(loose, prior)
     np.testing.assert_allclose(axes[:, 1] @ cut @ axes[:, 1], 0.09, rtol=1e-4)
     for k in (0, 2, 3, 4, 5):
         np.testing.assert_allclose(axes[:, k] @ cut @ axes[:, k], axes[:, k] @ known @ axes[:, k])

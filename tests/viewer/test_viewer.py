@@ -328,7 +328,7 @@ class Recorder(Silent):
 @pytest.mark.slow
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
-    from tofuse.pipeline.progress import Both
+    from tofuse.pipeline.progress import CombinedProgress
     from tofuse.viewer.live_view import LiveView
     from tofuse.viewer.server import address
 
@@ -339,7 +339,7 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
         live = LiveView(server)
         began = time.perf_counter()
         watched_run = run(
-            [room_recording], Options(out=tmp_path / "a", end=4), Both(recorder, live)
+            [room_recording], Options(out=tmp_path / "a", end=4), CombinedProgress(recorder, live)
         )
         assert live.first_seconds <= time.perf_counter() - began
         # The first frame is shown before any stage begins, and then each one with its pose.

@@ -165,7 +165,7 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
 
 def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
-    from tofuse.pipeline.progress import Both
+    from tofuse.pipeline.progress import CombinedProgress
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
     from tofuse.viewer.live_view import LiveView
@@ -173,7 +173,7 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
     with _page(arguments) as server:
         live = LiveView(server)
         with _run_progress(arguments) as progress:
-            result = run_pipeline(arguments.inputs, options, Both(progress, live))
+            result = run_pipeline(arguments.inputs, options, CombinedProgress(progress, live))
         print_result(result, arguments.out, as_json=arguments.json)
         live.finish(arguments.out)
         _wait()

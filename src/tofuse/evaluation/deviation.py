@@ -237,7 +237,7 @@ class _Corrections:
         M = self._units**2 / len(x)
         single = np.tile(np.diag(M), (len(x), 1, 1)), -M * x
         H = m * self._graph.information
-        found = self._system.solve(H, np.zeros((len(H), 6)), self._T_i_j, single=single)
+        found = self._system.solve(H, np.zeros((len(H), 6)), self._T_i_j, unary=single)
         assert found is not None, "M is positive definite"
         return found
 

@@ -21,18 +21,19 @@ _ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {
     "mirrored upside down": lambda a: a[::-1],
     "rotated by 180 degrees": lambda a: a[::-1, ::-1],
 }
-# Correlation of the edges of two channels, and its lead over the identity, also in standard errors.
-_MIN_CORRELATION, _LEAD, _SIGMAS = 0.15, 0.06, 4.0
-# Smallest relevant and largest tested shift of colour, as fractions of the width.
-_SHIFT, _MAX_SHIFT = 0.02, 0.12
+# Minimum correlation of the edges of two channels, and its lead over the identity, also in standard
+# errors.
+_MIN_CORRELATION, _MIN_LEAD, _MIN_LEAD_SIGMAS = 0.15, 0.06, 4.0
+# Minimum relevant and maximum tested shift of colour, as fractions of the width.
+_MIN_SHIFT, _MAX_SHIFT = 0.02, 0.12
 _MIN_FRAMES = 3
-# Smallest correlation of edges at the best shift, its lead over no shift, and the largest fraction
-# of it without a shift, or at other shifts more than this number of pixels away: edges in one
+# Minimum correlation of edges at the best shift, its lead over no shift, and the maximum fraction
+# of it without a shift, or at shifts farther than this number of pixels from the best: edges in one
 # direction correlate at many shifts.
-_COLOR_FITS, _COLOR_LEAD, _COLOR_UNSHIFTED = 0.42, 0.16, 0.68
-_ELSEWHERE, _PEAK_PIXELS = 0.95, 4
+_MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
+_MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
 # Gain in correlation by a shift that shows camera motion.
-_MOVED_GAIN = 0.03
+_MIN_MOTION_GAIN = 0.03
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
@@ -50,11 +51,11 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
         lead = best - identity
         error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
-        turned = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
+        reoriented = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
         if (
             best.mean() > _MIN_CORRELATION
-            and lead.mean() > max(_LEAD, _SIGMAS * error)
-            and _fit_unshifted(turned)
+            and lead.mean() > max(_MIN_LEAD, _MIN_LEAD_SIGMAS * error)
+            and _peaks_at_zero_shift(reoriented)
         ):
             yield Finding(
                 "mirrored",
@@ -78,22 +79,24 @@ def check_color(sample: Sample) -> Iterator[Finding]:
     if len(pairs) < _MIN_FRAMES:
         return
     columns = min(_COLUMNS, pairs[0][0].camera.width)
-    reach = round(_MAX_SHIFT * columns)
-    maps = np.stack([_shifted(_edges(_log_depth(f)), _edges(grey), reach) for f, grey in pairs])
-    mean = maps.mean(0)
+    max_shift = round(_MAX_SHIFT * columns)
+    correlations = np.stack(
+        [_shift_correlations(_edges(_log_depth(f)), _edges(grey), max_shift) for f, grey in pairs]
+    )
+    mean = correlations.mean(0)
     i, j = np.unravel_index(int(mean.argmax()), mean.shape)
-    lead = maps[:, i, j] - maps[:, reach, reach]
+    lead = correlations[:, i, j] - correlations[:, max_shift, max_shift]
     error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
-    shift = float(np.hypot(i - reach, j - reach)) / columns
+    shift = float(np.hypot(i - max_shift, j - max_shift)) / columns
     down, right = np.mgrid[: mean.shape[0], : mean.shape[1]]
-    elsewhere = mean[np.hypot(down - i, right - j) > _PEAK_PIXELS].max()
+    elsewhere = mean[np.hypot(down - i, right - j) > _PEAK_RADIUS_PX].max()
     if (
-        mean[i, j] < _COLOR_FITS
-        or mean[reach, reach] > _COLOR_UNSHIFTED * mean[i, j]
-        or elsewhere > _ELSEWHERE * mean[i, j]
+        mean[i, j] < _MIN_COLOR_CORRELATION
+        or mean[max_shift, max_shift] > _MAX_COLOR_UNSHIFTED * mean[i, j]
+        or elsewhere > _MAX_ELSEWHERE * mean[i, j]
     ):
         return
-    if shift > _SHIFT and lead.mean() > max(_COLOR_LEAD, _SIGMAS * error):
+    if shift > _MIN_SHIFT and lead.mean() > max(_MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS * error):
         pixels = shift * pairs[0][0].camera.width
         yield Finding(
             "color_unregistered",
@@ -106,15 +109,15 @@ def check_color(sample: Sample) -> Iterator[Finding]:
 
 def shifted(first: RangeFrame, second: RangeFrame) -> bool:
     """Whether the edges of one image are shifted relative to those of the other."""
-    reach = 6
-    best: list[bool] = []
+    max_shift = 6
+    is_shifted: list[bool] = []
     for channel_of in (_amplitude, _log_depth):
         a, b = channel_of(first), channel_of(second)
         if a is None or b is None:
             continue
-        scores = _shifted(_edges(a), _edges(b), reach)
-        best.append(bool(scores.max() - scores[reach, reach] > _MOVED_GAIN))
-    return any(best)
+        scores = _shift_correlations(_edges(a), _edges(b), max_shift)
+        is_shifted.append(bool(scores.max() - scores[max_shift, max_shift] > _MIN_MOTION_GAIN))
+    return any(is_shifted)
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:
@@ -134,11 +137,11 @@ def _grey(frame: RangeFrame) -> Float32 | None:
 def _log_depth(frame: RangeFrame) -> Float32:
     """Logarithm of depth (H, W); holes are filled from their surroundings to avoid edges."""
     z = np.where(frame.valid, frame.z, 0).astype(np.float32)
-    known = (z > 0).astype(np.float32)
-    spread = cv2.GaussianBlur(np.log(np.maximum(z, 1e-3)) * known, (0, 0), 3)
-    weight = cv2.GaussianBlur(known, (0, 0), 3)
-    around = spread / np.maximum(weight, 1e-6)
-    return np.where(known > 0, np.log(np.maximum(z, 1e-3)), around).astype(np.float32)
+    valid = (z > 0).astype(np.float32)
+    blurred = cv2.GaussianBlur(np.log(np.maximum(z, 1e-3)) * valid, (0, 0), 3)
+    weight = cv2.GaussianBlur(valid, (0, 0), 3)
+    filled = blurred / np.maximum(weight, 1e-6)
+    return np.where(valid > 0, np.log(np.maximum(z, 1e-3)), filled).astype(np.float32)
 
 
 def _edges(image: Float32) -> Float32:
@@ -149,8 +152,8 @@ def _edges(image: Float32) -> Float32:
     small = cv2.GaussianBlur(small, (0, 0), 1.0)
     strength = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
     # Strong edges saturate.
-    strong = float(np.percentile(strength, 95)) or 1.0
-    return np.minimum(strength / max(strong, 1e-6), 1.0).astype(np.float32)
+    saturation = float(np.percentile(strength, 95)) or 1.0
+    return np.minimum(strength / max(saturation, 1e-6), 1.0).astype(np.float32)
 
 
 def _correlation(a: Float32, b: Float32) -> float:
@@ -159,19 +162,18 @@ def _correlation(a: Float32, b: Float32) -> float:
     return float((a * b).sum()) / size if size > 0 else 0.0
 
 
-def _fit_unshifted(edges: Sequence[tuple[Float32, Float32]]) -> bool:
+def _peaks_at_zero_shift(edges: Sequence[tuple[Float32, Float32]]) -> bool:
     """Whether edges of two channels coincide best without a shift.
 
-    Those of different things correlate too where both lie in the same part of the images, but
-    then a shift fits as well.
+    Unrelated edges in the same part of the images correlate too, but then a shift fits as well.
     """
-    reach = round(_MAX_SHIFT * edges[0][0].shape[1])
-    scores = np.mean([_shifted(a, b, reach) for a, b in edges], axis=0)
+    max_shift = round(_MAX_SHIFT * edges[0][0].shape[1])
+    scores = np.mean([_shift_correlations(a, b, max_shift) for a, b in edges], axis=0)
     i, j = np.unravel_index(int(scores.argmax()), scores.shape)
-    return bool(np.hypot(i - reach, j - reach) <= _PEAK_PIXELS)
+    return bool(np.hypot(i - max_shift, j - max_shift) <= _PEAK_RADIUS_PX)
 
 
-def _shifted(a: Float32, b: Float32, reach: int) -> Float64:
-    """Correlations of the centre of `a` with `b`, for shifts of up to `reach` rows and columns."""
-    inner = a[reach:-reach, reach:-reach]
-    return cv2.matchTemplate(b, np.ascontiguousarray(inner), cv2.TM_CCOEFF_NORMED).astype(float)
+def _shift_correlations(a: Float32, b: Float32, max_shift: int) -> Float64:
+    """Correlations of the centre of `a` with `b`, for shifts of up to `max_shift` pixels."""
+    template = a[max_shift:-max_shift, max_shift:-max_shift]
+    return cv2.matchTemplate(b, np.ascontiguousarray(template), cv2.TM_CCOEFF_NORMED).astype(float)

@@ -15,7 +15,7 @@ from tofuse.recordings.recording import Recording
 
 
 def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
-    """Return facts about a recording by name, as text, from some of its frames."""
+    """Return facts about a recording by name, as text, from a sample of its frames."""
     facts = {
         "recording": recording.path,
         "format": recording.format,
@@ -50,9 +50,9 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
         np.degrees(np.arctan(rays[rays.shape[0] // 2, :, 0])),
         np.degrees(np.arctan(rays[:, rays.shape[1] // 2, 1])),
     )
-    wide, high = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
+    width, height = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
     model = getattr(frame.camera, "model", type(frame.camera).__name__)
-    also = [
+    channels = [
         name + ("" if name != "colour" or frame.color_registered else " (not registered)")
         for name, image in (
             ("amplitude", frame.amplitude_image),
@@ -64,17 +64,17 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     ]
     family = family_of(recording, frame)
     lens = frame.camera.fit if isinstance(frame.camera, RayTable) else frame.camera
-    out = {
-        "images": f"{frame.camera.width} x {frame.camera.height}, {wide:.0f} x {high:.0f} degrees, "
-        f"{model} camera",
+    facts = {
+        "images": f"{frame.camera.width} x {frame.camera.height}, "
+        f"{width:.0f} x {height:.0f} degrees, {model} camera",
         "noise model": family if family != "unknown" else "unknown camera",
     }
     if isinstance(lens, Pinhole):
         focal, centre = f"{lens.fx:.1f}, {lens.fy:.1f}", f"{lens.cx:.1f}, {lens.cy:.1f}"
-        out["intrinsics"] = f"f {focal} pixels, centre {centre}"
-    return out | {
+        facts["intrinsics"] = f"f {focal} pixels, centre {centre}"
+    return facts | {
         "kind of depth": "z" if frame.depth_kind == "z" else "radial range",
-        "other images": ", ".join(also) or "none",
+        "other images": ", ".join(channels) or "none",
     }
 
 

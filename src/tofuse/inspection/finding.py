@@ -30,7 +30,7 @@ CODES: dict[str, tuple[Severity, str]] = {
     "saturated": ("warning", "Many pixels are saturated."),
     "few_valid": ("warning", "Few pixels are valid."),
     "flying_pixels": ("warning", "Many pixels are between surfaces, at depth edges."),
-    # What comes of it is measured by tracking, and decides the verdict.
+    # The effect of these is measured by tracking, and decides the verdict.
     "little_overlap": ("warning", "Consecutive frames overlap too little."),
     "moving_objects": ("warning", "Something moves in front of the camera."),
     "fast_motion": ("warning", "The camera moves fast for the frame rate."),

@@ -3,7 +3,7 @@
 A wrong focal length stretches the world of a view laterally, and planes stay planes. But when the
 camera rotates, the stretched direction changes: the rotation from texture differs from that of the
 normals of walls, and no rigid motion fits both. So views are aligned again under several focal
-lengths, and the one with the best agreement is right. Pure translation is not informative.
+lengths, and the one with the best agreement is correct. Pure translation is not informative.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 
-# Rotation between views as a fraction of the field of view, and the smallest useful rotation.
-_TURN, _MIN_TURN = 0.25, np.radians(4.0)
+# Desired rotation between views as a fraction of the field of view, and the minimum useful one.
+_DESIRED_ROTATION, _MIN_ROTATION = 0.25, np.radians(4.0)
 _MAX_GAP = 60  # frames between views
 _MIN_PAIRS, _MAX_PAIRS = 6, 12
 # Logarithms of the tested factors of the rays.
 _LOG_SCALES = np.array([-0.42, -0.28, -0.14, 0.0, 0.14, 0.28, 0.42])
-_UNCHANGED = 3
-# Smallest lead in score, also in standard errors, and significance of the scale.
-_LEAD, _LEAD_SIGMAS, _SIGMAS = 0.015, 1.5, 3.0
-_MIN_LOG_SCALE, _AGREES, _WELL = 0.08, 0.5, 0.75
+_NOMINAL = 3
+# Minimum lead in score, also in standard errors, and significance of the scale.
+_MIN_LEAD, _MIN_LEAD_SIGMAS, _MIN_SIGMAS = 0.015, 1.5, 3.0
+_MIN_LOG_SCALE, _MIN_SCORE, _MIN_MEAN_SCORE = 0.08, 0.5, 0.75
 
 
 def check_focal(sample: Sample) -> Iterator[Finding]:
@@ -41,62 +41,64 @@ def check_focal(sample: Sample) -> Iterator[Finding]:
         return
     if any(check_kind(sample)):
         return
-    pairs = _turned_pairs(sample)
+    pairs = _rotated_pairs(sample)
     if len(pairs) < _MIN_PAIRS:
         return
     scores = np.array([_scores(pair) for pair in pairs])
-    # Views that are inconsistent under all focal lengths have another fault.
-    scores = scores[scores.max(1) > _AGREES]
+    # Views that are inconsistent under all focal lengths have a different fault.
+    scores = scores[scores.max(1) > _MIN_SCORE]
     if len(scores) < _MIN_PAIRS:
         return
     best = int(scores.mean(0).argmax())
     # At either end it may not be a maximum; with low scores it is not significant.
-    if best in (0, _UNCHANGED, len(_LOG_SCALES) - 1) or scores[:, best].mean() < _WELL:
+    if best in (0, _NOMINAL, len(_LOG_SCALES) - 1) or scores[:, best].mean() < _MIN_MEAN_SCORE:
         return
-    lead = scores[:, best] - scores[:, _UNCHANGED]
+    lead = scores[:, best] - scores[:, _NOMINAL]
     error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
     # Jackknife over the pairs (Efron 1982), at the same maximum.
-    tops = np.array([_top(np.delete(scores, k, 0).mean(0), best) for k in range(len(scores))])
-    sigma = float(np.sqrt((len(tops) - 1) * tops.var()))
-    log_scale = _top(scores.mean(0), best)
-    if lead.mean() > max(_LEAD, _LEAD_SIGMAS * error) and abs(log_scale) > max(
-        _MIN_LOG_SCALE, _SIGMAS * sigma
+    peaks = np.array(
+        [_parabola_peak(np.delete(scores, k, 0).mean(0), best) for k in range(len(scores))]
+    )
+    sigma = float(np.sqrt((len(peaks) - 1) * peaks.var()))
+    log_scale = _parabola_peak(scores.mean(0), best)
+    if lead.mean() > max(_MIN_LEAD, _MIN_LEAD_SIGMAS * error) and abs(log_scale) > max(
+        _MIN_LOG_SCALE, _MIN_SIGMAS * sigma
     ):
         factor = float(np.exp(-log_scale))
         yield wrong_focal(factor, factor * max(sigma, 0.01), "frames disagree")
 
 
-def _top(score: Float64, best: int) -> float:
+def _parabola_peak(score: Float64, best: int) -> float:
     """The maximum of the parabola through an inner score and its neighbours."""
     a, b, c = score[best - 1 : best + 2]
-    bend = a - 2 * b + c
-    shift = 0.0 if bend >= 0 else 0.5 * (a - c) / bend
+    curvature = a - 2 * b + c
+    shift = 0.0 if curvature >= 0 else 0.5 * (a - c) / curvature
     return float(_LOG_SCALES[best] + np.clip(shift, -1.0, 1.0) * (_LOG_SCALES[1] - _LOG_SCALES[0]))
 
 
-def _turned_pairs(sample: Sample) -> list[Pair]:
+def _rotated_pairs(sample: Sample) -> list[Pair]:
     """Pairs of views with enough rotation between them."""
-    out = []
+    pairs = []
     for step in sample.pairs[:_MAX_PAIRS]:
         if not step.fits:
             continue
-        wanted = _TURN * field_of_view(step.first)
-        gap = int(np.clip(np.round(wanted / max(step.angle, 1e-4)), 1, _MAX_GAP))
-        if gap * step.angle < _MIN_TURN:
+        desired = _DESIRED_ROTATION * field_of_view(step.first)
+        gap = int(np.clip(np.round(desired / max(step.angle, 1e-4)), 1, _MAX_GAP))
+        if gap * step.angle < _MIN_ROTATION:
             continue
-        pair = step if gap == 1 else _distant(sample, step, gap)
+        pair = step if gap == 1 else _pair_at_gap(sample, step, gap)
         if pair is not None:
-            out.append(pair)
-    return out
+            pairs.append(pair)
+    return pairs
 
 
-def _distant(sample: Sample, step: Pair, gap: int) -> Pair | None:
+def _pair_at_gap(sample: Sample, step: Pair, gap: int) -> Pair | None:
     """The pair of the same first frame and one `gap` frames later, or earlier near the end."""
     recording = sample.recording
-    here = int(np.searchsorted(recording.indices, sample.frames[step.i].index))
+    position = int(np.searchsorted(recording.indices, sample.frames[step.i].index))
     starts = [0, *part_starts(recording), len(recording)]
-    part = int(np.searchsorted(starts, here, "right"))
-    for k in (here + gap, here - gap):
+    part = int(np.searchsorted(starts, position, "right"))
+    for k in (position + gap, position - gap):
         if not starts[part - 1] <= k < starts[part]:
             continue
         try:
@@ -104,20 +106,20 @@ def _distant(sample: Sample, step: Pair, gap: int) -> Pair | None:
         except UnreadableFrameError:
             continue
         if isinstance(frame, RangeFrame) and frame.valid.any():
-            other = prepare_view(frame, SurfaceOptions(columns=VIEW_COLUMNS))
-            return aligned_pair(step.first, other, step.i, k)
+            second = prepare_view(frame, SurfaceOptions(columns=VIEW_COLUMNS))
+            return aligned_pair(step.first, second, step.i, k)
     return None
 
 
 def _scores(pair: Pair) -> list[float]:
     """Alignment score of the views under each of the focal lengths."""
-    out = []
+    scores = []
     for log_scale in _LOG_SCALES:
         scale = float(np.exp(log_scale))
         first, second = _scaled(pair.first, scale), _scaled(pair.second, scale)
-        start = aligned(second, first, pair.T_first_second).T_world_source
-        out.append(aligned(second, first, start).score)
-    return out
+        T_first_second = aligned(second, first, pair.T_first_second).T_world_source
+        scores.append(aligned(second, first, T_first_second).score)
+    return scores
 
 
 def _scaled(view: PreparedView, scale: float) -> PreparedView:

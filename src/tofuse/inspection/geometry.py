@@ -11,45 +11,46 @@ from tofuse.inspection.finding import Finding
 from tofuse.inspection.planar import Distortion, fit_distortion
 from tofuse.inspection.sample import Sample
 
-# Tolerance and largest standard deviation of the exponent that is 0, or 1 or -1 for the wrong kind.
-_KIND_WITHIN, _KIND_SIGMA = 0.3, 0.12
-# Smaller errors of rays don't matter; those below this number of standard deviations are unproven.
-_STRETCH, _FOCAL = 0.045, 0.05
-_STRETCH_SIGMAS, _SIGMAS = 3.0, 4.0
+# Tolerance and maximum standard deviation of the exponent: 0, or 1 or -1 for the wrong kind.
+_KIND_TOLERANCE, _MAX_KIND_SIGMA = 0.3, 0.12
+# Smaller errors of rays are irrelevant; below this number of standard deviations, insignificant.
+_MIN_STRETCH, _MIN_FOCAL_ERROR = 0.045, 0.05
+_MIN_STRETCH_SIGMAS, _MIN_FOCAL_SIGMAS = 3.0, 4.0
 _MIN_SCALE = -0.8
 _MIN_SURFACES = 4
-# Surfaces with a larger misfit, relative to the depth, under any lens are not planar.
-_FLAT = 0.012
-# Distortion that leaves a smaller fraction of the misfit of planes is its main cause.
-_EXPLAINED = 0.9
-# Largest offset of the principal point from the image centre, as a fraction of the image size.
-_OFF_CENTRE = 0.2
+# Surfaces with a larger misfit under every lens, relative to the depth, are not planar.
+_MAX_MISFIT = 0.012
+# Distortion is the main cause of a misfit of planes if it leaves a smaller fraction of it.
+_MAX_UNEXPLAINED = 0.9
+# Maximum offset of the principal point from the image centre, as a fraction of the image size.
+_MAX_CENTRE_OFFSET = 0.2
 # Limits of the focal length as fractions of the width: 150 and 12 degrees field of view.
 _MIN_FOCAL, _MAX_FOCAL = 0.13, 4.8
 
 
 def check_kind(sample: Sample) -> Iterator[Finding]:
     """Check that planes are not distorted as if z were taken for range, or the reverse."""
-    b = _distortion(sample)
-    if b is None:
+    distortion = _distortion(sample)
+    if distortion is None:
         return
     kind = sample.images[0].depth_kind
-    (alpha, sigma) = b.first
-    wrong = 1.0 if kind == "z" else -1.0
-    if sigma > _KIND_SIGMA or abs(alpha - wrong) > _KIND_WITHIN:
+    (alpha, sigma) = distortion.first
+    wrong_exponent = 1.0 if kind == "z" else -1.0
+    if sigma > _MAX_KIND_SIGMA or abs(alpha - wrong_exponent) > _KIND_TOLERANCE:
         return
     evidence = {
         "exponent": alpha,
         "sigma": sigma,
-        "rms_fraction": b.rms_before,
-        "rms_share_if_corrected": b.rms_after,
+        "rms_fraction": distortion.rms_before,
+        "rms_share_if_corrected": distortion.rms_after,
     }
-    surfaces = f"{b.surfaces} surfaces"
+    surfaces = f"{distortion.surfaces} surfaces"
     if kind == "z":
         yield Finding(
             "range_taken_for_z",
             f"Walls bulge as if radial range were taken for z: planes fit {surfaces} to "
-            f"{b.rms_after:.2%} of the depth as range, and to {b.rms_before:.2%} as z.",
+            f"{distortion.rms_after:.2%} of the depth as range, and to "
+            f"{distortion.rms_before:.2%} as z.",
             'Set depth_kind to "range".',
             evidence,
         )
@@ -57,7 +58,8 @@ def check_kind(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "z_taken_for_range",
             f"Walls are concave as if z were taken for radial range: planes fit {surfaces} to "
-            f"{b.rms_after:.2%} of the depth as z, and to {b.rms_before:.2%} as range.",
+            f"{distortion.rms_after:.2%} of the depth as z, and to "
+            f"{distortion.rms_before:.2%} as range.",
             'Set depth_kind to "z".',
             evidence,
         )
@@ -67,25 +69,26 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
     """Check that planes are not distorted by the lens or a wrong focal length."""
     if any(check_kind(sample)):
         return  # the planes are distorted anyway
-    found = _distortion(sample)
+    distortion = _distortion(sample)
     kind = sample.images[0].depth_kind if sample.images else "z"
-    lens = None if found is None else fit_distortion(sample.regions, sample.radius, kind)
-    if lens is None or lens.rms_after > _FLAT or lens.folds:
+    lens = None if distortion is None else fit_distortion(sample.regions, sample.radius, kind)
+    if lens is None or lens.rms_after > _MAX_MISFIT or lens.folds:
         return  # too few surfaces, or no planes
     stretch, sigma = lens.stretch
-    scale, scale_sigma = lens.first
-    # Other errors of the depth bend surfaces as well, and few surfaces may agree by chance.
-    explains = lens.rms_after < _EXPLAINED * lens.rms_before
-    by_chance = 0.0 if explains else lens.quantile(_STRETCH_SIGMAS)
+    focal_error, focal_sigma = lens.first
+    # Other depth errors bend surfaces too, and few surfaces may be consistent by chance.
+    explains = lens.rms_after < _MAX_UNEXPLAINED * lens.rms_before
+    by_chance = 0.0 if explains else lens.quantile(_MIN_STRETCH_SIGMAS)
     if (
         kind == "range"
-        and abs(scale) > max(_FOCAL, max(_SIGMAS, by_chance) * scale_sigma)
-        and scale > _MIN_SCALE
-        and abs(scale) / scale_sigma > abs(stretch) / sigma
+        and abs(focal_error)
+        > max(_MIN_FOCAL_ERROR, max(_MIN_FOCAL_SIGMAS, by_chance) * focal_sigma)
+        and focal_error > _MIN_SCALE
+        and abs(focal_error) / focal_sigma > abs(stretch) / sigma
     ):
-        yield wrong_focal(1 / (1 + scale), scale_sigma, "planes are distorted")
+        yield wrong_focal(1 / (1 + focal_error), focal_sigma, "planes are distorted")
         return
-    if abs(stretch) > max(_STRETCH, max(_STRETCH_SIGMAS, by_chance) * sigma):
+    if abs(stretch) > max(_MIN_STRETCH, max(_MIN_STRETCH_SIGMAS, by_chance) * sigma):
         yield Finding(
             "lens_distortion",
             f"Planes are distorted as by an uncorrected lens: rays at the corners deviate by "
@@ -96,11 +99,11 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def wrong_focal(factor: float, sigma: float, why: str) -> Finding:
-    """Return the finding that the focal length is wrong by `factor`, at which `why` is weakest."""
+def wrong_focal(factor: float, sigma: float, symptom: str) -> Finding:
+    """Return the finding of a focal length wrong by `factor`, at which the symptom is weakest."""
     return Finding(
         "focal_length",
-        f"The focal length does not match these images: {why} least at {factor:.2f} times the "
+        f"The focal length does not match these images: {symptom} least at {factor:.2f} times the "
         f"stated one (+-{sigma:.2f}).",
         "Use the intrinsics of the depth camera, at this resolution; not those of the colour "
         "camera.",
@@ -110,8 +113,8 @@ def wrong_focal(factor: float, sigma: float, why: str) -> Finding:
 
 def _distortion(sample: Sample) -> Distortion | None:
     """The distortion of planes, if there are enough surfaces."""
-    found = sample.distortion if sample.images else None
-    return found if found is not None and found.surfaces >= _MIN_SURFACES else None
+    distortion = sample.distortion if sample.images else None
+    return distortion if distortion is not None and distortion.surfaces >= _MIN_SURFACES else None
 
 
 def check_intrinsics(sample: Sample) -> Iterator[Finding]:
@@ -122,16 +125,16 @@ def check_intrinsics(sample: Sample) -> Iterator[Finding]:
     lens = _pinhole(camera)
     if lens is None:
         return
-    off_x = (lens.cx - (lens.width - 1) / 2) / lens.width
-    off_y = (lens.cy - (lens.height - 1) / 2) / lens.height
+    offset_x = (lens.cx - (lens.width - 1) / 2) / lens.width
+    offset_y = (lens.cy - (lens.height - 1) / 2) / lens.height
     evidence = {
-        "cx_off_fraction": off_x,
-        "cy_off_fraction": off_y,
+        "cx_off_fraction": offset_x,
+        "cy_off_fraction": offset_y,
         "fx_fraction": lens.fx / lens.width,
         "fx_over_fy": lens.fx / lens.fy,
     }
-    where = "Use the intrinsics of the depth camera at this resolution."
-    if max(abs(off_x), abs(off_y)) > _OFF_CENTRE:
+    remedy = "Use the intrinsics of the depth camera at this resolution."
+    if max(abs(offset_x), abs(offset_y)) > _MAX_CENTRE_OFFSET:
         text = (
             f"The principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the centre of "
             f"images of {lens.width} x {lens.height}: these are intrinsics of another resolution "
@@ -145,7 +148,7 @@ def check_intrinsics(sample: Sample) -> Iterator[Finding]:
         )
     else:
         return
-    yield Finding("other_intrinsics", text, where, evidence)
+    yield Finding("other_intrinsics", text, remedy, evidence)
 
 
 def _pinhole(camera: Camera) -> Pinhole | None:

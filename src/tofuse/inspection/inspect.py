@@ -23,7 +23,7 @@ PAIRS, QUICK_PAIRS = 8, 4
 
 Check = Callable[[Sample], Iterable[Finding]]
 
-# In the order in which findings of one severity are reported.
+# In the order in which findings of equal severity are reported.
 QUICK: tuple[Check, ...] = (
     values.check_unit,
     values.check_valid,
@@ -127,7 +127,7 @@ def inspect_recording(
     notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
     if not sample.frames:
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
-    # Results of BLAS depend on its number of threads.
+    # BLAS results depend on its number of threads.
     with threadpool_limits(1):
         findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))

@@ -15,15 +15,15 @@ from tofuse.inspection.sample import Sample
 # Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)
 _MIN_FRAMES = 3
-# Smallest overlap of neighbours, and largest image motion, as fractions of the image.
-_OVERLAP, _FAST = 0.5, 0.2
-# Fraction of the image in which something moved, and fraction of the pairs with it.
-_MOVED, _OFTEN = 0.015, 0.5
-_FITS_WELL = 0.65
-# Fraction of the pixels of a view that are on its largest plane, for a single-plane view.
-_WALL_FRACTION = 0.8
-# Largest misfit of a plane, relative to the depth.
-_FLAT = 0.02
+# Minimum overlap of neighbours, and maximum image motion, as fractions of the image.
+_MIN_OVERLAP, _MAX_SHIFT = 0.5, 0.2
+# Minimum fraction of the image with moving objects, and minimum fraction of pairs with such motion.
+_MIN_MOVED, _MIN_FREQUENCY = 0.015, 0.5
+_MIN_SCORE = 0.65
+# Minimum fraction of the pixels on the largest plane in a single-plane view.
+_MIN_WALL_FRACTION = 0.8
+# Maximum misfit of a plane, relative to the depth.
+_MAX_MISFIT = 0.02
 
 
 def check_still(sample: Sample) -> Iterator[Finding]:
@@ -47,14 +47,14 @@ def _stands_still(sample: Sample) -> bool:
         return False
     if not all(_still(p) for p in sample.distant_pairs):
         return False
-    # In degenerate directions an alignment stays at its start, so edges are compared too.
+    # In degenerate directions an alignment keeps its initial pose, so edges are compared too.
     images = sample.images
     return not any(channels.shifted(images[0], image) for image in images[1:])
 
 
 def _still(pair: Pair) -> bool:
     distance = float(np.linalg.norm(pair.T_first_second[:3, 3]))
-    return pair.alignment.overlap > _OVERLAP and distance < _STILL_M and pair.angle < _STILL_RAD
+    return pair.alignment.overlap > _MIN_OVERLAP and distance < _STILL_M and pair.angle < _STILL_RAD
 
 
 def check_motion(sample: Sample) -> Iterator[Finding]:
@@ -62,7 +62,7 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
     pairs = sample.pairs
     if sample.turning or len(pairs) < 2:
         return
-    lost = [p for p in pairs if not p.fits or p.alignment.overlap < _OVERLAP]
+    lost = [p for p in pairs if not p.fits or p.alignment.overlap < _MIN_OVERLAP]
     if 2 * len(lost) >= len(pairs):
         yield Finding(
             "little_overlap",
@@ -77,7 +77,7 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
         )
         return
     shift = float(np.median([p.shift for p in pairs if p.fits]))
-    if shift > _FAST:
+    if shift > _MAX_SHIFT:
         angle = float(np.degrees(np.median([p.angle for p in pairs if p.fits])))
         yield Finding(
             "fast_motion",
@@ -92,17 +92,21 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
     """Check for objects that move by themselves."""
     if sample.turning or not sample.pairs:
         return
-    # Slow motion shows in distant frames, if the camera stands still. Shifted edges are not used to
+    # Slow motion is visible between distant frames, if the camera stands still. Shifted edges don't
     # decide that: they may be those of the object.
-    still = [p for p in sample.distant_pairs if _still(p)]
-    apart = _moved(still) if len(still) >= _OFTEN * len(sample.distant_pairs) else np.zeros(0)
-    fractions = max(
-        _moved(sample.pairs),
-        apart,
-        key=lambda moved: np.mean(moved > _MOVED) if len(moved) else 0.0,
+    still_pairs = [p for p in sample.distant_pairs if _still(p)]
+    distant_fractions = (
+        _moved_fractions(still_pairs)
+        if len(still_pairs) >= _MIN_FREQUENCY * len(sample.distant_pairs)
+        else np.zeros(0)
     )
-    frequency = float(np.mean(fractions > _MOVED)) if len(fractions) else 0.0
-    if frequency >= _OFTEN:
+    fractions = max(
+        _moved_fractions(sample.pairs),
+        distant_fractions,
+        key=lambda moved: np.mean(moved > _MIN_MOVED) if len(moved) else 0.0,
+    )
+    frequency = float(np.mean(fractions > _MIN_MOVED)) if len(fractions) else 0.0
+    if frequency >= _MIN_FREQUENCY:
         yield Finding(
             "moving_objects",
             f"Something moves in front of the camera: in {frequency:.0%} of the pairs of frames "
@@ -113,12 +117,14 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def _moved(pairs: Sequence[Pair]) -> Float64:
-    """Fraction of the image that moved, for each consistent pair; empty if these are too few."""
-    fit = [p for p in pairs if p.alignment.score > _FITS_WELL and p.fits and p.shift < _FAST]
-    if len(fit) < max(2, _OFTEN * len(pairs)):
+def _moved_fractions(pairs: Sequence[Pair]) -> Float64:
+    """Fraction of the image that moved, for each consistent pair; empty with too few pairs."""
+    consistent = [
+        p for p in pairs if p.alignment.score > _MIN_SCORE and p.fits and p.shift < _MAX_SHIFT
+    ]
+    if len(consistent) < max(2, _MIN_FREQUENCY * len(pairs)):
         return np.zeros(0)
-    return np.array([p.moved_fraction for p in fit])
+    return np.array([p.moved_fraction for p in consistent])
 
 
 def check_walls(sample: Sample) -> Iterator[Finding]:
@@ -127,15 +133,15 @@ def check_walls(sample: Sample) -> Iterator[Finding]:
         return
     largest = dict.fromkeys(sample.views, 0.0)
     for region in sample.regions:
-        if region.misfit > _FLAT:
+        if region.misfit > _MAX_MISFIT:
             continue
         largest[region.frame] = max(largest[region.frame], region.fraction)
-    bare = [fraction > _WALL_FRACTION for fraction in largest.values()]
-    if np.mean(bare) >= _OFTEN:
+    single_plane = [fraction > _MIN_WALL_FRACTION for fraction in largest.values()]
+    if np.mean(single_plane) >= _MIN_FREQUENCY:
         yield Finding(
             "wall_only",
-            f"{sum(bare)} of {len(bare)} frames show a single plane, along which the motion of the "
-            "camera is not observable.",
+            f"{sum(single_plane)} of {len(single_plane)} frames show a single plane, along which "
+            "the motion of the camera is not observable.",
             "Keep a corner, furniture or texture in view.",
-            {"frames": len(bare), "single_plane": sum(bare)},
+            {"frames": len(single_plane), "single_plane": sum(single_plane)},
         )

@@ -1,4 +1,4 @@
-"""Camera motion between pairs of frames, and the part of the image that moved by itself."""
+"""Camera motion between pairs of frames, and the part of the image with moving objects."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tofuse.registration.view_points import landing_pixels
 _OPTIONS = ProjectiveOptions(
     levels=(Level(2, 8, 0.03, 0.1), Level(2, 3, 0.005, 0.02), Level(1, 2, 0.0, 0.0))
 )
-# An alignment with this score needs no other start.
-_GOOD_SCORE = 0.7
-# Rotations of further starts, as fractions of the field of view, in all four directions.
-_STARTS = (0.2, 0.4, 0.6)
-# Points that are before the other view's surface by this number of sigmas and fraction of z moved.
+# An alignment with this score needs no other initial pose.
+_SUFFICIENT_SCORE = 0.7
+# Rotations of further initial poses, as fractions of the field of view, in all four directions.
+_START_ROTATIONS = (0.2, 0.4, 0.6)
+# Points in front of the other view's surface by this number of sigmas and fraction of z have moved.
 _MOVED_SIGMAS, _MOVED_FRACTION = 4.0, 0.05
 _MIN_COMPARED = 200
-# Largest width in pixels of false detections at edges, from smoothing and pose errors.
+# Maximum width in pixels of false detections at edges, from smoothing and pose errors.
 _MAX_EDGE = 5
 
 
@@ -88,24 +88,24 @@ def field_of_view(view: PreparedView) -> float:
 
 
 def aligned_pair(first: PreparedView, second: PreparedView, i: int, j: int) -> Pair:
-    """Align views of frames `i` and `j`, from no motion, and if that fails from rotations."""
+    """Align views of frames `i` and `j`, from the identity, and if that fails from rotations."""
     best = aligned(second, first, np.eye(4))
-    if best.score < _GOOD_SCORE:
-        wide = field_of_view(first)
-        for fraction in _STARTS:
+    if best.score < _SUFFICIENT_SCORE:
+        fov = field_of_view(first)
+        for fraction in _START_ROTATIONS:
             for axis in (1, 0):
                 for sign in (1, -1):
                     xi = np.zeros(6)
-                    xi[3 + axis] = sign * fraction * wide
-                    other = aligned(second, first, se3.exp(xi))
-                    best = max(best, other, key=lambda a: a.score)
-            if best.score >= _GOOD_SCORE:
+                    xi[3 + axis] = sign * fraction * fov
+                    candidate = aligned(second, first, se3.exp(xi))
+                    best = max(best, candidate, key=lambda a: a.score)
+            if best.score >= _SUFFICIENT_SCORE:
                 break
     return Pair(i, j, first, second, best)
 
 
 def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64) -> Aligned:
-    """Align two small views from a start; without photometric terms if that fails."""
+    """Align two small views from an initial pose; without photometric terms if that fails."""
     targets = [Target(target, np.eye(4))]
     for options in (_OPTIONS, replace(_OPTIONS, photometric=False)):
         try:
@@ -113,10 +113,10 @@ def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64
         except np.linalg.LinAlgError:
             continue
     # The views do not overlap.
-    nothing = np.zeros((6, 6))
+    zeros = np.zeros((6, 6))
     return Aligned(
-        T_world_source=T_target_source, converged=False, iterations=0, information=nothing,
-        cross=nothing, unobservable=np.eye(6), points=0, landed=0, compared=0, inliers=0,
+        T_world_source=T_target_source, converged=False, iterations=0, information=zeros,
+        cross=zeros, unobservable=np.eye(6), points=0, projected=0, compared=0, inliers=0,
         in_front=0, rms_m=np.inf, scale=1.0, photo_scale=0.0, score=-1.0,
     )  # fmt: skip
 
@@ -127,9 +127,9 @@ def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float
     Single pixels and thin edges are ignored: they are flying pixels, or due to pose errors.
     """
     rows, columns = target.z.shape
-    on = source.z > 0
+    is_valid = source.z > 0
     points = np.concatenate([source.rays, np.ones_like(source.rays[..., :1])], -1)
-    points = se3.transform(T_target_source, (points * source.z[..., None])[on].astype(float))
+    points = se3.transform(T_target_source, (points * source.z[..., None])[is_valid].astype(float))
     pixels = landing_pixels(target, points)
     inside = (
         (points[:, 2] > 0.05)
@@ -138,17 +138,17 @@ def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float
         & (pixels[:, 1] < rows)
     )
     u, v = pixels[inside].T
-    # The nearest in 3 x 3 pixels, as edges may be off by one; 0 where any is unknown.
-    known = np.where(target.z > 0, target.z, 0).astype(np.float32)
-    behind = ndimage.minimum_filter(known, 3, mode="nearest")[v, u]
-    sigma = np.hypot(target.sigma[v, u], source.sigma[on][inside])
-    gap = behind - points[inside, 2]
-    front = gap > np.maximum(_MOVED_SIGMAS * sigma, _MOVED_FRACTION * behind)
-    compared = int(np.count_nonzero(behind > 0))
+    # The nearest of 3 x 3 pixels, as edges may be displaced by one; 0 where any is invalid.
+    z = np.where(target.z > 0, target.z, 0).astype(np.float32)
+    surface_z = ndimage.minimum_filter(z, 3, mode="nearest")[v, u]
+    sigma = np.hypot(target.sigma[v, u], source.sigma[is_valid][inside])
+    clearance = surface_z - points[inside, 2]
+    is_in_front = clearance > np.maximum(_MOVED_SIGMAS * sigma, _MOVED_FRACTION * surface_z)
+    compared = int(np.count_nonzero(surface_z > 0))
     if compared < _MIN_COMPARED:
         return 0.0
     image = np.zeros(source.z.shape, bool)
-    where = np.flatnonzero(on.ravel())[inside]
-    image.ravel()[where[front]] = True
-    opened: Bool = ndimage.binary_opening(image, np.ones((_MAX_EDGE,) * 2, bool))
-    return float(np.count_nonzero(opened)) / compared
+    flat_index = np.flatnonzero(is_valid.ravel())[inside]
+    image.ravel()[flat_index[is_in_front]] = True
+    cleaned: Bool = ndimage.binary_opening(image, np.ones((_MAX_EDGE,) * 2, bool))
+    return float(np.count_nonzero(cleaned)) / compared

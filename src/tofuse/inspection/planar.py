@@ -1,9 +1,9 @@
-"""Errors of rays and depth, estimated from how planes are distorted.
+"""Errors of rays and depth, estimated from the distortion of planes.
 
-In inverse depth ``w = 1/z`` a plane is linear in the ray coordinates: ``w = a x + b y + c``. What
-was recorded as z but is radial range has ``w = L^-1 (a x + b y + c)``, with the length L of the ray
-(x, y, 1) (eq 2.3 of the thesis), and the reverse; rays that are off by a factor ``q = 1 + t1 rho^2
-+ t2 rho^4`` (Brown 1966; rho is the distance from the axis in units of the image's corner) distort
+In inverse depth ``w = 1/z`` a plane is linear in the ray coordinates: ``w = a x + b y + c``. Radial
+range recorded as z has ``w = L^-1 (a x + b y + c)``, with the length L of the ray (x, y, 1) (eq 2.3
+of the thesis), and vice versa; rays that are wrong by a factor ``q = 1 + t1 rho^2 + t2 rho^4``
+(Brown 1966; rho is the distance from the axis in units of the image's corner) distort
 ``a x + b y`` but not a fronto-parallel wall. So the two can be distinguished. All smooth regions
 are fitted jointly, each with its own plane, all with the same three parameters, by Gauss-Newton
 with the planes eliminated:
@@ -12,7 +12,7 @@ with the planes eliminated:
     range:  w L(x p) / L(x)  = a x p + b y p + c      (s, t1, t2), with p = s + q
 
 and "z" is the first with alpha = 0. The last is for radial range, whose z depends on the rays:
-there a wrong focal length distorts planes too. Not for z: a wrong focal length stretches the whole
+there a wrong focal length distorts planes too. Not for z: a wrong focal length stretches the
 world, and planes stay planes. Along a corridor alpha and t1 are equivalent; then neither is known.
 
 Their covariance is computed from the disagreement of the surfaces (sandwich estimator: White 1980),
@@ -39,18 +39,18 @@ Model = Literal["kind", "z", "range"]
 
 # Neighbouring pixels belong to one surface if their normals differ by less than this angle, and
 # their planes predict each other's depth within this number of sigmas or this fraction of it.
-_SAME_NORMAL_COSINE = np.cos(np.radians(10.0))
-_SAME_SIGMAS, _SAME_FRACTION = 3.0, 0.01
-# Smaller regions, as a fraction of the image, are not distorted enough to be of use.
+_MIN_NORMAL_COSINE = np.cos(np.radians(10.0))
+_MAX_PLANE_SIGMAS, _MAX_PLANE_FRACTION = 3.0, 0.01
+# Smaller regions, as a fraction of the image, are not distorted enough to be informative.
 _MIN_FRACTION = 0.02
 _MAX_POINTS = 1500
 # Errors are correlated over patches of about this number of pixels.
 _CORRELATED_PIXELS = 25.0
 _ITERATIONS = 6
-# Regions of different frames are of one surface if they are this near in ray coordinates, with
-# similar normals.
-_SAME_PLACE, _SAME_PLACE_COSINE = 0.12, np.cos(np.radians(12.0))
-_ROBUST = 3.0
+# Regions of different frames belong to one surface if they are within this distance in ray
+# coordinates, with similar normals.
+_MAX_PLACE_DISTANCE, _MIN_PLACE_COSINE = 0.12, np.cos(np.radians(12.0))
+_CUTOFF_SIGMAS = 3.0
 # Prior standard deviations of the three parameters.
 _PRIOR: dict[Model, Float64] = {
     "kind": np.array([3.0, 0.15, 0.15]),
@@ -96,14 +96,14 @@ def regions_of(view: PreparedView, frame: int) -> list[Region]:
     """Return the smooth regions of a view, without edges and creases, for frame number `frame`."""
     planes = view.planes
     w = planes[..., 3]
-    on = (w > 0) & (view.z > 0) & (view.sigma > 0) & np.isfinite(view.sigma)
-    on &= np.isfinite(view.normals).all(-1) & np.isfinite(view.rays).all(-1)
-    labels = _labels(view, on)
-    counts = np.bincount(labels[on]) if on.any() else np.zeros(0, int)
-    out = []
-    valid = max(int(np.count_nonzero(view.z > 0)), 1)
-    for label in np.flatnonzero(counts >= _MIN_FRACTION * on.size):
-        v, u = np.nonzero(on & (labels == label))
+    is_valid = (w > 0) & (view.z > 0) & (view.sigma > 0) & np.isfinite(view.sigma)
+    is_valid &= np.isfinite(view.normals).all(-1) & np.isfinite(view.rays).all(-1)
+    labels = _labels(view, is_valid)
+    counts = np.bincount(labels[is_valid]) if is_valid.any() else np.zeros(0, int)
+    regions = []
+    n_valid = max(int(np.count_nonzero(view.z > 0)), 1)
+    for label in np.flatnonzero(counts >= _MIN_FRACTION * is_valid.size):
+        v, u = np.nonzero(is_valid & (labels == label))
         step = -(-len(v) // _MAX_POINTS)
         v, u = v[::step], u[::step]
         z = view.z[v, u].astype(float)
@@ -111,31 +111,33 @@ def regions_of(view: PreparedView, frame: int) -> list[Region]:
         sigma = view.sigma[v, u].astype(float) / z**2
         normal = view.normals[v, u].astype(float).mean(0)
         normal /= np.linalg.norm(normal)
-        out.append(Region(frame, x, y, 1 / z, sigma, float(counts[label]) / valid, normal))
-    return out
+        regions.append(Region(frame, x, y, 1 / z, sigma, float(counts[label]) / n_valid, normal))
+    return regions
 
 
-def _labels(view: PreparedView, on: Bool) -> Int64:
+def _labels(view: PreparedView, is_valid: Bool) -> Int64:
     """(H, W) label of the region of each pixel."""
-    rows, columns = on.shape
+    rows, columns = is_valid.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     normals, planes, rays = view.normals, view.planes, view.rays
-    tolerance = np.hypot(_SAME_FRACTION, _SAME_SIGMAS * view.sigma / np.maximum(view.z, 1e-3))
+    tolerance = np.hypot(
+        _MAX_PLANE_FRACTION, _MAX_PLANE_SIGMAS * view.sigma / np.maximum(view.z, 1e-3)
+    )
     starts, ends = [], []
     for a, b in (
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
         ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
     ):
-        same = on[a] & on[b]
-        same &= (normals[a] * normals[b]).sum(-1) > _SAME_NORMAL_COSINE
-        here = planes[b][..., :2] * rays[a]
-        there = here[..., 0] + here[..., 1] + planes[b][..., 2]
-        same &= np.abs(there - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
-        starts.append(number[a][same])
-        ends.append(number[b][same])
+        is_same = is_valid[a] & is_valid[b]
+        is_same &= (normals[a] * normals[b]).sum(-1) > _MIN_NORMAL_COSINE
+        terms = planes[b][..., :2] * rays[a]
+        predicted_w = terms[..., 0] + terms[..., 1] + planes[b][..., 2]
+        is_same &= np.abs(predicted_w - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
+        starts.append(number[a][is_same])
+        ends.append(number[b][is_same])
     i, j = np.concatenate(starts), np.concatenate(ends)
     graph = sparse.coo_matrix((np.ones(len(i), bool), (i, j)), shape=(number.size,) * 2)
-    return connected_components(graph, directed=False)[1].reshape(on.shape).astype(np.int64)
+    return connected_components(graph, directed=False)[1].reshape(is_valid.shape).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,7 @@ class Distortion:
         return float(g @ self.values), float(np.sqrt(g @ self.covariance @ g))
 
     def quantile(self, sigmas: float) -> float:
-        """Return the multiple of a standard deviation as rare as `sigmas` of a normal variable.
+        """Return the multiple of a standard deviation with the probability of `sigmas` if normal.
 
         Standard deviations are estimated from few surfaces: Student's t distribution.
         """
@@ -183,7 +185,7 @@ class Distortion:
 
     @property
     def folds(self) -> bool:
-        """Whether it would map two rays of the image onto one, as no lens does.
+        """Whether it maps two rays of the image onto one, which no lens does.
 
         Such a fit follows surfaces that are not planar.
         """
@@ -236,21 +238,21 @@ def fit_distortion(regions: Sequence[Region], radius: float, model: Model) -> Di
 
 def _same_surface(regions: Sequence[Region]) -> Int64:
     """(R,) surface number of each region; overlapping regions of different frames share one."""
-    out = np.zeros(len(regions), np.int64)
-    last: list[Region] = []
+    surface_of = np.zeros(len(regions), np.int64)
+    latest: list[Region] = []
     for n, region in enumerate(regions):
-        known = [
+        nearby = [
             (float(np.hypot(region.x.mean() - r.x.mean(), region.y.mean() - r.y.mean())), k)
-            for k, r in enumerate(last)
-            if r.frame != region.frame and float(region.normal @ r.normal) > _SAME_PLACE_COSINE
+            for k, r in enumerate(latest)
+            if r.frame != region.frame and float(region.normal @ r.normal) > _MIN_PLACE_COSINE
         ]
-        distance, k = min(known, default=(np.inf, 0))
-        if distance > _SAME_PLACE:
-            k = len(last)
-            last.append(region)
-        last[k] = region
-        out[n] = k
-    return out
+        distance, k = min(nearby, default=(np.inf, 0))
+        if distance > _MAX_PLACE_DISTANCE:
+            k = len(latest)
+            latest.append(region)
+        latest[k] = region
+        surface_of[n] = k
+    return surface_of
 
 
 def _residuals(
@@ -263,32 +265,32 @@ def _residuals(
     length = 0.5 * np.log1p(r2)
     stretch = 1 + theta[1] * rho2 + theta[2] * rho2**2
     if model != "range":
-        bent = region.w * np.exp(theta[0] * length)
+        observed = region.w * np.exp(theta[0] * length)
     else:
         stretch = stretch + theta[0]
-        bent = region.w * np.sqrt((1 + r2 * stretch**2) / (1 + r2))
+        observed = region.w * np.sqrt((1 + r2 * stretch**2) / (1 + r2))
     B = np.stack([x * stretch, y * stretch, np.ones_like(x)], 1)
     base = 1 / region.sigma**2
     weight = base
     for _ in range(2 if np.isfinite(bound) else 5):
         root = np.sqrt(weight)
-        plane = np.linalg.lstsq(B * root[:, None], bent * root, rcond=None)[0]
-        e = bent - B @ plane
-        reach = bound if np.isfinite(bound) else _ROBUST * _spread(e)
-        weight = base * np.maximum(1 - (e / reach) ** 2, 0) ** 2
+        plane = np.linalg.lstsq(B * root[:, None], observed * root, rcond=None)[0]
+        e = observed - B @ plane
+        cutoff = bound if np.isfinite(bound) else _CUTOFF_SIGMAS * _spread(e)
+        weight = base * np.maximum(1 - (e / cutoff) ** 2, 0) ** 2
     slope = plane[0] * x + plane[1] * y
     if model != "range":
-        first, by_stretch = bent * length, -slope
+        by_first, by_stretch = observed * length, -slope
     else:
-        by_stretch = bent * r2 * stretch / (1 + r2 * stretch**2) - slope
-        first = by_stretch
-    G = np.stack([first, by_stretch * rho2, by_stretch * rho2**2], 1)
+        by_stretch = observed * r2 * stretch / (1 + r2 * stretch**2) - slope
+        by_first = by_stretch
+    G = np.stack([by_first, by_stretch * rho2, by_stretch * rho2**2], 1)
     # Project out the plane's parameters.
     root = np.sqrt(weight)[:, None]
     G = G - B @ np.linalg.lstsq(B * root, G * root, rcond=None)[0]
-    # The actual noise, as the stated one may be wrong by a factor, and correlated between pixels.
+    # Rescaled to the actual noise: the stated one may be wrong by a factor, and is correlated.
     scale = max(_spread(e / region.sigma), 0.3)
-    return e, G, weight / (scale**2 * _CORRELATED_PIXELS), _ROBUST * _spread(e)
+    return e, G, weight / (scale**2 * _CORRELATED_PIXELS), _CUTOFF_SIGMAS * _spread(e)
 
 
 def _spread(e: Float64) -> float:

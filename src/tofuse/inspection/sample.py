@@ -17,24 +17,24 @@ from tofuse.recordings.recording import Recording, evenly
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 
-# The faults concern the whole image; a higher resolution would only take longer.
+# Faults affect the full image; a higher resolution would only take longer.
 VIEW_COLUMNS = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Some frames of a recording, with lazily computed views, pairs and regions.
+    """A sample of frames of a recording, with lazily computed views, pairs and regions.
 
     Attributes
     ----------
     recording
-        The whole recording, for its timestamps.
+        The full recording, for its timestamps.
     frames
-        The readable ones, in order.
+        The readable frames of the sample, in order.
     steps
         (i, j) positions in `frames` of consecutive frames of the recording.
     unreadable
-        Errors of the others.
+        Errors of the unreadable frames.
     turning
         Whether, according to the user, an object turns in front of a stationary camera.
     """
@@ -59,23 +59,23 @@ class Sample:
             Whether an object turns in front of a stationary camera.
         """
         n = len(recording)
-        firsts = evenly(np.arange(max(n - 1, 1)), count)
-        wanted = np.unique(np.concatenate([firsts, np.minimum(firsts + 1, n - 1)]))
+        first_of_pair = evenly(np.arange(max(n - 1, 1)), count)
+        selected = np.unique(np.concatenate([first_of_pair, np.minimum(first_of_pair + 1, n - 1)]))
         frames: list[Frame] = []
         unreadable: list[UnreadableFrameError] = []
-        place: dict[int, int] = {}
-        for k in wanted.tolist():
+        position_of: dict[int, int] = {}
+        for k in selected.tolist():
             try:
                 frames.append(recording[k])
             except UnreadableFrameError as error:
                 unreadable.append(error)
                 continue
-            place[k] = len(frames) - 1
+            position_of[k] = len(frames) - 1
         breaks = set(part_starts(recording))
         steps = [
-            (place[k], place[k + 1])
-            for k in sorted(place)
-            if k + 1 in place and k + 1 not in breaks
+            (position_of[k], position_of[k + 1])
+            for k in sorted(position_of)
+            if k + 1 in position_of and k + 1 not in breaks
         ]
         return cls(recording, tuple(frames), tuple(steps), tuple(unreadable), turning)
 
@@ -130,8 +130,8 @@ class Sample:
     @cached_property
     def period_m(self) -> float | None:
         """Range in m after which the phase repeats; None if not known."""
-        known = {f.ambiguity_m for f in self.images}
-        period = known.pop() if len(known) == 1 else None
+        periods = {f.ambiguity_m for f in self.images}
+        period = periods.pop() if len(periods) == 1 else None
         if period is None:
             stated = self.recording.metadata.get("ambiguity_m")
             period = float(stated) if isinstance(stated, int | float) and stated > 0 else None
@@ -140,7 +140,7 @@ class Sample:
 
 def part_starts(recording: Recording) -> list[int]:
     """Return the positions in a recording at which further joined recordings begin."""
-    joined = recording.metadata.get("parts", ())
-    starts = list(accumulate(part["frames"] for part in joined))[:-1]
+    parts = recording.metadata.get("parts", ())
+    starts = list(accumulate(part["frames"] for part in parts))[:-1]
     indices: Intp = recording.indices
     return [int(np.searchsorted(indices, s)) for s in starts]

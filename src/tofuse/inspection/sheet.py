@@ -26,7 +26,7 @@ _MASK = (
     ("flying", (226, 40, 160)),
     ("lowest confidence", (240, 190, 70)),
 )
-_LINES = 125
+_LINE_WIDTH = 125
 
 
 def write_sheet(inspection: Inspection, path: Path) -> Path:
@@ -44,31 +44,31 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
     frames = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(_COLUMNS, len(frames)))]
     lines = _lines(inspection)
     columns = max(len(frames), 2)
-    height = 0.135 * len(lines) + 0.45
-    pictures = 3 * 1.75
-    figure = Figure(figsize=(2.35 * columns, pictures + height), facecolor="white")
+    text_height = 0.135 * len(lines) + 0.45
+    images_height = 3 * 1.75
+    figure = Figure(figsize=(2.35 * columns, images_height + text_height), facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
-        3, columns, left=0.01, right=0.90, top=1 - 0.3 / (pictures + height),
-        bottom=height / (pictures + height), wspace=0.04, hspace=0.16,
+        3, columns, left=0.01, right=0.90, top=1 - 0.3 / (images_height + text_height),
+        bottom=text_height / (images_height + text_height), wspace=0.04, hspace=0.16,
     )  # fmt: skip
     limits = _limits(frames)
     for column, frame in enumerate(frames):
         axes = [figure.add_subplot(grid[row, column]) for row in range(3)]
-        shown = _draw(axes, frame, limits)
+        drawn = _draw(axes, frame, limits)
         axes[0].set_title(f"frame {frame.index}", fontsize=8)
-        if column == len(frames) - 1 and shown is not None:
-            place = axes[0].get_position()
-            bar = figure.add_axes((0.915, place.y0, 0.012, place.height))
-            figure.colorbar(shown, cax=bar)
+        if column == len(frames) - 1 and drawn is not None:
+            box = axes[0].get_position()
+            bar = figure.add_axes((0.915, box.y0, 0.012, box.height))
+            figure.colorbar(drawn, cax=bar)
             bar.tick_params(labelsize=7)
             bar.set_title("m", fontsize=8)
     for row, (name, colour) in enumerate(_MASK):
         figure.text(
-            0.912, (height + 0.25 * row) / (pictures + height), f"■ {name}", fontsize=6,
-            color=np.array(colour) / 255 * 0.75,
+            0.912, (text_height + 0.25 * row) / (images_height + text_height), f"■ {name}",
+            fontsize=6, color=np.array(colour) / 255 * 0.75,
         )  # fmt: skip
-    top = (height - 0.2) / (pictures + height)
+    top = (text_height - 0.2) / (images_height + text_height)
     figure.text(0.012, top, "\n".join(lines), fontsize=7.5, va="top", family="monospace")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,11 +85,11 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
 def _lines(inspection: Inspection) -> list[str]:
     facts = inspection.facts
     shown = ("recording", "format", "frames", "time", "images", "depth is", "depth", "with")
-    out = [f"{name:<10} {facts[name]}"[:_LINES] for name in shown if name in facts]
+    out = [f"{name:<10} {facts[name]}"[:_LINE_WIDTH] for name in shown if name in facts]
     out.append("")
     for finding in inspection.findings:
         text = f"{finding.severity}: {finding.code}: {finding.text}"
-        out += textwrap.wrap(text, _LINES, subsequent_indent="    ")
+        out += textwrap.wrap(text, _LINE_WIDTH, subsequent_indent="    ")
     if not inspection.findings:
         out.append("all checks passed")
     return [line.replace("$", r"\$") for line in out]

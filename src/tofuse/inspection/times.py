@@ -12,12 +12,12 @@ from tofuse.recordings.frames import RangeFrame
 
 # Relative tolerance of regular intervals; with a smaller fraction of regular ones the camera was
 # triggered manually, and gaps are meaningless.
-_REGULAR_WITHIN, _REGULAR_FRACTION = 0.25, 0.75
-_GAP = 1.75
-_SAME_S = 1e-6
+_REGULAR_TOLERANCE, _MIN_REGULAR_FRACTION = 0.25, 0.75
+_MIN_GAP = 1.75
+_MIN_STEP_S = 1e-6
 _MIN_STEPS = 4
-# Fraction of missing frames that is tolerated.
-_MISSING_FRACTION = 0.01
+# Maximum tolerated fraction of missing frames.
+_MAX_MISSING_FRACTION = 0.01
 
 
 def check_times(sample: Sample) -> Iterator[Finding]:
@@ -28,37 +28,37 @@ def check_times(sample: Sample) -> Iterator[Finding]:
     )
     if len(steps) == 0:
         return
-    steps = np.where(np.abs(steps) < _SAME_S, 0.0, steps)
-    back = int(np.count_nonzero(steps < 0))
-    if back:
+    steps = np.where(np.abs(steps) < _MIN_STEP_S, 0.0, steps)
+    n_backward = int(np.count_nonzero(steps < 0))
+    if n_backward:
         yield Finding(
             "time_unsorted",
-            f"{back} of {len(steps)} timestamps are earlier than the previous one, by up to "
+            f"{n_backward} of {len(steps)} timestamps are earlier than the previous one, by up to "
             f"{-steps.min():.3g} s.",
             "Sort the frames by time, or correct timestamps.txt: they are used to predict motion.",
-            {"backward_steps": back, "largest_s": float(-steps.min())},
+            {"backward_steps": n_backward, "largest_s": float(-steps.min())},
         )
-    same = int(np.count_nonzero(steps == 0))
-    if same:
+    n_equal = int(np.count_nonzero(steps == 0))
+    if n_equal:
         yield Finding(
             "time_repeated",
-            f"{same} of {len(steps)} timestamps are equal to the previous one.",
+            f"{n_equal} of {len(steps)} timestamps are equal to the previous one.",
             "Correct timestamps.txt, or remove frames that were stored twice.",
-            {"repeated": same},
+            {"repeated": n_equal},
         )
     forward = steps[steps > 0]
-    if back or len(forward) < _MIN_STEPS:
+    if n_backward or len(forward) < _MIN_STEPS:
         return
-    usual = float(np.median(forward))
-    regular = float(np.mean(np.abs(forward / usual - 1) < _REGULAR_WITHIN))
-    gaps = forward[forward > _GAP * usual]
-    missing = int(np.round(gaps / usual).sum()) - len(gaps)
-    if regular >= _REGULAR_FRACTION and missing > _MISSING_FRACTION * len(times):
+    interval = float(np.median(forward))
+    regular = float(np.mean(np.abs(forward / interval - 1) < _REGULAR_TOLERANCE))
+    gaps = forward[forward > _MIN_GAP * interval]
+    missing = int(np.round(gaps / interval).sum()) - len(gaps)
+    if regular >= _MIN_REGULAR_FRACTION and missing > _MAX_MISSING_FRACTION * len(times):
         yield Finding(
             "frames_missing",
             f"About {missing} frames are missing: the timestamps have {len(gaps)} "
             f"gap{'s' if len(gaps) > 1 else ''} of up to {gaps.max():.3g} s; the median "
-            f"interval is {usual:.3g} s.",
+            f"interval is {interval:.3g} s.",
             "Record to a faster disk, or at a lower rate; tracking may fail at the gaps.",
             {"missing": missing, "gaps": len(gaps), "largest_s": float(gaps.max())},
         )
@@ -66,16 +66,16 @@ def check_times(sample: Sample) -> Iterator[Finding]:
 
 def check_repeats(sample: Sample) -> Iterator[Finding]:
     """Check for consecutive images that are identical."""
-    same = compared = 0
+    repeated = compared = 0
     for i, j in sample.steps:
         a, b = sample.frames[i], sample.frames[j]
         if isinstance(a, RangeFrame) and isinstance(b, RangeFrame):
             compared += 1
-            same += bool(a.valid.any()) and np.array_equal(a.depth, b.depth)
-    if same:
+            repeated += bool(a.valid.any()) and np.array_equal(a.depth, b.depth)
+    if repeated:
         yield Finding(
             "frames_repeated",
-            f"{same} of {compared} sampled images are identical to the previous one.",
+            f"{repeated} of {compared} sampled images are identical to the previous one.",
             "Skip them (--every), or find out why the camera or its driver froze.",
-            {"repeated": same, "compared": compared},
+            {"repeated": repeated, "compared": compared},
         )

@@ -12,21 +12,22 @@ from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.unwrap import on_surface
 
-# Typical distances of ToF cameras are in between, m.
-_NEAREST_M, _FARTHEST_M = 0.15, 12.0
-_FEW_VALID, _MANY_SATURATED = 0.1, 0.05
-# At an edge the surfaces _REACH pixels to both sides differ by the fraction _STEP of the depth, and
-# each changes by less than the fraction _EVEN of that difference over two pixels; flying pixels are
-# farther than the fraction _INSIDE of it from both.
-_REACH, _STEP, _INSIDE, _EVEN = 4, 0.15, 0.2, 0.1
-_WIDE, _MANY_FLYING = 4.5, 0.01
+# Range of typical distances of ToF cameras, m.
+_MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0
+_MIN_VALID, _MAX_SATURATED = 0.1, 0.05
+# At an edge the surfaces _REACH pixels to both sides differ by the fraction _MIN_STEP of the depth,
+# and each changes by less than the fraction _MAX_CHANGE of that difference over two pixels; flying
+# pixels are farther than the fraction _MIN_INSIDE of it from both.
+_REACH, _MIN_STEP, _MIN_INSIDE, _MAX_CHANGE = 4, 0.15, 0.2, 0.1
+_MAX_EDGE_WIDTH, _MAX_FLYING = 4.5, 0.01
 # At a seam of a phase wrap, ranges above and below these fractions of the period are adjacent.
 _LATE, _EARLY = 0.85, 0.15
-_SEAM_FRACTION = 0.003
-# Near pixels with a lower apparent albedo, relative to the median, are beyond the period.
+_MAX_SEAM_FRACTION = 0.003
+# Pixels nearer than this fraction of the period with a lower apparent albedo, relative to the
+# median, are wrapped.
 _DARK, _NEAR = 0.12, 0.5
-_DARK_FRACTION = 0.08
-# Smallest number of edge pixels per image to judge flying pixels.
+_MAX_DARK_FRACTION = 0.08
+# Minimum number of edge pixels per image to assess flying pixels.
 _MIN_EDGES = 100
 
 
@@ -53,9 +54,9 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
     evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
     if period is not None and median > period:
         problem = f"but the ambiguity range of this camera is {period:.3g} m"
-    elif median > _FARTHEST_M:
+    elif median > _MAX_DISTANCE_M:
         problem = "farther than ToF cameras measure"
-    elif median < _NEAREST_M:
+    elif median < _MIN_DISTANCE_M:
         problem = "nearer than ToF cameras measure"
     else:
         return
@@ -75,7 +76,7 @@ def _factor(median: float) -> float:
 def check_valid(sample: Sample) -> Iterator[Finding]:
     """Check that enough pixels are valid."""
     valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
-    if 0 < valid < _FEW_VALID:
+    if 0 < valid < _MIN_VALID:
         yield Finding(
             "few_valid",
             f"Only {valid:.1%} of the pixels are valid.",
@@ -91,7 +92,7 @@ def check_saturation(sample: Sample) -> Iterator[Finding]:
         for f in sample.images
         if f.amplitude_image is not None
     ]
-    if saturated and (fraction := float(np.mean(saturated))) > _MANY_SATURATED:
+    if saturated and (fraction := float(np.mean(saturated))) > _MAX_SATURATED:
         yield Finding(
             "saturated",
             f"{fraction:.0%} of the pixels are saturated and invalid.",
@@ -104,14 +105,14 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
     """Check the number of flying pixels and the width of depth edges."""
     flying = edges = valid = 0
     for frame in sample.images:
-        between, across = _flying(frame.radial_range, frame.valid)
-        flying += int(np.count_nonzero(between))
-        edges += int(np.count_nonzero(across))
+        is_flying, is_edge = _flying(frame.radial_range, frame.valid)
+        flying += int(np.count_nonzero(is_flying))
+        edges += int(np.count_nonzero(is_edge))
         valid += len(frame)
     if edges < _MIN_EDGES * max(len(sample.images), 1):
         return
     width, fraction = 2 * _REACH * flying / edges, flying / valid
-    if width > _WIDE and fraction > _MANY_FLYING:
+    if width > _MAX_EDGE_WIDTH and fraction > _MAX_FLYING:
         yield Finding(
             "flying_pixels",
             f"{fraction:.1%} of the pixels are flying pixels between near and far surfaces: edges "
@@ -128,32 +129,34 @@ def flying_pixels(frame: RangeFrame) -> Bool:
 
 def _flying(r: Float32, valid: Bool) -> tuple[Bool, Bool]:
     """Masks (H, W) of flying pixels, and of all pixels at depth edges between smooth surfaces."""
-    between, across = np.zeros(r.shape, bool), np.zeros(r.shape, bool)
-    far = _REACH + 2
+    is_flying, is_edge = np.zeros(r.shape, bool), np.zeros(r.shape, bool)
+    margin = _REACH + 2
     for axis in (0, 1):
         n = r.shape[axis]
-        if n <= 2 * far:
+        if n <= 2 * margin:
             continue
 
-        def at(shift: int, axis: int = axis, n: int = n) -> tuple[slice, ...]:
-            part = slice(far + shift, n - far + shift)
+        def shifted(shift: int, axis: int = axis, n: int = n) -> tuple[slice, ...]:
+            part = slice(margin + shift, n - margin + shift)
             return (part, slice(None)) if axis == 0 else (slice(None), part)
 
-        here, a, b = r[at(0)], r[at(-_REACH)], r[at(_REACH)]
+        center, a, b = r[shifted(0)], r[shifted(-_REACH)], r[shifted(_REACH)]
         gap = np.abs(b - a)
-        known = valid[at(0)] & valid[at(-_REACH)] & valid[at(_REACH)]
-        known &= valid[at(-far)] & valid[at(far)]
-        edge = known & (gap > _STEP * np.minimum(a, b))
-        edge &= (np.abs(a - r[at(-far)]) < _EVEN * gap) & (np.abs(b - r[at(far)]) < _EVEN * gap)
-        # Smooth in the other direction too, unlike noise.
+        measured = valid[shifted(0)] & valid[shifted(-_REACH)] & valid[shifted(_REACH)]
+        measured &= valid[shifted(-margin)] & valid[shifted(margin)]
+        edge = measured & (gap > _MIN_STEP * np.minimum(a, b))
+        edge &= (np.abs(a - r[shifted(-margin)]) < _MAX_CHANGE * gap) & (
+            np.abs(b - r[shifted(margin)]) < _MAX_CHANGE * gap
+        )
+        # Also smooth in the other direction, unlike noise.
         for side in (-_REACH, _REACH):
             for offset in (-1, 1):
-                other = np.roll(r, offset, 1 - axis)[at(side)]
-                edge &= np.abs(r[at(side)] - other) < _EVEN * gap
-        across[at(0)] |= edge
-        inner = np.minimum(np.abs(here - a), np.abs(b - here)) > _INSIDE * gap
-        between[at(0)] |= edge & inner & ((here - a) * (b - here) > 0)
-    return between, across
+                neighbour = np.roll(r, offset, 1 - axis)[shifted(side)]
+                edge &= np.abs(r[shifted(side)] - neighbour) < _MAX_CHANGE * gap
+        is_edge[shifted(0)] |= edge
+        inner = np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
+        is_flying[shifted(0)] |= edge & inner & ((center - a) * (b - center) > 0)
+    return is_flying, is_edge
 
 
 def check_wrap(sample: Sample) -> Iterator[Finding]:
@@ -178,15 +181,15 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
         albedo = _apparent_albedo(frame, r)
         if albedo is None:
             continue
-        known = frame.valid & (albedo > 0)
-        with_albedo += int(np.count_nonzero(known))
-        if not known.any():
+        usable = frame.valid & (albedo > 0)
+        with_albedo += int(np.count_nonzero(usable))
+        if not usable.any():
             continue
-        typical = float(np.median(albedo[known]))
-        near = known & surface & (r < _NEAR * period)
+        typical = float(np.median(albedo[usable]))
+        near = usable & surface & (r < _NEAR * period)
         dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
     seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
-    if seam_fraction > _SEAM_FRACTION or dark_fraction > _DARK_FRACTION:
+    if seam_fraction > _MAX_SEAM_FRACTION or dark_fraction > _MAX_DARK_FRACTION:
         yield Finding(
             "phase_wrap",
             f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "

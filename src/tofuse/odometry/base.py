@@ -24,7 +24,7 @@ class Step:
     status
         "tracked"; "predicted" where all directions are degenerate; "lost" without a pose.
     reason
-        Why it is not tracked, or what was unusual in tracking it; may be empty.
+        Why it is not tracked, or anything unusual in tracking it; may be empty.
     T_component_camera
         (4, 4) pose in the frame of its component; None where lost.
     reference
@@ -40,9 +40,9 @@ class Step:
     links
         Registrations of this frame to frames of other components, which may join them.
     doubtful
-        Whether it fits worse than views of this camera usually do.
+        Whether it fits worse than usual for views of this camera.
     inflation
-        Factor by which it enlarged the standard deviations of the registration for that reason.
+        Factor by which the standard deviations of the registration were enlarged for that reason.
     moving
         (H, W) mask of the frame's pixels on moving objects; None without any.
     """
@@ -80,7 +80,7 @@ class Tracker(Protocol):
         ...
 
     def prepare(self, frame: Frame) -> PreparedView | None:
-        """Prepare a frame before its turn, as far as that depends on it alone; None if it doesn't.
+        """Prepare a frame in advance, as far as that depends on it alone; None if it doesn't.
 
         May be called by other threads while earlier frames are tracked.
         """

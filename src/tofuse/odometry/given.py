@@ -31,9 +31,9 @@ from tofuse.registration.uncertainty import covariance
 class GivenPoses(Bounded, Odometry):
     """Adopts the poses of external odometry unchanged.
 
-    Each frame is aligned with the newest keyframe, or with the nearest one where that sees another
-    place, to measure the motion between them by the images; the pose stays as given. Moving
-    objects are left out. A frame without a pose is lost.
+    Each frame is aligned with the newest keyframe, or with the nearest one if the newest does not
+    overlap it, to measure their relative motion by the images; the pose stays as given. Moving
+    objects are excluded. A frame without a pose is lost.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class _GivenTracker(Tracker):
         if not len(self._keyframes):
             self._keyframes.add(Keyframe(view, T, 0))
             return Step("tracked", "", T, surface=view)
-        keyframe = self._keyframes.in_sight(T)
+        keyframe = self._keyframes.overlapping(T)
         moving = self._objects.compare(view, T, keyframe.view, keyframe.T_component_camera)
         self._objects.update(moving)
         mask = None
@@ -181,7 +181,7 @@ class _StatedTracker(Tracker):
         if stated.T_component_camera is None:
             return Step("lost", stated.reason, None)
         if stated.component not in self._trackers:
-            # Another session of the component may have begun elsewhere.
+            # Another session of the component may have begun at another pose.
             self._trackers[stated.component] = _GivenTracker(self._odometry.options, np.eye(4))
         tracker = self._trackers[stated.component]
         step = tracker.push(frame, stated.T_component_camera, surface)
@@ -199,15 +199,15 @@ class _StatedTracker(Tracker):
 
         The refinement of the earlier result may have constrained it by other views.
         """
-        found = step.registration
-        if found is None or not len(found.unobservable) or step.reference is None:
-            return found
+        registration = step.registration
+        if registration is None or not len(registration.unobservable) or step.reference is None:
+            return registration
         reference = self._odometry.stated[step.reference]
         T, T_reference = stated.T_component_camera, reference.T_component_camera
         if T is None or T_reference is None:
-            return found
+            return registration
         if stated.covariance is None or reference.covariance is None:
-            return found
+            return registration
         T_reference_frame = np.asarray(se3.inverse(T_reference) @ T, np.float64)
         A = se3.adjoint(se3.inverse(T_reference_frame))
         # An upper limit: errors that both poses share cancel.
@@ -215,9 +215,9 @@ class _StatedTracker(Tracker):
         alignment = self._odometry.options.views.alignment
         prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
         if np.linalg.eigvalsh(C / np.outer(prior, prior))[-1] > 1:
-            return found
+            return registration
         return replace(
-            found,
+            registration,
             T_target_source=T_reference_frame,
             information=np.asarray(np.linalg.inv(C + np.diag(_MIN_VARIANCE)), np.float64),
             unobservable=np.zeros((0, 6)),

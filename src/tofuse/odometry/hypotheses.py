@@ -14,15 +14,15 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.verification import PATIENT, Assessment, FitStatistics
 
-# Minimum score of a rotated start relative to that of no rotation: a flat wall fits any.
-_MIN_SCORE_RATIO = 1.03
+# Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
+_MIN_ROTATED_SCORE_RATIO = 1.03
 # A nearly aligned view needs a few more iterations, at the resolution of tracking.
 _CONVERGENCE_LEVELS = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A keyframe, and its view as used for alignment: without what has moved since."""
+    """A keyframe, and its view without moved objects as the target of alignments."""
 
     keyframe: Keyframe
     target: Target
@@ -30,7 +30,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """An alignment of the view with a keyframe, and how it compares with usual ones.
+    """An alignment of the view with a keyframe, and its comparison with usual alignments.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Hypothesis:
     predicted
         Whether it started at the predicted pose.
     note
-        How it was found, in words, if that is unusual.
+        Unusual origin of the alignment, in words; may be empty.
     assessment
         Comparison with usual alignments.
     """
@@ -63,7 +63,7 @@ class Hypothesis:
 
     @property
     def T_keyframe_camera(self) -> Float64:
-        """(4, 4) the same in the frame of the keyframe."""
+        """(4, 4) pose of the view in the frame of the keyframe."""
         T = se3.inverse(self.keyframe.T_component_camera) @ self.T_component_camera
         return np.asarray(T, np.float64)
 
@@ -73,7 +73,7 @@ class Hypotheses:
 
     Parameters
     ----------
-    whole, view
+    full_view, static_view
         The view, and the same without moving objects.
     references
         To align with, the likeliest first.
@@ -84,30 +84,30 @@ class Hypotheses:
         (4, 4) pose of the last frame.
     options
         How views are aligned.
-    usual
-        How views of this camera usually fit.
+    fit_statistics
+        Usual fit of views of this camera.
 
     Attributes
     ----------
     segmented
-        Alternatives to hypotheses without moving objects, as far as these were evaluated.
+        Alternatives without moving objects to the hypotheses for which they were evaluated.
     """
 
     def __init__(
         self,
-        whole: PreparedView,
-        view: PreparedView,
+        full_view: PreparedView,
+        static_view: PreparedView,
         references: Sequence[Reference],
         T_predicted: Float64 | None,
         T_smoothed: Float64 | None,
         T_last: Float64,
         options: ProjectiveOptions,
-        usual: FitStatistics,
+        fit_statistics: FitStatistics,
     ) -> None:
-        self.whole, self.view, self.references = whole, view, references
+        self.full_view, self.static_view, self.references = full_view, static_view, references
         self.T_predicted, self.T_last = T_predicted, T_last
         self._T_smoothed = T_smoothed
-        self._options, self._usual = options, usual
+        self._options, self._fit_statistics = options, fit_statistics
         self._pending = self._generate()
         self._evaluated: list[Hypothesis] = []
         self.segmented: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
@@ -119,7 +119,7 @@ class Hypotheses:
             yield hypothesis
 
     @property
-    def first_objection(self) -> str:
+    def first_rejection(self) -> str:
         """The reason why the likeliest hypothesis was rejected, in words."""
         for hypothesis in self._evaluated:
             if hypothesis.assessment.reason:
@@ -129,7 +129,7 @@ class Hypotheses:
     def realigned(
         self, T: Float64, view: PreparedView, reference: Reference, *, predicted: bool
     ) -> Hypothesis:
-        """Align once more from a pose T (4, 4), with other pixels of the view or the reference."""
+        """Realign from a pose T (4, 4), with other pixels of the view or the reference."""
         aligned = self._align(view, reference, T, self._options)
         return self._hypothesis(aligned, view, reference, "", predicted=predicted)
 
@@ -147,7 +147,7 @@ class Hypotheses:
         return refined if aligned.score >= hypothesis.aligned.score else hypothesis
 
     def _generate(self) -> Iterator[Hypothesis]:
-        T_predicted, view = self.T_predicted, self.view
+        T_predicted, view = self.T_predicted, self.static_view
         if T_predicted is not None:
             prior = T_predicted if self._T_smoothed is None else self._T_smoothed
             for r in self.references:
@@ -155,7 +155,7 @@ class Hypotheses:
                 yield self._hypothesis(aligned, view, r, "", predicted=True)
         reason = "no prediction" if T_predicted is None else "the prediction did not fit"
         for r in self.references:
-            aligned, start = self._from_best_turn(r)
+            aligned, start = self._from_best_rotation(r)
             yield self._hypothesis(
                 aligned, view, r, f"{reason}: aligned from {start}", predicted=False
             )
@@ -169,25 +169,29 @@ class Hypotheses:
         *,
         predicted: bool,
     ) -> Hypothesis:
-        return Hypothesis(aligned, view, reference, predicted, note, self._usual.assess(aligned))
+        return Hypothesis(
+            aligned, view, reference, predicted, note, self._fit_statistics.assess(aligned)
+        )
 
-    def _from_best_turn(self, reference: Reference) -> tuple[Aligned, str]:
-        """Align from the last pose, or from its rotation that fits best; and name the start."""
-        view = self.view
+    def _from_best_rotation(self, reference: Reference) -> tuple[Aligned, str]:
+        """Align from the last pose, or its rotation that fits best; and name the start."""
+        view = self.static_view
         coarse = replace(self._options, levels=PATIENT[:1])
-        motions = _turn_candidates(view)
-        still, *turned = [
+        motions = _rotation_candidates(view)
+        unrotated, *rotated = [
             self._align(view, reference, self.T_last @ motion, coarse) for motion in motions
         ]
-        best = max(range(len(turned)), key=lambda k: turned[k].score)
-        moves = turned[best].score > _MIN_SCORE_RATIO * still.score
-        chosen, name = (turned[best], "a rotation") if moves else (still, "the last pose")
-        if moves:
+        best = max(range(len(rotated)), key=lambda k: rotated[k].score)
+        rotates = rotated[best].score > _MIN_ROTATED_SCORE_RATIO * unrotated.score
+        best_aligned, name = (
+            (rotated[best], "a rotation") if rotates else (unrotated, "the last pose")
+        )
+        if rotates:
             name += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
         # Without a prediction, weakly constrained directions follow the data.
         options = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
-        prior = chosen.T_world_source if moves else self.T_last
-        start = chosen.T_world_source
+        prior = best_aligned.T_world_source if rotates else self.T_last
+        start = best_aligned.T_world_source
         return self._align(view, reference, prior, options, start=start), name
 
     def _align(
@@ -199,12 +203,12 @@ class Hypotheses:
         *,
         start: Float64 | None = None,
     ) -> Aligned:
-        scale = self._usual.noise_scale
+        scale = self._fit_statistics.noise_scale
         return align(view, [reference.target], T, options, start=start, usual_scale=scale)
 
 
-def _turn_candidates(view: PreparedView) -> list[Float64]:
-    """Return motions (4, 4) to try: none, rotations about the camera, and about what it sees."""
+def _rotation_candidates(view: PreparedView) -> list[Float64]:
+    """Return motions (4, 4) to try: none, and rotations about the camera and the scene."""
     centre = np.eye(4)
     centre[2, 3] = view.depth
     motions = [np.eye(4)]
@@ -212,6 +216,6 @@ def _turn_candidates(view: PreparedView) -> list[Float64]:
         for axis in (3, 4):
             twist = np.zeros(6)
             twist[axis] = angle
-            turn = se3.exp(twist)
-            motions += [turn, centre @ turn @ se3.inverse(centre)]
+            rotation = se3.exp(twist)
+            motions += [rotation, centre @ rotation @ se3.inverse(centre)]
     return motions

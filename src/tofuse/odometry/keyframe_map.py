@@ -69,33 +69,35 @@ class KeyframeMap:
     def add(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; beyond the capacity, remove the most redundant one."""
         if self._keyframes:  # from here on used for relocalization only
-            before = self._keyframes[-1]
-            self._keyframes[-1] = replace(before, view=before.view.without_caches())
+            previous = self._keyframes[-1]
+            self._keyframes[-1] = replace(previous, view=previous.view.without_caches())
         self._keyframes.append(keyframe)
         if len(self._keyframes) > CAPACITY:
             del self._keyframes[self._most_redundant()]
 
     def is_far(self, T_component_camera: Float64, keyframe: Keyframe) -> bool:
         """Whether a pose (4, 4) is so far from a keyframe that its view becomes the next one."""
-        between = se3.inverse(keyframe.T_component_camera) @ T_component_camera
+        T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ T_component_camera
         return bool(
-            se3.angle(between) > self._angle
-            or np.linalg.norm(between[:3, 3]) > self._distance * keyframe.depth
+            se3.angle(T_keyframe_camera) > self._angle
+            or np.linalg.norm(T_keyframe_camera[:3, 3]) > self._distance * keyframe.depth
         )
 
-    def in_sight(self, T_component_camera: Float64) -> Keyframe:
-        """Return the newest keyframe, or the nearest one where the newest sees another place.
+    def overlapping(self, T_component_camera: Float64) -> Keyframe:
+        """Return the newest keyframe, or the nearest one if the newest does not overlap a view.
 
         Parameters
         ----------
         T_component_camera
             (4, 4) pose of the view.
         """
-        T = np.stack([k.T_component_camera for k in self._keyframes])
-        between = se3.inverse(T_component_camera) @ T
+        T_component_keyframes = np.stack([k.T_component_camera for k in self._keyframes])
+        T_camera_keyframes = se3.inverse(T_component_camera) @ T_component_keyframes
         depth = np.array([k.depth for k in self._keyframes])
-        away = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
-        return self._keyframes[-1 if away[-1] < IN_SIGHT else int(np.argmin(away))]
+        distances = np.linalg.norm(T_camera_keyframes[:, :3, 3], axis=1) / depth + np.asarray(
+            se3.angle(T_camera_keyframes)
+        )
+        return self._keyframes[-1 if distances[-1] < IN_SIGHT else int(np.argmin(distances))]
 
     def most_similar(self, view: PreparedView, component: int) -> Keyframe | None:
         """Return the most similar keyframe of another component; of ties the newest."""
@@ -103,8 +105,8 @@ class KeyframeMap:
         if not others:
             return None
         descriptors = np.stack([k.descriptor for k in others])
-        far = dissimilarity(view_descriptor(view), descriptors, _MAX_SHIFT)
-        return others[int(np.flatnonzero(far == far.min())[-1])]
+        distances = dissimilarity(view_descriptor(view), descriptors, _MAX_SHIFT)
+        return others[int(np.flatnonzero(distances == distances.min())[-1])]
 
     def _most_redundant(self) -> int:
         """Return the position of the later one of the two keyframes that are nearest in pose.
@@ -112,17 +114,19 @@ class KeyframeMap:
         The earlier one has drifted less. The newest one, which views are tracked against, stays,
         and so does the last one of each component.
         """
-        old = self._keyframes[:-1]
-        T = np.stack([k.T_component_camera for k in old])
-        component = np.array([k.component for k in old])
-        reach = self._distance * np.array([k.depth for k in old])
-        place = T[:, :3, 3]
-        apart = np.linalg.norm(place[:, None] - place, axis=-1) / np.minimum(reach[:, None], reach)
-        turned = np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3])
-        angle = np.arccos(np.clip((turned - 1) / 2, -1, 1)) / self._angle
-        away = np.hypot(apart, angle)
-        away[np.triu_indices(len(old))] = np.inf
-        away[component[:, None] != component] = np.inf
-        if np.isinf(away).all():  # one keyframe per component: remove the oldest
+        candidates = self._keyframes[:-1]
+        T = np.stack([k.T_component_camera for k in candidates])
+        component = np.array([k.component for k in candidates])
+        max_distance = self._distance * np.array([k.depth for k in candidates])
+        positions = T[:, :3, 3]
+        translation = np.linalg.norm(positions[:, None] - positions, axis=-1) / np.minimum(
+            max_distance[:, None], max_distance
+        )
+        trace = np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3])
+        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1)) / self._angle
+        pose_distance = np.hypot(translation, angle)
+        pose_distance[np.triu_indices(len(candidates))] = np.inf
+        pose_distance[component[:, None] != component] = np.inf
+        if np.isinf(pose_distance).all():  # one keyframe per component: remove the oldest
             return 0
-        return int(np.argmin(away.min(1)))
+        return int(np.argmin(pose_distance.min(1)))

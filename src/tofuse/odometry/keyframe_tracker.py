@@ -30,12 +30,12 @@ class KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
-        self._usual = FitStatistics()
-        self._relocalizer = Relocalizer(search if options.searches else None, self._usual)
+        self._fit_statistics = FitStatistics()
+        self._relocalizer = Relocalizer(search if options.searches else None, self._fit_statistics)
         self._motion = MotionModel()
         self._segmentation = MotionSegmentation(self._relocalizer)
         self._selector = HypothesisSelector(
-            self._usual, self._motion, self._segmentation, self._relocalizer
+            self._fit_statistics, self._motion, self._segmentation, self._relocalizer
         )
         self._component = -1
         self._connected = True  # whether a certain link joins the component to an earlier one
@@ -95,15 +95,15 @@ class KeyframeTracker(Tracker):
 
     def _problem_of(self, frame: RangeFrame) -> str:
         """Return why a frame can't be tracked; empty if it can."""
-        minimum = self._options.minimum_points
-        if len(frame) < minimum:
-            return f"{len(frame)} valid points, {minimum} are needed"
-        first = frame.depth.flat[np.argmax(frame.valid)]
+        min_points = self._options.minimum_points
+        if len(frame) < min_points:
+            return f"{len(frame)} valid points, {min_points} are needed"
+        first_depth = frame.depth.flat[np.argmax(frame.valid)]
         # A subset of the pixels is nearly always enough.
         for subset in (np.s_[::8, ::8], np.s_[:, :]):
-            if np.any((frame.depth[subset] != first) & frame.valid[subset]):
+            if np.any((frame.depth[subset] != first_depth) & frame.valid[subset]):
                 return ""
-        return f"every depth is {first:.3g} m"
+        return f"every depth is {first_depth:.3g} m"
 
     def _hypotheses(self, view: PreparedView, now: Moment) -> Hypotheses:
         """Return alignments with the last keyframe and the last frame, from the predicted pose."""
@@ -138,11 +138,11 @@ class KeyframeTracker(Tracker):
             T_smoothed,
             T_last,
             self._options.views.alignment,
-            self._usual,
+            self._fit_statistics,
         )
 
     def _begin_component(self, view: PreparedView, hypotheses: Hypotheses) -> Step:
-        """Begin a component with a view that can't be connected, and search it in the others."""
+        """Begin a component with an unconnected view, and search for links to the others."""
         self._component += 1
         last = None if self._last is None else self._last.view.index
         adjacent = last if self._in_sequence else None
@@ -156,8 +156,8 @@ class KeyframeTracker(Tracker):
         self._segmentation.reset()
         reason = ""
         if self._component:
-            objection = hypotheses.first_objection or "nothing comparable was seen before"
-            reason = f"begins component {self._component}: {objection}"
+            rejection = hypotheses.first_rejection or "nothing comparable was seen before"
+            reason = f"begins component {self._component}: {rejection}"
             if links:
                 reason += f"; {links[-1].how} in frame {links[-1].i}"
         return Step(
@@ -168,9 +168,9 @@ class KeyframeTracker(Tracker):
         self, frame: RangeFrame, selected: Hypothesis, hypotheses: Hypotheses
     ) -> Step:
         """Refine the selected hypothesis without moving objects, and take its pose."""
-        view = hypotheses.whole
+        view = hypotheses.full_view
         accepted, moving = self._segmentation.segment(hypotheses.converged(selected), hypotheses)
-        self._usual.learn(accepted.aligned, view.depth)
+        self._fit_statistics.learn(accepted.aligned, view.depth)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
         mask = None
@@ -192,7 +192,7 @@ class KeyframeTracker(Tracker):
         )
 
     def _insert_keyframe(self, view: PreparedView, accepted: Hypothesis) -> tuple[Link, ...]:
-        """Make a view a keyframe if it is due, and search it while the component is unconnected.
+        """Make a view a keyframe if it is due, and search for links while unconnected.
 
         It is due far from the last keyframe, or where it fits the last frame only; unless the view
         itself is doubtful.
@@ -210,9 +210,9 @@ class KeyframeTracker(Tracker):
         return links
 
     def _registration(self, accepted: Hypothesis) -> Registration:
-        a, targets = accepted.aligned, [accepted.reference.target]
-        C = covariance(accepted.view, targets, a, self._options.views.alignment)
-        return registration_of(a, accepted.T_keyframe_camera, C * _inflation(accepted) ** 2)
+        aligned, targets = accepted.aligned, [accepted.reference.target]
+        C = covariance(accepted.view, targets, aligned, self._options.views.alignment)
+        return registration_of(aligned, accepted.T_keyframe_camera, C * _inflation(accepted) ** 2)
 
 
 def _inflation(accepted: Hypothesis) -> float:
@@ -221,7 +221,7 @@ def _inflation(accepted: Hypothesis) -> float:
 
 
 def _status_of(accepted: Hypothesis, frame: RangeFrame) -> tuple[Status, str]:
-    """Return the status of a frame with a pose, and what was unusual in tracking it."""
+    """Return the status of a frame with a pose, and anything unusual in tracking it."""
     notes = [accepted.note, accepted.assessment.reason]
     if frame.amplitude_image is not None and not accepted.aligned.photometric:
         notes.append("the albedo took no part")

@@ -1,9 +1,9 @@
 """Constant-velocity motion model: the predicted pose of the next frame, and its validation gate.
 
-A camera that is carried or turned changes its velocity little from one frame to the next, so that a
-good fit at a wrong place (another place that looks similar, say) violates the gate. Time is that of
-the timestamps, or the frame index where there are none: after missing frames the predicted motion
-is longer and the gate wider.
+The velocity of a camera changes little from one frame to the next, so that a good fit at a wrong
+place (one that looks similar, for example) violates the gate. Time is that of the timestamps, or
+the frame index where there are none: after missing frames the predicted motion is longer and the
+gate wider.
 """
 
 from __future__ import annotations
@@ -26,38 +26,38 @@ _GATE_SECONDS, _MAX_GATE_SCALE = 0.2, 10.0
 # Largest velocity of a handheld camera, m/s and rad/s.
 HANDHELD = np.array([3.0, 6.0])
 # The gate is wider by this factor times the largest of the recent deviations from the prediction.
-_DEVIATION_FACTOR, _RECENT = 2.0, 4
+_DEVIATION_FACTOR, _DEVIATION_WINDOW = 2.0, 4
 # Deviations of a camera on a tripod are the noise of tracking: m and rad.
 _TRACKING_NOISE = np.array([0.003, np.radians(0.2)])
 # Weight of the newest motion in the exponential moving average of the velocity.
 _NEWEST_WEIGHT = 0.3
-# External odometry is compared with the velocity over this number of recent motions.
-_COMPARED = 10
-# After more frames without a pose than these, without timestamps, nothing is predicted.
+# Number of recent motions over which external odometry is compared with the velocity.
+_COMPARISON_WINDOW = 10
+# Without timestamps, no motion is predicted across more frames without a pose than this.
 _MAX_UNTIMED_GAP = 3
 
 
 @dataclass(frozen=True)
 class Moment:
-    """When a frame was taken: its index, and its time in s, which is the index if none is known."""
+    """When a frame was taken: its index, and its time in s, which is the index if unknown."""
 
     index: int
     timestamp: float
 
     @property
     def is_timed(self) -> bool:
-        """Whether the timestamp says more than the index."""
+        """Whether the timestamp is a time, not the index."""
         return self.timestamp != self.index
 
-    def since(self, before: Moment) -> float:
+    def since(self, earlier: Moment) -> float:
         """Time since another frame, in s, or in frames where only these were counted; above 0."""
-        seconds = self.seconds_since(before)
-        return float(max(self.index - before.index, 1)) if seconds is None else seconds
+        seconds = self.seconds_since(earlier)
+        return float(max(self.index - earlier.index, 1)) if seconds is None else seconds
 
-    def seconds_since(self, before: Moment) -> float | None:
+    def seconds_since(self, earlier: Moment) -> float | None:
         """Time since another frame in s; None where only frames were counted."""
-        timed = (self.is_timed or before.is_timed) and self.timestamp > before.timestamp
-        return self.timestamp - before.timestamp if timed else None
+        timed = (self.is_timed or earlier.is_timed) and self.timestamp > earlier.timestamp
+        return self.timestamp - earlier.timestamp if timed else None
 
 
 class MotionModel:
@@ -77,12 +77,12 @@ class MotionModel:
         self._velocity: Float64 | None = None  # (6,) twist per unit of time, while it is known
         self._mean_velocity: Float64 | None = None  # (6,) its exponential moving average
         self._interval = 1.0  # between the last two frames with a pose
-        self._deviations: deque[Float64] = deque(maxlen=_RECENT)
+        self._deviations: deque[Float64] = deque(maxlen=_DEVIATION_WINDOW)
         # (4, 4) poses of external odometry at the last frame and now; and the errors (2,), m and
         # rad, of recent motions as predicted by it and by the velocity.
         self._T_odometry_before: Float64 | None = None
         self._T_odometry_now: Float64 | None = None
-        self._compared: deque[tuple[Float64, Float64]] = deque(maxlen=_COMPARED)
+        self._prediction_errors: deque[tuple[Float64, Float64]] = deque(maxlen=_COMPARISON_WINDOW)
 
     def set_odometry(self, T_odometry: Float64 | None) -> None:
         """Set the pose (4, 4) of the coming frame by external odometry, in any fixed frame."""
@@ -94,7 +94,7 @@ class MotionModel:
         Position and rotation are those of external odometry, each unless it has predicted recent
         motions worse than the velocity did.
         """
-        return self._by_odometry(self._extrapolated(self._velocity, now), now)
+        return self._with_odometry(self._extrapolated(self._velocity, now), now)
 
     def odometry_pose(self) -> Float64 | None:
         """Return the last pose moved as by external odometry; None without odometry."""
@@ -110,7 +110,7 @@ class MotionModel:
         along it, and the noise of single motions would accumulate. With external odometry as in
         `predicted_pose`.
         """
-        return self._by_odometry(self._extrapolated(self._mean_velocity, now), now)
+        return self._with_odometry(self._extrapolated(self._mean_velocity, now), now)
 
     def gate(self, now: Moment) -> Float64:
         """Return by how much a pose may deviate from the predicted one, (2,), m and rad.
@@ -121,10 +121,10 @@ class MotionModel:
             return np.full(2, np.inf)
         elapsed = now.since(self._last_time) / self._interval
         if self._deviations or self.velocity_is_inherited:
-            usual = np.max([np.zeros(2), *self._deviations], axis=0)
+            typical_deviation = np.max([np.zeros(2), *self._deviations], axis=0)
         else:
             T_next = retract(self._T_last, self._velocity * self._interval)
-            usual = _distance_and_angle(self._T_last, T_next)
+            typical_deviation = _distance_and_angle(self._T_last, T_next)
         seconds = now.seconds_since(self._last_time)
         if seconds is None:
             if elapsed > _MAX_UNTIMED_GAP:
@@ -132,7 +132,9 @@ class MotionModel:
             minimum = GATE * max(elapsed, 1.0)
         else:
             minimum = GATE * min(max((seconds / _GATE_SECONDS) ** 2, 1.0), _MAX_GATE_SCALE)
-        return np.asarray(minimum + _DEVIATION_FACTOR * usual * max(elapsed, 1.0), np.float64)
+        return np.asarray(
+            minimum + _DEVIATION_FACTOR * typical_deviation * max(elapsed, 1.0), np.float64
+        )
 
     def gate_violation(self, T: Float64, now: Moment) -> str:
         """Describe by how much a pose outside of the gate deviates; empty for one inside."""
@@ -163,30 +165,30 @@ class MotionModel:
         T_predicted = self.predicted_pose(now)
         if T_predicted is None or not self._deviations:
             return 0.0
-        usual = np.maximum(np.max(self._deviations, axis=0), _TRACKING_NOISE)
-        return float(np.max(_distance_and_angle(T_predicted, T) / usual))
+        scale = np.maximum(np.max(self._deviations, axis=0), _TRACKING_NOISE)
+        return float(np.max(_distance_and_angle(T_predicted, T) / scale))
 
-    def _by_odometry(self, T: Float64 | None, now: Moment) -> Float64 | None:
+    def _with_odometry(self, T: Float64 | None, now: Moment) -> Float64 | None:
         """Replace the parts of a pose (4, 4) that external odometry has not predicted worse."""
         T_odometry = self.odometry_pose()
         if T_odometry is None:
             return T
         if T is None:
             return T_odometry if self.is_feasible(T_odometry, now) else None
-        by_odometry, by_velocity = np.median(self._compared or [np.zeros((2, 2))], axis=0)
-        position, rotation = by_odometry <= by_velocity
-        out = T.copy()
-        if position:
-            out[:3, 3] = T_odometry[:3, 3]
-        if rotation:
-            out[:3, :3] = T_odometry[:3, :3]
-        return out
+        by_odometry, by_velocity = np.median(self._prediction_errors or [np.zeros((2, 2))], axis=0)
+        use_position, use_rotation = by_odometry <= by_velocity
+        fused = T.copy()
+        if use_position:
+            fused[:3, 3] = T_odometry[:3, 3]
+        if use_rotation:
+            fused[:3, :3] = T_odometry[:3, :3]
+        return fused
 
     def _compare_odometry(self, T: Float64, now: Moment) -> None:
         """Record how well odometry and velocity predicted a pose (4, 4)."""
         T_odometry, T_velocity = self.odometry_pose(), self._extrapolated(self._velocity, now)
         if T_odometry is not None and T_velocity is not None:
-            self._compared.append(
+            self._prediction_errors.append(
                 (_distance_and_angle(T_odometry, T), _distance_and_angle(T_velocity, T))
             )
 
@@ -219,9 +221,11 @@ class MotionModel:
                 self._deviations.append(deviation * min(self._interval / elapsed, 1.0))
         velocity = twist_between(self._T_last, T) / elapsed
         mean = velocity if self._mean_velocity is None else self._mean_velocity
-        off = (velocity - mean) * elapsed
+        residual = (velocity - mean) * elapsed
         # Jumps are down-weighted: they do not continue.
-        excess = max(np.linalg.norm(off[:3]) / GATE[0], np.linalg.norm(off[3:]) / GATE[1], 1.0)
+        excess = max(
+            np.linalg.norm(residual[:3]) / GATE[0], np.linalg.norm(residual[3:]) / GATE[1], 1.0
+        )
         self._mean_velocity = mean + _NEWEST_WEIGHT / excess * (velocity - mean)
         self._velocity, self._interval = velocity, elapsed
         self._T_last, self._last_time, self.velocity_is_inherited = T, now, False
@@ -277,7 +281,7 @@ def jumps(
         the motion before was not measured.
     """
     motion = MotionModel()
-    found = []
+    result = []
     for k, (T, now) in enumerate(zip(poses, moments, strict=True)):
         if k in interruptions:
             motion.interrupt()
@@ -285,11 +289,11 @@ def jumps(
             continue
         violation = motion.gate_violation(T, now)
         if violation:
-            found.append((k, violation))
+            result.append((k, violation))
             motion.restart_at(T, now)
         else:
             motion.update(T, now)
-    return found
+    return result
 
 
 def _distance_and_angle(A: Float64, B: Float64) -> Float64:

@@ -13,7 +13,7 @@ from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
 
-# Moving fraction of a view above which the rest is aligned once more, and which is reported.
+# Moving fraction of a view above which the static rest is realigned, and the mask reported.
 MIN_MOVING_FRACTION = 0.01
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
@@ -21,26 +21,26 @@ _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
 class MotionSegmentation:
-    """Leaves moving objects out of views before alignment, and segments them afterwards."""
+    """Excludes moving objects from views before alignment, and segments them afterwards."""
 
     def __init__(self, relocalizer: Relocalizer) -> None:
         self._relocalizer = relocalizer
         self._objects = MovingObjects()
-        self._moved = False  # whether something moved in the last frame
+        self._moved = False  # whether objects moved in the last frame
 
     def reset(self) -> None:
-        """Begin anew, in another frame of reference."""
+        """Restart in another frame of reference."""
         self._objects.reset()
         self._moved = False
 
     def static_part(self, view: PreparedView, T_component_camera: Float64) -> PreparedView:
-        """Return a view, predicted at a pose (4, 4), without what moved in the last one."""
+        """Return a view with a predicted pose (4, 4) without the objects that moved before."""
         if not self._moved:
             return view
         return without_pixels(view, self._objects.predicted_mask(T_component_camera, view))
 
     def reference(self, keyframe: Keyframe) -> Reference:
-        """Return a keyframe as a reference for alignment: without what has moved."""
+        """Return a keyframe without moved objects, as a reference for alignment."""
         mask = self._objects.reference_mask(keyframe.view)
         if not mask.any():
             return Reference(keyframe, keyframe.target)
@@ -53,24 +53,25 @@ class MotionSegmentation:
         """Return the same alignment without moving objects, if its pose is that of the camera.
 
         A moving object may fill so much of the view that the alignment follows it: then the
-        predicted pose is the better start. Where something begins to move, the camera may as well
-        have jumped, which a search must not confirm.
+        predicted pose is the better start. Where objects begin to move, the camera itself may have
+        jumped instead; so a search must not confirm that.
         """
         if hypothesis not in hypotheses.segmented:
-            k, predicted = hypothesis.keyframe, hypothesis.predicted
+            keyframe, predicted = hypothesis.keyframe, hypothesis.predicted
             poses = [hypothesis.T_component_camera]
             if predicted and hypotheses.T_predicted is not None:
                 poses.insert(0, hypotheses.T_predicted)
             accepted = []
             for T in poses:
-                moving = self._segmented(hypotheses.whole, T, k, suspected=True)
+                moving = self._segmented(hypotheses.full_view, T, keyframe, suspected=True)
                 if not moving.reliable or moving.fraction <= MIN_MOVING_FRACTION:
                     continue
-                static = _realigned(T, k, moving, hypotheses, predicted=predicted)
-                agrees = self._relocalizer.agrees
+                static = _realigned(T, keyframe, moving, hypotheses, predicted=predicted)
+                confirms = self._relocalizer.confirms
                 if (
                     self._moved
-                    or agrees(hypotheses.whole, k, static.T_keyframe_camera) is not False
+                    or confirms(hypotheses.full_view, keyframe, static.T_keyframe_camera)
+                    is not False
                 ):
                     accepted.append(static)
             hypotheses.segmented[hypothesis] = tuple(accepted)
@@ -83,29 +84,31 @@ class MotionSegmentation:
 
         Returns
         -------
-        The accepted hypothesis, realigned if enough moves; and the segmentation, if one was made.
+        The accepted hypothesis, realigned if enough moves; and the segmentation, if any.
         """
-        view, a = hypotheses.whole, hypothesis.aligned
-        suspected = hypothesis.view is not hypotheses.view
-        due = (
+        view, aligned = hypotheses.full_view, hypothesis.aligned
+        suspected = hypothesis.view is not hypotheses.static_view
+        is_due = (
             self._moved
             or suspected
             or not hypothesis.assessment.usual
-            or a.in_front > _MAX_IN_FRONT * a.compared
+            or aligned.in_front > _MAX_IN_FRONT * aligned.compared
             or view.index % _SEGMENT_EVERY == 0
         )
-        if not due:
+        if not is_due:
             return hypothesis, None
-        k, T = hypothesis.keyframe, hypothesis.T_component_camera
-        moving = self._segmented(view, T, k, suspected=suspected)
-        left_out = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
+        keyframe, T = hypothesis.keyframe, hypothesis.T_component_camera
+        moving = self._segmented(view, T, keyframe, suspected=suspected)
+        excluded = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
             hypothesis.view.planes[..., 3]
         )
-        if moving.reliable and moving.fraction - left_out / view.pixels > MIN_MOVING_FRACTION:
-            static = _realigned(T, k, moving, hypotheses, predicted=hypothesis.predicted)
+        if moving.reliable and moving.fraction - excluded / view.pixels > MIN_MOVING_FRACTION:
+            static = _realigned(T, keyframe, moving, hypotheses, predicted=hypothesis.predicted)
             if static.assessment.usual or not hypothesis.assessment.usual:
                 hypothesis = static
-                moving = self._segmented(view, static.T_component_camera, k, suspected=suspected)
+                moving = self._segmented(
+                    view, static.T_component_camera, keyframe, suspected=suspected
+                )
         self._objects.update(moving)
         self._moved = moving.fraction > 0
         return hypothesis, moving
@@ -120,8 +123,8 @@ class MotionSegmentation:
 def _realigned(
     T: Float64, keyframe: Keyframe, moving: Moving, hypotheses: Hypotheses, *, predicted: bool
 ) -> Hypothesis:
-    """Align once more, from T (4, 4), without moving objects."""
+    """Realign from T (4, 4), without moving objects."""
     k = keyframe
     target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
-    view = moving.applied(hypotheses.whole)
+    view = moving.applied(hypotheses.full_view)
     return hypotheses.realigned(T, view, Reference(k, target), predicted=predicted)

@@ -1,15 +1,14 @@
 """Segmentation of moving objects, from views whose poses are known.
 
-A point in space that another view saw through has moved there; a surface that a later view sees
-through has moved away. Either contradicts a static scene by a likelihood ratio, see
-`tofuse.kernels.moving_objects`. The log-odds of each pixel accumulate over frames and are
-propagated with the motion of the camera, and connected pixels are segmented with hysteresis. What
-the foreground hides from a static camera, or reveals, is no evidence: nothing was seen through
-there.
+A point that lies in the free space of another view has moved there; a surface that lies in the
+free space of a later view has moved away. Either contradicts a static scene by a likelihood ratio,
+see `tofuse.kernels.moving_objects`. The log-odds of each pixel accumulate over frames and are
+propagated with the motion of the camera, and connected pixels are segmented with hysteresis.
+Occlusion and disocclusion by the foreground are no evidence: no free space was observed there.
 
-The static scene is what agrees with the given poses. A wrong pose makes views disagree as well:
-`Moving` states how well the rest of the view agrees, and no pair of which less than
-`_MIN_AGREEMENT` does updates the log-odds.
+The static scene is consistent with the given poses. A wrong pose makes views disagree as well:
+`Moving` states how well the rest of the view agrees, and a pair of views updates the log-odds only
+if at least `_MIN_AGREEMENT` of it does.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ from tofuse.registration.prepared_view import PreparedView
 # The image is divided into cells of n x n pixels, in at most this number of columns; one pixel of
 # each is compared.
 _COLUMNS = 112
-# Standard deviation of the errors of a depth besides its noise, as a fraction: what data sheets of
-# depth cameras state as accuracy.
+# Standard deviation of the errors of a depth besides its noise, as a fraction: the accuracy in data
+# sheets of depth cameras.
 _MODEL_ERROR = 0.005
-# Neighbours whose depths differ by more than this fraction are an outline.
+# Neighbours whose depths differ by more than this fraction are on a depth edge.
 _EDGE_JUMP = 0.04
-# By how many pixels (of the prepared view) views may be misregistered, besides noise.
+# Maximum misregistration of views besides noise, in pixels of the prepared view.
 _MISREGISTRATION = 2
-# Probability that a comparison of a static pixel is wrong for other reasons than noise. Limits the
+# Probability that a comparison of a static pixel is wrong for reasons other than noise. Limits the
 # evidence of one frame.
 _OUTLIERS = 0.05
 _MAX_EVIDENCE = -float(np.log(_OUTLIERS))
@@ -49,9 +48,9 @@ _SELF_OVERLAP = 0.3
 # Prior probability that a pixel moves, and its log-odds.
 _PRIOR = 0.05
 _PRIOR_ODDS = float(np.log(_PRIOR / (1 - _PRIOR)))
-# Factor per frame of the difference of the log-odds from their prior: evidence is forgotten.
+# Factor per frame of the difference of the log-odds from their prior: evidence decays.
 _DECAY = 0.95
-# Log-odds beyond which a pixel is segmented, and beyond which it is if connected to one of these.
+# Log-odds beyond which a pixel is segmented, and beyond which it is if connected to such a pixel.
 # An isolated pixel needs two frames with full evidence to reach the first.
 _DETECT, _EXTEND = 1.5, -0.5
 # Fraction of the pixels of a segment that must be beyond `_DETECT`, and the smallest segment, as a
@@ -59,7 +58,7 @@ _DETECT, _EXTEND = 1.5, -0.5
 _MIN_CORE, _MIN_SIZE = 0.25, 0.004
 # Fraction of its depth by which the surface at a pixel may move between frames.
 _MAX_MOTION = 0.05
-# By how many cells a predicted mask is dilated.
+# Dilation of a predicted mask, in cells.
 _DILATION = 3
 # Minimum fraction of the comparisons outside of the mask that agree, for a pair of views to be
 # evidence of motion. Below, a wrong pose is as likely.
@@ -72,12 +71,12 @@ _CHUNK_ROWS = 60
 _SCALE_EVERY = 2
 # Robust scale of up to half outliers: iterations, cut-off in sigmas, and the median of the absolute
 # values of a normal distribution within the cut-off.
-_SCALE_ITERATIONS, _SCALE_CUT, _MEDIAN_WITHIN = 5, 3.0, 0.6724
+_SCALE_ITERATIONS, _SCALE_CUT, _TRUNCATED_MEDIAN = 5, 3.0, 0.6724
 _LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
 _MIN_RESIDUALS = 50
-# The scale is that of the pair, but at most this multiple of the median of the last ones: the
-# errors of a wrong pose must not pass for noise.
-_SCALES, _MAX_SCALE_RATIO = 31, 3.0
+# The scale is that of the pair, but at most this multiple of the median of recent ones: errors of a
+# wrong pose must not be taken for noise.
+_SCALE_WINDOW, _MAX_SCALE_RATIO = 31, 3.0
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 _LIMITS = kernels.Limits(
     _MODEL_ERROR,
@@ -105,7 +104,7 @@ class _Cells:
 
 
 @dataclass(frozen=True, eq=False)
-class _Last:
+class _LastView:
     """The previous view, its pose, and its cells."""
 
     view: PreparedView
@@ -117,7 +116,7 @@ class _Last:
 class PairUpdate:
     """Updated cells of both views of a pair, and the scale of its residuals if it is reliable."""
 
-    last: _Last
+    last: _LastView
     reference: int
     cells: _Cells
     scale: float | None
@@ -142,7 +141,7 @@ class Moving:
         Fraction of these that agree; 0 without any. Low after masking: the pose is wrong, or
         moving objects are not segmented yet.
     agreement_unmasked
-        The same of all comparisons, masked or not. The masks explain the difference between both.
+        The same over all comparisons, masked or not; the masks explain the difference.
     scale
         Robust scale of the residuals outside of the previous mask, in sigmas of noise and
         `_MODEL_ERROR`.
@@ -181,22 +180,22 @@ class Moving:
 def without_pixels(view: PreparedView, mask: Bool) -> PreparedView:
     """Return a view that has no surface at some pixels: no plane, no albedo, no noise.
 
-    Their depth stays, as the ray was free up to it; its sigma is 0, "unknown", so that it is not
-    taken for a surface again.
+    Their depth stays, as the ray is free up to it; its sigma is 0, "unknown", so that it does not
+    become a surface again.
 
     Parameters
     ----------
     view
-        Is not changed.
+        The view, which is not changed.
     mask
-        (H, W) pixels to leave out.
+        (H, W) pixels to exclude.
     """
     if mask.shape != view.z.shape:
         raise ValueError(f"the mask is {mask.shape}, the view {view.z.shape}")
     if not mask.any():
         return view
     keep = ~mask
-    own = view.pixel_variance
+    pixel_variance = view.pixel_variance
     return replace(
         view,
         sigma=view.sigma * keep,
@@ -205,7 +204,7 @@ def without_pixels(view: PreparedView, mask: Bool) -> PreparedView:
         albedo=np.where(keep[..., None], view.albedo, np.float32(np.nan))
         if view.has_albedo
         else view.albedo,
-        pixel_variance=None if own is None else own * keep,
+        pixel_variance=None if pixel_variance is None else pixel_variance * keep,
     )
 
 
@@ -222,10 +221,10 @@ def at_size(mask: Bool, frame: RangeFrame) -> Bool:
 class MovingObjects:
     """Segments moving objects, from views whose poses relative to keyframes are known.
 
-    Before a view is aligned, leave `predicted_mask` out of it and `reference_mask` out of the
+    Before a view is aligned, exclude `predicted_mask` from it and `reference_mask` from the
     keyframe; afterwards `compare` both, and `update` with the result. Where the masks are much
-    larger than those (something just began to move), align once more without them: they are right
-    before the pose is. `compare` takes whole views. References are identified by their
+    larger than those (an object just began to move), realign without them: they are right before
+    the pose is. `compare` takes unmasked views. References are identified by their
     `PreparedView.index`; one that was the last view keeps its cells.
 
     Parameters
@@ -236,12 +235,12 @@ class MovingObjects:
 
     def __init__(self, max_references: int = _MAX_REFERENCES) -> None:
         self._max_references = max_references
-        self._last: _Last | None = None
+        self._last: _LastView | None = None
         self._references: OrderedDict[int, _Cells] = OrderedDict()
-        self._scales: deque[float] = deque(maxlen=_SCALES)
+        self._scales: deque[float] = deque(maxlen=_SCALE_WINDOW)
 
     def reset(self) -> None:
-        """Forget the last view, after which the camera was lost; references are kept."""
+        """Forget the last view, as the camera was lost after it; references are kept."""
         self._last = None
 
     def predicted_mask(self, T_world_camera_predicted: Float64, view: PreparedView) -> Bool:
@@ -297,58 +296,66 @@ class MovingObjects:
         reference, T_world_reference
             The keyframe and its (4, 4) pose.
         suspected
-            Whether motion is suspected, as the views conflict: then pixels are segmented that move
-            more likely than not, for which the evidence of one frame is enough.
+            Whether motion is suspected, as the views conflict: then pixels are segmented if they
+            move more likely than not, for which the evidence of one frame is enough.
         """
-        now, arrived = self._propagated(view, T_world_camera)
-        then = self._reference(reference)
-        T = np.ascontiguousarray(se3.inverse(T_world_reference) @ T_world_camera)
-        scale = self._scale(view, now.moving, reference, T)
-        typical = median(np.array(self._scales)) if self._scales else scale
+        cells, arrived = self._propagated(view, T_world_camera)
+        reference_cells = self._reference(reference)
+        T_reference_view = np.ascontiguousarray(se3.inverse(T_world_reference) @ T_world_camera)
+        scale = self._scale(view, cells.moving, reference, T_reference_view)
+        typical_scale = median(np.array(self._scales)) if self._scales else scale
         # The noise may be underestimated, but not overestimated.
-        used = max(1.0, min(scale, _MAX_SCALE_RATIO * max(typical, 1.0)))
-        seen, evidence = self._compare(view, reference, then.moving, T, used)
-        inverse = np.ascontiguousarray(se3.inverse(T))
-        met, evidence_then = self._compare(reference, view, now.moving, inverse, used)
+        clipped_scale = max(1.0, min(scale, _MAX_SCALE_RATIO * max(typical_scale, 1.0)))
+        outcome, evidence = self._compare(
+            view, reference, reference_cells.moving, T_reference_view, clipped_scale
+        )
+        T_view_reference = np.ascontiguousarray(se3.inverse(T_reference_view))
+        reference_outcome, reference_evidence = self._compare(
+            reference, view, cells.moving, T_view_reference, clipped_scale
+        )
 
-        before = _counts(seen, now.moving) + _counts(met, then.moving)
-        reliable = bool(before[0] >= _MIN_AGREEMENT * before.sum() and before[0] > 0)
-        tracked = now.tracked
+        counts_before = _counts(outcome, cells.moving) + _counts(
+            reference_outcome, reference_cells.moving
+        )
+        reliable = bool(
+            counts_before[0] >= _MIN_AGREEMENT * counts_before.sum() and counts_before[0] > 0
+        )
+        tracked = cells.tracked
         if reliable:
-            # What is behind the reference was revealed, unless it was tracked from there.
-            follows = (tracked > 0) | (now.odds > _EXTEND)
-            evidence[(seen == kernels.BEHIND) & ~follows] = 0
-            evidence_then[met == kernels.BEHIND] = 0
-            # The last view saw through there; the reference adds its own evidence only if in front.
-            alone = arrived & (seen != kernels.IN_FRONT)
-            evidence[alone] += np.float32(_MAX_EVIDENCE)
-            now = self._updated(now, evidence)
-            then = self._updated(then, evidence_then)
-            tracked = np.where(seen == kernels.AGREES, np.uint8(1), tracked)
+            # Surfaces behind the reference were disoccluded, unless they were tracked from there.
+            was_moving = (tracked > 0) | (cells.odds > _EXTEND)
+            evidence[(outcome == kernels.BEHIND) & ~was_moving] = 0
+            reference_evidence[reference_outcome == kernels.BEHIND] = 0
+            # The last view observed free space there; the reference adds evidence only if in front.
+            arrived_only = arrived & (outcome != kernels.IN_FRONT)
+            evidence[arrived_only] += np.float32(_MAX_EVIDENCE)
+            cells = self._updated(cells, evidence)
+            reference_cells = self._updated(reference_cells, reference_evidence)
+            tracked = np.where(outcome == kernels.AGREES, np.uint8(1), tracked)
         else:
-            evidence, evidence_then = now.odds, then.odds
+            evidence, reference_evidence = cells.odds, reference_cells.odds
         detect = 0.0 if suspected else _DETECT
-        now, segments = self._segmented(replace(now, tracked=tracked), evidence, detect)
-        then, _ = self._segmented(then, evidence_then, detect)
-        rest = _counts(seen, now.moving) + _counts(met, then.moving)
-        everything = _counts(seen, None) + _counts(met, None)
-        mask = _pixels(now.moving, view.z.shape, _stride(view))
+        cells, segments = self._segmented(replace(cells, tracked=tracked), evidence, detect)
+        reference_cells, _ = self._segmented(reference_cells, reference_evidence, detect)
+        counts = _counts(outcome, cells.moving) + _counts(reference_outcome, reference_cells.moving)
+        counts_unmasked = _counts(outcome, None) + _counts(reference_outcome, None)
+        mask = _pixels(cells.moving, view.z.shape, _stride(view))
         valid = view.z > 0
         return Moving(
             view=mask,
-            reference=_pixels(then.moving, reference.z.shape, _stride(reference)),
+            reference=_pixels(reference_cells.moving, reference.z.shape, _stride(reference)),
             fraction=_fraction(mask & valid, valid),
-            compared=int(rest.sum()),
-            agreement=float(rest[0] / max(rest.sum(), 1)),
-            agreement_unmasked=float(everything[0] / max(everything.sum(), 1)),
+            compared=int(counts.sum()),
+            agreement=float(counts[0] / max(counts.sum(), 1)),
+            agreement_unmasked=float(counts_unmasked[0] / max(counts_unmasked.sum(), 1)),
             scale=scale,
-            scale_ratio=scale / max(typical, 1e-6),
+            scale_ratio=scale / max(typical_scale, 1e-6),
             segments=segments,
             reliable=reliable,
             pair_update=PairUpdate(
-                _Last(view, T_world_camera, now),
+                _LastView(view, T_world_camera, cells),
                 reference.index,
-                then,
+                reference_cells,
                 scale if reliable else None,
             ),
         )
@@ -364,15 +371,15 @@ class MovingObjects:
     def _reference(self, reference: PreparedView) -> _Cells:
         """Return the cells of a reference so far."""
         shape = _cell_shape(reference.z.shape, _stride(reference))
-        known = self._references.get(reference.index)
-        if known is None and self._last is not None and self._last.view.index == reference.index:
-            known = self._last.cells
-        if known is None or known.odds.shape != shape:
+        cells = self._references.get(reference.index)
+        if cells is None and self._last is not None and self._last.view.index == reference.index:
+            cells = self._last.cells
+        if cells is None or cells.odds.shape != shape:
             stride = _stride(reference)
-            none = np.ascontiguousarray(reference.z[::stride, ::stride])
+            depth = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
-            known = _Cells(none, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
-        return known
+            cells = _Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
+        return cells
 
     def _store(self, index: int, cells: _Cells) -> None:
         self._references[index] = cells
@@ -381,26 +388,26 @@ class MovingObjects:
             self._references.popitem(last=False)
 
     def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[_Cells, Bool]:
-        """Propagate the cells of the last view to this one; and which surfaces are new there."""
+        """Propagate the cells of the last view to this one; and return which surfaces are new."""
         last, stride = self._last, _stride(view)
         shape = _cell_shape(view.z.shape, stride)
         depth, odds = np.empty(shape, np.float32), np.empty(shape, np.float32)
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
-            T, before = np.eye(4), view
+            T, previous = np.eye(4), view
             cells = _Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
         else:
-            T, before = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
+            T, previous = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
             cells = last.cells
         T = np.ascontiguousarray(T)
-        # At the rim of what is tracked a cell may be that of an adjacent surface.
+        # At the rim of the tracked region a cell may belong to an adjacent surface.
         inner = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
         last_cells = replace(cells, tracked=inner).arrays
-        sampled, sampled_before = _sampled(view), _sampled(before)
+        sampled, sampled_previous = _sampled(view), _sampled(previous)
 
         def work(a: int, b: int) -> None:
             kernels.propagate(
-                sampled, sampled_before, last_cells, T, _MAX_MOTION, _PRIOR_ODDS,
+                sampled, sampled_previous, last_cells, T, _MAX_MOTION, _PRIOR_ODDS,
                 depth, odds, tracked, arrived, a, b,
             )  # fmt: skip
 
@@ -448,13 +455,13 @@ class MovingObjects:
     def _segmented(self, cells: _Cells, evidence: Float32, detect: float) -> tuple[_Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
-        `evidence` is that of this frame: segments are not extended over what agrees in it.
+        `evidence` is that of this frame: segments are not extended over cells that agree in it.
         """
         odds, depth = cells.odds, cells.depth
         certain = odds > detect
-        none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
+        unsegmented = replace(cells, moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
-            return none, 0
+            return unsegmented, 0
         likely = (odds > _EXTEND).view(np.uint8)
         likely = np.asarray(cv2.morphologyEx(likely, cv2.MORPH_OPEN, _NEIGHBOURS), np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(likely, connectivity=4)
@@ -463,32 +470,34 @@ class MovingObjects:
         kept = (core >= _MIN_CORE * sizes) & (sizes >= _MIN_SIZE * odds.size)
         kept[0] = False
         if not kept.any():
-            return none, 0
+            return unsegmented, 0
         moving = self._completed(kept[labels], depth)
         # All of a segment moves as likely as its core, unless this frame shows that it is static.
-        sure = np.float32(_DETECT + 0.5 * _MAX_EVIDENCE)
-        odds = np.where(moving & (evidence >= 0), np.maximum(odds, sure), odds)
+        core_odds = np.float32(_DETECT + 0.5 * _MAX_EVIDENCE)
+        odds = np.where(moving & (evidence >= 0), np.maximum(odds, core_odds), odds)
         # Comparisons at the outline are inconclusive. One more cell mixes both surfaces; the next
         # is the object's if it is at the same depth.
-        near = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
+        near_depth = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
         dilated = cv2.dilate(moving.view(np.uint8), _NEIGHBOURS) > 0
-        dilated |= (near > 0) & (np.abs(near - depth) <= np.float32(_MAX_MOTION) * near)
+        dilated |= (near_depth > 0) & (
+            np.abs(near_depth - depth) <= np.float32(_MAX_MOTION) * near_depth
+        )
         moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
         return replace(cells, odds=odds, moving=moving), int(kept.sum())
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
-        """Add the rest of surfaces of which more than half moves.
+        """Complete the mask on surfaces of which more than half moves.
 
         Where an object still overlaps itself, it agrees with the reference.
         """
         jump = np.float32(0.5 * _EDGE_JUMP)
-        inside = depth > 0
+        interior = depth > 0
         for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-            inside[a] &= np.abs(depth[a] - depth[b]) <= jump * depth[b]
-        count, labels = cv2.connectedComponents(inside.view(np.uint8), connectivity=4)
+            interior[a] &= np.abs(depth[a] - depth[b]) <= jump * depth[b]
+        count, labels = cv2.connectedComponents(interior.view(np.uint8), connectivity=4)
         sizes = np.bincount(labels.ravel(), minlength=count)
-        moved = np.bincount(labels[moving], minlength=count)
-        majority = 2 * moved > sizes
+        moving_count = np.bincount(labels[moving], minlength=count)
+        majority = 2 * moving_count > sizes
         majority[0] = False
         return np.asarray(moving | majority[labels], np.bool_)
 
@@ -517,25 +526,25 @@ def _pixels(cells: Bool, shape: tuple[int, ...], stride: int) -> Bool:
 
 
 def _robust_scale(ratios: Float32) -> float:
-    """Return the scale of absolute values that are normal but for up to half outliers."""
+    """Return the scale of absolute values of normal errors with up to half outliers."""
     if len(ratios) < _MIN_RESIDUALS:
         return 1.0
     scale = float(np.partition(ratios, len(ratios) // 4)[len(ratios) // 4]) / _LOWER_QUARTILE
     for _ in range(_SCALE_ITERATIONS):
         kept = ratios[ratios <= _SCALE_CUT * scale]
-        before, scale = scale, median(kept) / _MEDIAN_WITHIN if len(kept) else scale
-        if abs(scale - before) <= 0.01 * before:
+        previous, scale = scale, median(kept) / _TRUNCATED_MEDIAN if len(kept) else scale
+        if abs(scale - previous) <= 0.01 * previous:
             break
     return scale
 
 
-def _counts(outcome: UInt8, masked: Bool | None) -> Int64:
-    """Return how many comparisons agree, and how many see through a surface."""
-    of = [outcome == kernels.AGREES, outcome == kernels.IN_FRONT]
-    if masked is not None:
-        of = [here & ~masked for here in of]
-    return np.array([np.count_nonzero(here) for here in of])
+def _counts(outcome: UInt8, mask: Bool | None) -> Int64:
+    """Return the numbers of comparisons that agree, and of free-space violations."""
+    outcomes = [outcome == kernels.AGREES, outcome == kernels.IN_FRONT]
+    if mask is not None:
+        outcomes = [selected & ~mask for selected in outcomes]
+    return np.array([np.count_nonzero(selected) for selected in outcomes])
 
 
-def _fraction(part: Bool, whole: Bool) -> float:
-    return int(np.count_nonzero(part)) / (int(np.count_nonzero(whole)) or 1)
+def _fraction(mask: Bool, valid: Bool) -> float:
+    return int(np.count_nonzero(mask)) / (int(np.count_nonzero(valid)) or 1)

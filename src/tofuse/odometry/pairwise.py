@@ -1,4 +1,4 @@
-"""Odometry of views far apart: each is registered to an earlier one, if the pose is accepted."""
+"""Odometry with wide baselines: each view is registered to an earlier one, and verified."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tofuse.registration.search import SearchOptions
 # The prediction replaces the search once it has agreed with 2 of the last 3 searches.
 _MIN_CONFIRMED = 2
 # Poses that differ by less than this fraction of the extent are the same.
-_SAME_POSE = 0.03
+_MAX_DIFFERENCE = 0.03
 
 
 @part("odometry", "pairwise")
@@ -36,7 +36,7 @@ class Pairwise(Bounded, Odometry):
     """Registers each view to the one before; where that is not accepted, to earlier ones.
 
     Once the predicted motion has agreed with searches, it replaces them as long as the views agree
-    there; degenerate directions follow the motion. For unordered views, or views far apart, each
+    there; degenerate directions follow the motion. For unordered views, or wide baselines, each
     pair is searched.
 
     A view whose best pose is not accepted, but more probable than not, keeps it and is marked as
@@ -71,7 +71,7 @@ class Pairwise(Bounded, Odometry):
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _PosedView:
     """A view with a pose."""
 
     frame: Frame
@@ -83,7 +83,7 @@ class _PairwiseTracker(Tracker):
     def __init__(self, options: Pairwise, seed: int) -> None:
         self._options = options
         self._seed = seed
-        self._placed: deque[_Placed] = deque(maxlen=options.references)
+        self._posed: deque[_PosedView] = deque(maxlen=options.references)
         self._component = -1
         self._connected = True  # whether links join the component to an earlier one
         self._motion = MotionModel()
@@ -101,20 +101,20 @@ class _PairwiseTracker(Tracker):
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
-        minimum = self._options.minimum_points
-        if len(frame) < minimum:
+        min_points = self._options.minimum_points
+        if len(frame) < min_points:
             self._motion.interrupt()
-            return Step("lost", f"{len(frame)} valid points, {minimum} are needed", None)
-        own = [p for p in reversed(self._placed) if p.component == self._component]
-        local = self._by_prediction(frame, own[0]) if own else None
+            return Step("lost", f"{len(frame)} valid points, {min_points} are needed", None)
+        references = [p for p in reversed(self._posed) if p.component == self._component]
+        local = self._by_prediction(frame, references[0]) if references else None
         confirmed = sum(self._motion_confirmed) >= _MIN_CONFIRMED
         if confirmed and local is not None and local.needs_no_search:
             return self._continue_component(frame, local)
         doubtful: list[_Registered] = []
-        for earlier in own:
-            registered = self._by_search(frame, earlier)
+        for reference in references:
+            registered = self._by_search(frame, reference)
             if registered is not None and registered.accepted:
-                if earlier is own[0]:
+                if reference is references[0]:
                     self._motion_confirmed.append(
                         local is not None and local.agrees(registered, frame.points)
                     )
@@ -128,7 +128,7 @@ class _PairwiseTracker(Tracker):
             return self._continue_component(frame, probable[0])
         return self._begin_component(frame, links, doubtful[0] if doubtful else None)
 
-    def _by_prediction(self, frame: Frame, last: _Placed) -> _Registered | None:
+    def _by_prediction(self, frame: Frame, last: _PosedView) -> _Registered | None:
         """Register to the last view from the predicted pose.
 
         Along a direction that is degenerate for many views, the noise of single motions would
@@ -143,33 +143,33 @@ class _PairwiseTracker(Tracker):
         guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
         return self._registered(frame, last, guess, self._local_registration)
 
-    def _by_search(self, frame: Frame, to: _Placed) -> _Registered | None:
-        """Register to an earlier view, wherever it is."""
-        return self._registered(frame, to, None, self._options.registration)
+    def _by_search(self, frame: Frame, reference: _PosedView) -> _Registered | None:
+        """Register to an earlier view by a global search."""
+        return self._registered(frame, reference, None, self._options.registration)
 
     def _registered(
-        self, frame: Frame, to: _Placed, guess: Float64 | None, method: AnyPair
+        self, frame: Frame, reference: _PosedView, guess: Float64 | None, method: AnyPair
     ) -> _Registered | None:
-        rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, to.frame.index])
+        rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, reference.frame.index])
         try:
-            return _Registered(to, method.register(frame, to.frame, guess, rng))
+            return _Registered(reference, method.register(frame, reference.frame, guess, rng))
         except RegistrationError:
             return None
 
     def _continue_component(self, frame: Frame, registered: _Registered) -> Step:
         """Take the pose of a registration to a view of the present component."""
-        to, registration = registered.to, registered.registration
-        T = se3.orthonormalise(to.T_component_view @ registration.T_target_source)
+        reference, registration = registered.reference, registered.registration
+        T = se3.orthonormalise(reference.T_component_view @ registration.T_target_source)
         self._motion.update(T, _moment(frame))
         self._degenerate = len(registration.unobservable) > 0
         links = () if self._connected else self._links(frame)
         self._connected |= bool(links)
-        self._placed.append(_Placed(frame, T, self._component))
+        self._posed.append(_PosedView(frame, T, self._component))
         return Step(
             "tracked",
             "" if registered.accepted else registration.reason,
             T,
-            to.frame.index,
+            reference.frame.index,
             registration,
             component=self._component,
             links=links,
@@ -177,19 +177,19 @@ class _PairwiseTracker(Tracker):
         )
 
     def _begin_component(
-        self, frame: Frame, links: tuple[Link, ...], refused: _Registered | None
+        self, frame: Frame, links: tuple[Link, ...], rejected: _Registered | None
     ) -> Step:
         self._component += 1
         self._connected = self._component == 0 or bool(links)
         self._motion.interrupt()
         self._motion.update(np.eye(4), _moment(frame))
-        self._placed.append(_Placed(frame, np.eye(4), self._component))
-        reason = "" if refused is None else f"not connected: {refused.registration.reason}"
+        self._posed.append(_PosedView(frame, np.eye(4), self._component))
+        reason = "" if rejected is None else f"not connected: {rejected.registration.reason}"
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
     def _links(self, frame: Frame) -> tuple[Link, ...]:
         """Return the registration to the last view of another component, if it is accepted."""
-        others = [p for p in self._placed if p.component != self._component]
+        others = [p for p in self._posed if p.component != self._component]
         registered = self._by_search(frame, others[-1]) if others else None
         return (registered.link(frame),) if registered is not None and registered.accepted else ()
 
@@ -202,7 +202,7 @@ def _moment(frame: Frame) -> Moment:
 class _Registered:
     """A registration to an earlier view."""
 
-    to: _Placed
+    reference: _PosedView
     registration: Registration
 
     @property
@@ -211,16 +211,16 @@ class _Registered:
 
     @property
     def needs_no_search(self) -> bool:
-        """Whether a pose is accepted and either certain or degenerate, so that no search helps."""
+        """Whether a pose is accepted and certain or degenerate, so that no search is needed."""
         certain = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
         return self.accepted and certain
 
     def agrees(self, other: _Registered, points: Float32) -> bool:
         """Whether both map points (n, 3) to the same place, relative to their extent."""
-        ours, theirs = (r.registration.T_target_source for r in (self, other))
-        gap = se3.transform(ours, points) - se3.transform(theirs, points)
-        rms = np.sqrt((gap**2).sum(1).mean())
-        return bool(rms <= _SAME_POSE * extent(points))
+        T, T_other = (r.registration.T_target_source for r in (self, other))
+        difference = se3.transform(T, points) - se3.transform(T_other, points)
+        rms = np.sqrt((difference**2).sum(1).mean())
+        return bool(rms <= _MAX_DIFFERENCE * extent(points))
 
     @property
     def probability(self) -> float:
@@ -228,4 +228,4 @@ class _Registered:
 
     def link(self, frame: Frame) -> Link:
         r = self.registration
-        return Link(self.to.frame.index, frame.index, r, self.accepted, r.how)
+        return Link(self.reference.frame.index, frame.index, r, self.accepted, r.how)

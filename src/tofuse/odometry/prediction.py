@@ -23,7 +23,7 @@ _DISTINCT = 0.3
 # smooth motion grows faster over some frames, but its velocity stays bounded.
 _AHEAD = 8
 _POWERS = np.linspace(0.0, 2.0, 41)
-# Where it can't be estimated from the recording.
+# If it can't be estimated from the recording.
 _DEFAULT_POWER = 2.0
 
 
@@ -51,7 +51,7 @@ class Prediction:
     def of(cls, poses: Float64, unobservable: Sequence[Float64]) -> Prediction:
         """Estimate it from the constrained motions of a recording.
 
-        Where hardly any direction was constrained, sigma is half of the typical motion.
+        If too few directions were constrained, sigma is half of the typical motion.
 
         Parameters
         ----------
@@ -64,16 +64,16 @@ class Prediction:
             return cls((0.1, 0.1))
         motions = se3.inverse(poses[:-1]) @ poses[1:]
         typical = np.sqrt((se3.log(motions) / UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
-        one, known = _errors(poses, motions, unobservable, 1)
-        sigma = np.maximum(np.where(known, one, _MOTION_FRACTION * typical), _MIN_SIGMA)
+        rms, enough = _errors(poses, motions, unobservable, 1)
+        sigma = np.maximum(np.where(enough, rms, _MOTION_FRACTION * typical), _MIN_SIGMA)
         power = (_DEFAULT_POWER, _DEFAULT_POWER)
         if len(poses) > _AHEAD + 1:
-            later, known_later = _errors(poses, motions, unobservable, _AHEAD)
-            ratio = np.divide(later, one, out=np.ones(2), where=one > 0)
+            rms_ahead, enough_ahead = _errors(poses, motions, unobservable, _AHEAD)
+            ratio = np.divide(rms_ahead, rms, out=np.ones(2), where=rms > 0)
             k = np.arange(1, _AHEAD + 1)[:, None]
-            found = np.interp(ratio**2, (k**_POWERS).sum(0), _POWERS)
-            found = np.where(known & known_later & (one > 0), found, _DEFAULT_POWER)
-            power = (float(found[0]), float(found[1]))
+            exponent = np.interp(ratio**2, (k**_POWERS).sum(0), _POWERS)
+            exponent = np.where(enough & enough_ahead & (rms > 0), exponent, _DEFAULT_POWER)
+            power = (float(exponent[0]), float(exponent[1]))
         return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
 
     def at_worst(self) -> Prediction:
@@ -100,24 +100,24 @@ class Prediction:
 def _errors(
     poses: Float64, motions: Float64, unobservable: Sequence[Float64], ahead: int
 ) -> tuple[Float64, Bool]:
-    """Return rms errors of the extrapolation by some frames, of translation and rotation; (2,).
+    """Return rms errors of the extrapolation by `ahead` frames, of translation and rotation; (2,).
 
-    In `UNITS`, over constrained directions; and whether there were enough of these, (2,).
+    In `UNITS`, over constrained directions; and whether there were enough of them, (2,).
     """
     last = len(poses) - ahead
     extrapolated = np.linalg.matrix_power(motions[: last - 1], ahead)
     errors = se3.log(se3.inverse(poses[1:last] @ extrapolated) @ poses[1 + ahead :]) / UNITS
     squares, dimensions = np.zeros(2), np.zeros(2)
     for i, error in enumerate(errors, 1):
-        P = np.eye(6)
-        weak = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
-        if len(weak):
-            u = span(weak, _DISTINCT)
-            P -= u @ u.T
-        constrained = P @ error
+        projector = np.eye(6)
+        degenerate = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
+        if len(degenerate):
+            basis = span(degenerate, _DISTINCT)
+            projector -= basis @ basis.T
+        constrained = projector @ error
         t, r = constrained[:3], constrained[3:]
         squares += [t @ t, r @ r]
-        dimensions += [np.trace(P[:3, :3]), np.trace(P[3:, 3:])]
+        dimensions += [np.trace(projector[:3, :3]), np.trace(projector[3:, 3:])]
     return np.sqrt(squares / np.maximum(dimensions, 1)), dimensions >= _MIN_CONSTRAINED
 
 
@@ -145,7 +145,7 @@ def with_prediction(
     """
     if not len(unobservable):
         return information
-    q, _ = np.linalg.qr((unobservable / UNITS).T)
+    basis, _ = np.linalg.qr((unobservable / UNITS).T)
     variance = (np.repeat(sigma, 3) / UNITS) ** 2
-    known = q @ np.linalg.inv(q.T @ (variance[:, None] * q)) @ q.T
-    return np.asarray(information + known / np.outer(UNITS, UNITS), np.float64)
+    prior_information = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
+    return np.asarray(information + prior_information / np.outer(UNITS, UNITS), np.float64)

@@ -11,25 +11,25 @@ from tofuse.registration.verification import FitStatistics, comparable
 from tofuse.registration.view_pair import register_pair
 
 # A search costs about as much as tracking 40 frames. With one per 40 frames, a lost camera costs no
-# more than a tracked one; some are free, as short recordings may consist of large steps.
+# more than a tracked one; the first ones are free, as short recordings may have large steps.
 _FRAMES_PER_SEARCH, _FREE_SEARCHES = 40, 24
 
 
 class Relocalizer:
     """Registers a view to the newest keyframe and to the most similar one, without a guess.
 
-    The budget counts frames, not seconds, so that every machine makes the same searches.
+    The budget counts frames, not seconds, so that the searches are the same on every machine.
 
     Parameters
     ----------
     search
         Range and effort of the search; None never searches.
-    usual
-        How views of this camera usually fit.
+    fit_statistics
+        Usual fit of views of this camera.
     """
 
-    def __init__(self, search: SearchOptions | None, usual: FitStatistics) -> None:
-        self._search, self._usual = search, usual
+    def __init__(self, search: SearchOptions | None, fit_statistics: FitStatistics) -> None:
+        self._search, self._fit_statistics = search, fit_statistics
         self._budget = float(_FREE_SEARCHES)
         # Registrations of the last view, as several hypotheses need the same pair.
         self._cache: dict[tuple[int, int], Registration | None] = {}
@@ -82,7 +82,7 @@ class Relocalizer:
         certain = adjacent or registration.stands_alone
         return Link(keyframe.view.index, view.index, registration, certain, registration.how)
 
-    def agrees(self, view: PreparedView, keyframe: Keyframe, T: Float64) -> bool | None:
+    def confirms(self, view: PreparedView, keyframe: Keyframe, T: Float64) -> bool | None:
         """Whether a search confirms T_keyframe_camera (4, 4); None if it finds no probable pose."""
         registration = self._probable(view, keyframe)
         if registration is None or self._search is None:
@@ -97,11 +97,11 @@ class Relocalizer:
             if not can_search or not comparable(view.depth, keyframe.depth):
                 return None
             self._budget -= 1
-            # Even where an alignment seems certain: a box looks the same from its other side.
+            # Even where an alignment seems certain: a box looks the same from its opposite side.
             registration = register_pair(
                 view,
                 keyframe.view,
-                usual=self._usual,
+                usual=self._fit_statistics,
                 options=self._search,
                 always_search=True,
                 rival_m=DISTINCT_M,

@@ -1,4 +1,4 @@
-"""Selection of a pose hypothesis: among alignments, moving objects and quick motions."""
+"""Selection of a pose hypothesis, with regard to moving objects and quick motions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from tofuse.registration.verification import FitStatistics, finely_scaled, self_
 # pose loses more where the scene constrains it.
 _MOTION_WEIGHT = 0.05
 # Degenerate directions of a view of a plane: two translations and a rotation.
-_PLANE = 3
-# Starts along a degenerate direction each way: the gate is wide where the camera accelerates.
-_MAX_STARTS = 5
+_PLANE_DEGENERACY = 3
+# Maximum number of starts along a degenerate direction, for either sign: the gate is wide where the
+# camera accelerates.
+_MAX_DISPLACED = 5
 
 
 class HypothesisSelector:
@@ -31,14 +32,14 @@ class HypothesisSelector:
 
     def __init__(
         self,
-        usual: FitStatistics,
+        fit_statistics: FitStatistics,
         motion: MotionModel,
         segmentation: MotionSegmentation,
         relocalizer: Relocalizer,
     ) -> None:
-        self._usual, self._motion = usual, motion
+        self._fit_statistics, self._motion = fit_statistics, motion
         self._segmentation, self._relocalizer = segmentation, relocalizer
-        self._degenerate = 0  # number of degenerate directions of the last view
+        self._last_degenerate = 0  # number of degenerate directions of the last view
 
     def best(self, hypotheses: Hypotheses, now: Moment, *, in_sequence: bool) -> Hypothesis | None:
         """Return the hypothesis to accept; None if all are contradicted.
@@ -50,7 +51,7 @@ class HypothesisSelector:
             best = self._best_uncertain(hypotheses, now) or self._by_search(hypotheses, now)
         elif best is not None and in_sequence and len(best.aligned.unobservable):
             best = self._better_constrained(best, hypotheses, now)
-        self._degenerate = 0 if best is None else len(best.aligned.unobservable)
+        self._last_degenerate = 0 if best is None else len(best.aligned.unobservable)
         return best
 
     def _better_constrained(
@@ -58,20 +59,20 @@ class HypothesisSelector:
     ) -> Hypothesis:
         """Return the alignment with the best score among those that are better constrained.
 
-        What constrains a view may be outside the convergence basin of a wrong start, and the rest
-        fits anywhere along a wall. So other starts along the degenerate directions are tried, and a
-        search where the view before was better constrained.
+        The structure that constrains a view may be outside the convergence basin of a wrong start,
+        where a wall fits anywhere along itself. So other starts along the degenerate directions are
+        tried, and a search if the previous view was better constrained.
         """
         best, best_score = hypothesis, self._explanation_score(hypothesis, hypotheses, now)
         degenerate = len(hypothesis.aligned.unobservable)
-        found = self._by_search(hypotheses, now) if degenerate > self._degenerate else None
-        others = [(found, 0.0)] if found is not None else []
-        others += [(other, MIN_LEAD) for other in self._displaced(hypothesis, hypotheses, now)]
-        for other, lead in others:
-            if len(other.aligned.unobservable) < degenerate:
-                score = self._explanation_score(other, hypotheses, now)
-                if score > best_score + lead:
-                    best, best_score = other, score
+        searched = self._by_search(hypotheses, now) if degenerate > self._last_degenerate else None
+        rivals = [(searched, 0.0)] if searched is not None else []
+        rivals += [(rival, MIN_LEAD) for rival in self._displaced(hypothesis, hypotheses, now)]
+        for rival, min_lead in rivals:
+            if len(rival.aligned.unobservable) < degenerate:
+                score = self._explanation_score(rival, hypotheses, now)
+                if score > best_score + min_lead:
+                    best, best_score = rival, score
         return best
 
     def _displaced(
@@ -83,24 +84,24 @@ class HypothesisSelector:
             lengths = np.linalg.norm(direction.reshape(2, 3), axis=1)
             step = direction / np.max(lengths / (DISTINCT_M, DISTINCT_RAD))
             for sign in (-1, 1):
-                for k in range(1, _MAX_STARTS + 1):
+                for k in range(1, _MAX_DISPLACED + 1):
                     start = T @ se3.exp(sign * k * step)
                     if self._motion.gate_violation(start, now):
                         break
-                    other = hypotheses.realigned(start, view, r, predicted=True)
-                    if other.assessment.usual and not self._violates_gate(other, now):
-                        yield other
+                    displaced = hypotheses.realigned(start, view, r, predicted=True)
+                    if displaced.assessment.usual and not self._violates_gate(displaced, now):
+                        yield displaced
 
     def _first_usual(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
         """Return the first alignment with a usual fit and a motion inside of the gate.
 
-        While the usual fit of the camera is unknown, both images must agree as well. So they must
-        where a fit is only noisier than usual: a view farther from the keyframe shares less of its
-        systematic errors, and a chain of nearer references would drift. Where a reference
+        While the usual fit of the camera is unknown, both images must agree as well. The same holds
+        for a fit that is only noisier than usual: a view farther from the keyframe shares less of
+        its systematic errors, and a chain of nearer references would drift. If a reference
         contradicts, moving objects may explain it; else another pose must explain all references
-        as well: an alignment with the last frame may follow what moves since then.
+        as well: an alignment with the last frame may follow an object that began to move.
         """
-        rival = -np.inf
+        rival_score = -np.inf
         for hypothesis in hypotheses:
             usual, predicted = hypothesis.assessment.usual, self._is_predicted(hypothesis, now)
             if self._violates_gate(hypothesis, now):
@@ -110,32 +111,41 @@ class HypothesisSelector:
                     for static in self._segmentation.alternatives(hypothesis, hypotheses):
                         if static.assessment.usual and not self._violates_gate(static, now):
                             return static
-                    rival = max(rival, self._explanation_score(hypothesis, hypotheses, now))
+                    rival_score = max(
+                        rival_score, self._explanation_score(hypothesis, hypotheses, now)
+                    )
                 continue
             if not predicted and not self._is_verified(hypothesis, hypotheses):
                 continue
             if (
-                np.isfinite(rival)
-                and self._explanation_score(hypothesis, hypotheses, now) < rival - MIN_LEAD
+                np.isfinite(rival_score)
+                and self._explanation_score(hypothesis, hypotheses, now) < rival_score - MIN_LEAD
             ):
                 continue
-            if (usual and self._usual.is_known) or self._agreement(hypothesis) > 0:
+            if (usual and self._fit_statistics.is_known) or self._agreement(hypothesis) > 0:
                 return hypothesis
         return None
 
     def _best_uncertain(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
         """Return the alignment that explains the view best, unless both images contradict it."""
         best, best_score = None, -np.inf
-        made = list(hypotheses)
-        segmented = [a for m in made for a in self._segmentation.alternatives(m, hypotheses)]
-        for hypothesis in (*segmented, *made):
+        unsegmented = list(hypotheses)
+        segmented = [
+            alternative
+            for h in unsegmented
+            for alternative in self._segmentation.alternatives(h, hypotheses)
+        ]
+        for hypothesis in (*segmented, *unsegmented):
             if not np.isfinite(hypothesis.aligned.rms_m) or self._violates_gate(hypothesis, now):
                 continue
             if not (self._is_predicted(hypothesis, now) or _is_small(hypothesis, hypotheses)):
                 continue
-            if len(hypothesis.aligned.unobservable) >= _PLANE and hypothesis.assessment.conflict:
+            if (
+                len(hypothesis.aligned.unobservable) >= _PLANE_DEGENERACY
+                and hypothesis.assessment.conflict
+            ):
                 continue  # mostly predicted, and the prediction explains the view badly
-            if self._agreement(hypothesis, finely_scaled(self._usual)) <= 0:
+            if self._agreement(hypothesis, finely_scaled(self._fit_statistics)) <= 0:
                 continue
             score = self._explanation_score(hypothesis, hypotheses, now)
             if score > best_score:
@@ -145,41 +155,43 @@ class HypothesisSelector:
     def _by_search(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
         """Return a quick, unpredicted motion of which a search is certain."""
         for r in hypotheses.references:
-            link = self._relocalizer.link(hypotheses.view, r.keyframe, adjacent=False)
+            link = self._relocalizer.link(hypotheses.static_view, r.keyframe, adjacent=False)
             if link is None or not link.certain:
                 continue
             T = r.keyframe.T_component_camera @ link.T_i_j
-            found = hypotheses.realigned(T, hypotheses.view, r, predicted=False)
-            if found.assessment.usual and self._motion.is_feasible(found.T_component_camera, now):
-                return replace(found, note=f"the prediction did not fit: {link.how}")
+            hypothesis = hypotheses.realigned(T, hypotheses.static_view, r, predicted=False)
+            if hypothesis.assessment.usual and self._motion.is_feasible(
+                hypothesis.T_component_camera, now
+            ):
+                return replace(hypothesis, note=f"the prediction did not fit: {link.how}")
         return None
 
     def _explanation_score(
         self, hypothesis: Hypothesis, hypotheses: Hypotheses, now: Moment
     ) -> float:
-        """Return how well a pose explains the view against all references, and the motion.
+        """Return the score of a pose: agreement with all references, less the deviation in motion.
 
         A doubtful reference counts only if there is no other: its own pose may follow a moving
         object.
         """
-        T, compare = hypothesis.T_component_camera, finely_scaled(self._usual)
+        T, options = hypothesis.T_component_camera, finely_scaled(self._fit_statistics)
         references = [
             hypothesis.reference if r.keyframe is hypothesis.keyframe else r
             for r in hypotheses.references
         ]
-        sure = [r for r in references if not r.keyframe.doubtful] or references
-        fits = [
-            agreement(hypothesis.view, r.target.view, r.target.T_target_world @ T, compare).score
-            for r in sure
+        reliable = [r for r in references if not r.keyframe.doubtful] or references
+        scores = [
+            agreement(hypothesis.view, r.target.view, r.target.T_target_world @ T, options).score
+            for r in reliable
         ]
-        off = self._motion.normalised_deviation(T, now)
-        return float(np.mean(fits) - _MOTION_WEIGHT * np.log1p(off * off))
+        deviation = self._motion.normalised_deviation(T, now)
+        return float(np.mean(scores) - _MOTION_WEIGHT * np.log1p(deviation * deviation))
 
-    def _agreement(self, hypothesis: Hypothesis, compare: AgreementOptions | None = None) -> float:
-        """Return support minus contradiction of an alignment, of both images."""
+    def _agreement(self, hypothesis: Hypothesis, options: AgreementOptions | None = None) -> float:
+        """Return support minus contradiction of an alignment, over both images."""
         target = hypothesis.reference.target.view
-        compare = compare or self_scaled(self._usual)
-        return agreement(hypothesis.view, target, hypothesis.T_keyframe_camera, compare).score
+        options = options or self_scaled(self._fit_statistics)
+        return agreement(hypothesis.view, target, hypothesis.T_keyframe_camera, options).score
 
     def _violates_gate(self, hypothesis: Hypothesis, now: Moment) -> bool:
         """Whether the motion to a pose is outside of the gate."""
@@ -187,7 +199,7 @@ class HypothesisSelector:
         return bool(violation) and not self._motion.velocity_is_inherited
 
     def _is_predicted(self, hypothesis: Hypothesis, now: Moment) -> bool:
-        """Whether an alignment began at the predicted pose, and ended near it if inherited."""
+        """Whether an alignment began at the predicted pose; if inherited, it must end near it."""
         motion = self._motion
         violation = motion.velocity_is_inherited and motion.gate_violation(
             hypothesis.T_component_camera, now
@@ -200,9 +212,9 @@ class HypothesisSelector:
             return True
         if not hypothesis.aligned.converged or len(hypothesis.aligned.unobservable):
             return False
-        k, T = hypothesis.keyframe, hypothesis.T_keyframe_camera
+        keyframe, T = hypothesis.keyframe, hypothesis.T_keyframe_camera
         return self._agreement(hypothesis) > 0 and bool(
-            self._relocalizer.agrees(hypothesis.view, k, T)
+            self._relocalizer.confirms(hypothesis.view, keyframe, T)
         )
 
 

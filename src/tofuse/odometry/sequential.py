@@ -49,7 +49,7 @@ class Sequential(Bounded, Odometry):
         Valid points that a frame must have.
     min_inlier_ratio
         Smallest inlier fraction, 0 to 1. The thesis has no such threshold for consecutive frames;
-        this one is low and only refuses registrations with hardly any correspondences.
+        this one is low and only rejects registrations with hardly any correspondences.
     """
 
     registration: Registrar = field(default_factory=algorithm_1)

@@ -12,14 +12,14 @@ from tofuse.registration.surface_options import SurfaceOptions
 
 @dataclass(frozen=True)
 class ViewOptions(Bounded):
-    """How images are prepared and aligned, as far as it depends on the camera and the scene.
+    """Options of preparation and alignment that depend on the camera and the scene.
 
     Attributes
     ----------
     columns
         Images are halved until they have at most this many columns.
     photometric
-        Whether the albedo takes part in the alignment.
+        Whether the albedo is used in the alignment.
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.

@@ -1,1 +1,1 @@
-"""The engine: a configuration of parts, the online mapper, and the whole run."""
+"""The engine: a configuration of parts, the online mapper, and the complete run."""

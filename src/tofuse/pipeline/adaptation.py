@@ -27,8 +27,8 @@ from tofuse.recordings.recording import Recording
 from tofuse.registration.prepared_view import RAW_RANGE_FALLOFF
 from tofuse.sensor.noise import NOISE, NoiseModel
 
-# Frames, evenly spaced: enough for the background behind an object that turns once.
-_SAMPLE = 30
+# Number of evenly spaced frames: enough for the background behind an object that turns once.
+_SAMPLE_FRAMES = 30
 
 
 def adapted(
@@ -37,12 +37,12 @@ def adapted(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Config:
-    """Return the configuration with everything that is left to the recording filled in.
+    """Return the configuration with all values that depend on the recording filled in.
 
-    These are defaults that depend on the recording (`with_recording_defaults`), what corrections
-    and filters learn from up to 30 frames, and the falloffs of the amplitude and of colour.
+    These are defaults (`with_recording_defaults`), the parameters that corrections and filters
+    learn from up to 30 frames, and the falloffs of the amplitude and of colour.
     Corrections on trial are kept only if overlapping views show the error that they correct
-    (`trial`). An adapted configuration stays as it is.
+    (`trial`). An adapted configuration is returned unchanged.
 
     Parameters
     ----------
@@ -63,19 +63,19 @@ def adapted(
     config = with_recording_defaults(config, recording)
     initial = config
     filters_learn = any(f.needs_fit for f in (*config.filters, *config.model_filters))
-    # BLAS sums differ with its number of threads; ours don't.
+    # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
         if filters_learn or any(c.needs_fit for c in config.corrections):
-            config = _learned(config, recording)
+            config = _fitted(config, recording)
         for item in config.corrections:
             if item.needs_trial:
-                config = _tried(config, item, recording, progress or Silent())
+                config = _after_trial(config, item, recording, progress or Silent())
         left_out = sum(c.disabled for c in config.corrections)
         if filters_learn and left_out > sum(c.disabled for c in initial.corrections):
             # Filters must learn from images without the corrections that are left out.
             filters, model_filters = initial.filters, initial.model_filters
             config = replace(config, filters=filters, model_filters=model_filters)
-            config = _learned(config, recording)
+            config = _fitted(config, recording)
         odometry = config.odometry
         if isinstance(odometry, Keyframes | GivenPoses):
             views = _with_falloffs(odometry.views, recording, _preparation(config))
@@ -84,26 +84,28 @@ def adapted(
 
 
 def _with_falloffs(views: ViewOptions, recording: Recording, prepare: Prepare) -> ViewOptions:
-    """Return the options with the falloffs of amplitude and of colour that were not given."""
+    """Return the options with unspecified falloffs of amplitude and colour estimated."""
     if views.falloff is not None and views.range_falloff is not None:
         return views
     frame = recording.first_readable()
     image = frame if isinstance(frame, RangeFrame) else None
     amplitude = image is not None and image.amplitude_image is not None
-    falloff, by_range = views.falloff, views.range_falloff
-    if by_range is None:
-        # Infrared is that of a time-of-flight camera, unless the recording shows otherwise.
+    falloff, range_falloff = views.falloff, views.range_falloff
+    if range_falloff is None:
+        # Infrared is assumed to be that of a ToF camera, unless the recording shows otherwise.
         infrared = image is not None and amplitude and image.amplitude_kind == "ir"
         color = image is not None and not amplitude and image.color_image is not None
-        by_range = RAW_RANGE_FALLOFF if infrared else 0.0
+        range_falloff = RAW_RANGE_FALLOFF if infrared else 0.0
         if infrared or color:
-            surface = replace(views.surface, falloff=falloff or 0.0, range_falloff=by_range)
-            by_range = max(by_range + estimate_falloff(recording, prepare, surface, RANGE), 0.0)
+            surface = replace(views.surface, falloff=falloff or 0.0, range_falloff=range_falloff)
+            range_falloff = max(
+                range_falloff + estimate_falloff(recording, prepare, surface, RANGE), 0.0
+            )
     if falloff is None:
         # Colour cameras compensate their vignetting.
-        surface = replace(views.surface, falloff=0.0, range_falloff=by_range)
+        surface = replace(views.surface, falloff=0.0, range_falloff=range_falloff)
         falloff = estimate_falloff(recording, prepare, surface) if amplitude else 0.0
-    return replace(views, falloff=falloff, range_falloff=by_range)
+    return replace(views, falloff=falloff, range_falloff=range_falloff)
 
 
 def with_recording_defaults(config: Config, recording: Recording) -> Config:
@@ -115,53 +117,59 @@ def with_recording_defaults(config: Config, recording: Recording) -> Config:
         If the recording has an invalid noise.json.
     """
     corrections = tuple(
-        replace(c, model=_known_noise(recording)) if isinstance(c, Noise) and not c.model else c
+        replace(c, model=_noise_model(recording)) if isinstance(c, Noise) and not c.model else c
         for c in config.corrections
     )
     config = replace(config, corrections=corrections)
-    highest = recording.metadata.get("confidence_max")
-    if not isinstance(highest, int | float) or not 1 <= highest <= 255:
+    max_confidence = recording.metadata.get("confidence_max")
+    if not isinstance(max_confidence, int | float) or not 1 <= max_confidence <= 255:
         return config
     scaled = (
-        tuple(f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in filters)
+        tuple(
+            f.on_scale(round(max_confidence)) if isinstance(f, Confidence) else f for f in filters
+        )
         for filters in (config.filters, config.model_filters)
     )
     filters, model_filters = scaled
     return replace(config, filters=filters, model_filters=model_filters)
 
 
-def _known_noise(recording: Recording) -> NoiseModel | None:
-    """Return the noise model that the recording states, or that of its camera's family."""
+def _noise_model(recording: Recording) -> NoiseModel | None:
+    """Return the noise model stated by the recording, or that of its camera family."""
     model = noise_model_for(recording)
     return None if model == NOISE["unknown"] else model
 
 
-def _learned(config: Config, recording: Recording) -> Config:
-    """Return the configuration with what its parts learn from a sample of frames."""
-    frames = recording.readable(_SAMPLE)
+def _fitted(config: Config, recording: Recording) -> Config:
+    """Return the configuration with its parts fitted to a sample of frames."""
+    frames = recording.readable(_SAMPLE_FRAMES)
     check_views(config, kind_of(frames[0]) if frames else "range")
-    corrections, frames = _learned_corrections(config.corrections, frames)
-    filters, frames = _learned_filters(config.filters, frames)
-    model_filters, _ = _learned_filters(config.model_filters, frames)
+    corrections, frames = _fitted_corrections(config.corrections, frames)
+    filters, frames = _fitted_filters(config.filters, frames)
+    model_filters, _ = _fitted_filters(config.model_filters, frames)
     return replace(config, corrections=corrections, filters=filters, model_filters=model_filters)
 
 
-def _tried(config: Config, item: Correction, recording: Recording, progress: Progress) -> Config:
-    """Return the configuration with the decision of a correction's trial."""
+def _after_trial(
+    config: Config, item: Correction, recording: Recording, progress: Progress
+) -> Config:
+    """Return the configuration after the trial of a correction."""
     others = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
-    without, corrected = _preparation(others), _preparation(config)
-    if _changes(config, recording, without, corrected):
-        result = trial(recording, without, corrected)
-        decided = item.after_trial(result.helps, result.strength, result.error)
-        if decided.disabled:
+    uncorrected, corrected = _preparation(others), _preparation(config)
+    if _changes(config, recording, uncorrected, corrected):
+        result = trial(recording, uncorrected, corrected)
+        tested = item.after_trial(result.is_significant, result.strength, result.error)
+        if tested.disabled:
             progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")
     else:
-        decided = item.after_trial(helps=True)
-    corrections = tuple(decided if c is item else c for c in config.corrections)
+        tested = item.after_trial(helps=True)
+    corrections = tuple(tested if c is item else c for c in config.corrections)
     return replace(config, corrections=corrections)
 
 
-def _changes(config: Config, recording: Recording, without: Prepare, corrected: Prepare) -> bool:
+def _changes(
+    config: Config, recording: Recording, uncorrected: Prepare, corrected: Prepare
+) -> bool:
     """Whether a correction changes the first image of a recording."""
     frame = recording.first_readable()
     if frame is None:
@@ -169,7 +177,7 @@ def _changes(config: Config, recording: Recording, without: Prepare, corrected: 
     check_views(config, kind_of(frame))
     if not isinstance(frame, RangeFrame):
         return False
-    before, after = without(frame), corrected(frame)
+    before, after = uncorrected(frame), corrected(frame)
     assert isinstance(before, RangeFrame)
     assert isinstance(after, RangeFrame)
     return not np.array_equal(before.depth, after.depth)
@@ -190,27 +198,27 @@ def _preparation(config: Config) -> Prepare:
     return prepare
 
 
-def _learned_corrections(
+def _fitted_corrections(
     corrections: Sequence[Correction], frames: list[Frame]
 ) -> tuple[tuple[Correction, ...], list[Frame]]:
-    """Let each correction learn from frames corrected by those before; and correct the frames."""
-    learned = []
+    """Fit each correction to frames corrected by the preceding ones; and correct the frames."""
+    fitted = []
     for item in corrections:
         item = item.fit(frames) if item.needs_fit else item
         corrector = item.start()
         frames = [corrector.apply(frame) for frame in frames]
-        learned.append(item)
-    return tuple(learned), frames
+        fitted.append(item)
+    return tuple(fitted), frames
 
 
-def _learned_filters(
+def _fitted_filters(
     filters: Sequence[Filter], frames: list[Frame]
 ) -> tuple[tuple[Filter, ...], list[Frame]]:
-    """Let each filter learn from frames filtered by those before; and filter the frames."""
-    learned = []
+    """Fit each filter to frames filtered by the preceding ones; and filter the frames."""
+    fitted = []
     for item in filters:
         item = item.fit(frames) if item.needs_fit else item
         if item.window == 1:  # a sample has no neighbours in time
             frames = [frame.keep(item.mask(frame, ())) for frame in frames]
-        learned.append(item)
-    return tuple(learned), frames
+        fitted.append(item)
+    return tuple(fitted), frames

@@ -32,13 +32,13 @@ class Assembly:
     ----------
     observations
         The store of observations.
-    given
+    given_loops
         Given loops.
     """
 
     config: Config
     observations: Observations
-    given: tuple[GivenLoop, ...]
+    given_loops: tuple[GivenLoop, ...]
     progress: Progress
     watch: Stopwatch
     seed: int
@@ -48,32 +48,32 @@ class Assembly:
         """Join components, and reconstruct them: the main one last."""
         with threads(self.threads):
             groups = self._join(log, stages)
-            log, components = numbered_components(log, groups, self._reconstruct_apart)
+            log, components = numbered_components(log, groups, self._reconstruct_separate)
             poses = poses_in_world(log, groups[0].T_group_component)
             result = self._back_end(log, poses, groups[0].joins).run(stages, components)
         return replace(result, seed=self.seed, threads=self.threads)
 
     def graph(self, log: FrameLog, component: int, loops: Sequence[ClosedLoop]) -> PoseGraph:
         """Return the pose graph of a component as tracked, with loops."""
-        own = log.of_component(component)
-        poses = poses_in_world(own, {component: np.eye(4)})
-        return TrackedGraph(own.posed, poses, ()).build(loops)
+        component_log = log.of_component(component)
+        poses = poses_in_world(component_log, {component: np.eye(4)})
+        return TrackedGraph(component_log.posed, poses, ()).build(loops)
 
     def _join(self, log: FrameLog, stages: Stages) -> list[Group]:
-        """Decide which components are connected, and how, from all views."""
-        kept = stages.load("joining")
-        if kept is not None:
-            self.watch.seconds.update(kept[1])
-            return list(kept[0])
-        stretches = log.stretches(self.observations.views)
-        if len(stretches) > 1:
+        """Decide from all views which components are connected, and how."""
+        saved = stages.load("joining")
+        if saved is not None:
+            self.watch.seconds.update(saved[1])
+            return list(saved[0])
+        components = log.tracked_components(self.observations.views)
+        if len(components) > 1:
             self.progress.stage("joining components")
         with self.watch.timing("joining"):
-            groups = self.config.joining.join(stretches, log.links, self.config.search)
+            groups = self.config.joining.join(components, log.links, self.config.search)
         stages.save("joining", (groups, dict(self.watch.seconds)))
         return groups
 
-    def _reconstruct_apart(
+    def _reconstruct_separate(
         self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
     ) -> Reconstruction:
         """Reconstruct a component that is not connected to the main one."""
@@ -86,7 +86,7 @@ class Assembly:
             log,
             poses,
             joins,
-            self.given,
+            self.given_loops,
             self.observations.for_back_end(),
             self.progress,
             self.watch,

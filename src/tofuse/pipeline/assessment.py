@@ -45,7 +45,7 @@ class Assessed:
     accuracy
         Bounds of the pose errors.
     records
-        Of all frames, with the covariances of their poses.
+        Records of all frames, with the covariances of their poses.
     model
         The model, whose errors include those of the poses.
     """
@@ -59,7 +59,7 @@ class Assessed:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """Assesses one connected part.
+    """Assesses the reconstruction of one connected part.
 
     Attributes
     ----------
@@ -69,17 +69,17 @@ class Assessment:
         The frames of the part.
     tracked
         Its pose graph.
-    stored
+    observations
         Stored observations.
-    given
+    given_loops
         Given loops.
     """
 
     config: Config
     log: FrameLog
     tracked: TrackedGraph
-    stored: BackEndInput
-    given: Sequence[GivenLoop]
+    observations: BackEndInput
+    given_loops: Sequence[GivenLoop]
 
     def run(
         self,
@@ -99,11 +99,11 @@ class Assessment:
         components
             As in `Reconstruction`.
         """
-        graph, stored = refined.graph, self.stored
+        graph, observations = refined.graph, self.observations
         loops = tuple(c.record for c in closed.loops)
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
-        if stored.has_covariances:
+        if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
         records = self._records(covariances)
         posed, entries = self.tracked.posed, self.log.entries
@@ -111,33 +111,35 @@ class Assessment:
             records=records,
             registrations=tuple(None if e.step is None else e.step.registration for e in entries),
             loops=loops,
-            sequential=closed.visual.sequential if self._tracks else graph.poses,
+            sequential=closed.visual.sequential if self._is_tracked else graph.poses,
             optimisation=closed.visual.optimisation,
             cross_view=cross_view,
             accuracy=accuracy,
             diagonal_m=model.cloud.diagonal_m,
             tolerance_m=self.config.tolerance_m,
-            has_covariances=stored.has_covariances,
+            has_covariances=observations.has_covariances,
             refinement=refined.refinement,
-            given=frozenset((g.i, g.j) for g in self.given if g.by_user),
+            given_loops=frozenset((g.i, g.j) for g in self.given_loops if g.by_user),
             depths=tuple(
-                d for index, d in stored.depths.items() if d > 0 and index in self.tracked.poses
+                d
+                for index, d in observations.depths.items()
+                if d > 0 and index in self.tracked.poses
             ),
-            ambiguity_m=stored.ambiguity_m,
+            ambiguity_m=observations.ambiguity_m,
             repeated=tuple(self.log.repeated),
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,
             components=components,
             moving=tuple((e.record.index, e.moving) for e in posed if e.moving > 0),
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
-            hanging=on_a_single_link(self.tracked, loops),
+            single_link_frames=single_link_frames(self.tracked, loops),
         )
         verdict, reasons = judge(evidence)
         more = [*self._correction_reasons(), *self._surface_reasons(model)]
         return Assessed(verdict, ranked([*reasons, *more]), accuracy, records, model)
 
     @property
-    def _tracks(self) -> bool:
+    def _is_tracked(self) -> bool:
         return not isinstance(self.config.odometry, GivenPoses)
 
     def _accuracy(
@@ -151,44 +153,45 @@ class Assessment:
 
         Not assessed if covariances of registrations are unrealistic.
         """
-        if not self.stored.has_covariances:
+        if not self.observations.has_covariances:
             return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
         refinement = refined.refinement
-        known = images_only = GraphCovariances(self._measured(refined.graph, refinement))
-        if closed.sensors:  # the accuracy rests on the images alone where they suffice
+        full = images_only = GraphCovariances(self._measured(refined.graph, refinement))
+        if closed.sensors:  # the accuracy uses the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
                 without_sensors = self.tracked.build(
                     closed.loops, refinement, confirmed=closed.confirmed
                 )
             images_only = GraphCovariances(self._measured(without_sensors, refinement))
-        moved = 0.0, 0.0
-        if self._tracks:  # the initial error of given poses says nothing of the final one
-            moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
-        excess = 0.0 if cross_view is None else cross_view.excess_m()
-        calibration = self._by_calibration(refinement.calibration_check)
-        shown = ObservedErrors(
-            *moved, excess, *calibration, refinement.split_m, refinement.split_rad
+        refinement_shift = 0.0, 0.0
+        if self._is_tracked:  # the initial error of given poses is unrelated to the final one
+            refinement_shift = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        excess_m = 0.0 if cross_view is None else cross_view.excess_m()
+        calibration = self._calibration_error(refinement.calibration_check)
+        observed = ObservedErrors(
+            *refinement_shift, excess_m, *calibration, refinement.split_m, refinement.split_rad
         )
-        covariances = covariances_of(known, shown)
-        del known  # only one large factor is in memory
-        accuracy = accuracy_of(images_only, shown, model.cloud.diagonal_m)
+        covariances = covariances_of(full, observed)
+        del full  # only one large factor is in memory
+        accuracy = accuracy_of(images_only, observed, model.cloud.diagonal_m)
         if accuracy.unbounded and closed.sensors.verified:
-            free = set(accuracy.unbounded)
-            bounded = with_sensors(images_only.graph, self._where_degenerate(closed.sensors))
-            accuracy = accuracy_of(GraphCovariances(bounded), shown, model.cloud.diagonal_m)
-            by_odometry = tuple(sorted(free.difference(accuracy.unbounded)))
+            unbounded = set(accuracy.unbounded)
+            bounded = with_sensors(images_only.graph, self._steps_at_degenerate(closed.sensors))
+            accuracy = accuracy_of(GraphCovariances(bounded), observed, model.cloud.diagonal_m)
+            by_odometry = tuple(sorted(unbounded.difference(accuracy.unbounded)))
             accuracy = replace(accuracy, by_odometry=by_odometry)
         return accuracy, covariances
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
-        return self.tracked.measured(graph, self.stored.views, refinement.stated)
+        return self.tracked.measured(graph, self.observations.views, refinement.stated)
 
-    def _by_calibration(self, check: CalibrationCheck | None) -> tuple[float, float]:
-        """Return how far (m, rad) the poses may be off by the calibration (95 %).
+    def _calibration_error(self, check: CalibrationCheck | None) -> tuple[float, float]:
+        """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
 
-        That is the gap of a loop that a better calibration would close, or the motion by the one
-        that the views estimate, unless a loop contradicts; and the uncertainty of a correction.
+        It is the gap of a loop that a better calibration would close, or the change of the poses
+        under the estimated calibration unless a loop contradicts that; plus the uncertainty of
+        corrections.
         """
         if check is None:
             return 0.0, 0.0
@@ -207,8 +210,8 @@ class Assessment:
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
 
-    def _where_degenerate(self, sensors: SensorPriors) -> SensorPriors:
-        """Return the steps of odometry from and to degenerate frames, and over gaps."""
+    def _steps_at_degenerate(self, sensors: SensorPriors) -> SensorPriors:
+        """Return the odometry steps from and to degenerate frames, and over gaps."""
         ends = self.tracked.unobservable.keys()
         gaps = self.tracked.gaps
         steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
@@ -216,30 +219,32 @@ class Assessment:
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
-        frames, at = self._checked_images(graph)
-        return with_pose_errors(model, frames, graph.poses[at], covariances[at])
+        frames, rows = self._checked_images(graph)
+        return with_pose_errors(model, frames, graph.poses[rows], covariances[rows])
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
-        """Return the records with the covariances (P, 6, 6) of the frames with a pose here."""
-        known = dict(zip((e.record.index for e in self.tracked.posed), covariances, strict=True))
+        """Return the records, with the covariances (P, 6, 6) of the frames of this part."""
+        covariance_of = dict(
+            zip((e.record.index for e in self.tracked.posed), covariances, strict=True)
+        )
         out = []
         for entry in self.log.entries:
-            C = known.get(entry.record.index)
+            C = covariance_of.get(entry.record.index)
             finite = C is not None and bool(np.isfinite(C).all())
             out.append(replace(entry.record, covariance=C) if finite else entry.record)
         return tuple(out)
 
     def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
         """Compare overlapping images at the final poses."""
-        frames, at = self._checked_images(graph)
-        return cross_view_consistency(frames, graph.poses[at]) if len(frames) > 1 else None
+        frames, rows = self._checked_images(graph)
+        return cross_view_consistency(frames, graph.poses[rows]) if len(frames) > 1 else None
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""
-        images = (image.get() for image in self.stored.checks)
+        images = (image.get() for image in self.observations.checks)
         frames = [f for f in images if f.index in self.tracked.poses]
-        row = {int(frame): k for k, frame in enumerate(graph.ids)}
-        return frames, np.array([row[f.index] for f in frames], np.intp)
+        row_of = {int(frame): k for k, frame in enumerate(graph.ids)}
+        return frames, np.array([row_of[f.index] for f in frames], np.intp)
 
     def _correction_reasons(self) -> tuple[Reason, ...]:
         """Return the reason if a correction was left out."""
@@ -270,19 +275,19 @@ class Assessment:
         return (Reason("no_surface", self._whole_recording, text),)
 
 
-def on_a_single_link(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
+def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
     """Return the frames connected to the first one by a single, unconfirmed link."""
     if not tracked.joins:
         return ()
     component_of = {e.record.index: e.step.component for e in tracked.posed if e.step is not None}
     pairs = [(j.link.i, j.link.j) for j in tracked.joins]
-    # Another registration of the same two views is no confirmation.
-    known = {frozenset(pair) for pair in pairs}
-    pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in known]
+    # Another registration of the same two views does not confirm it.
+    joined_pairs = {frozenset(pair) for pair in pairs}
+    pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in joined_pairs]
     edges = [(component_of[i], component_of[j]) for i, j in pairs]
     first = component_of[tracked.posed[0].record.index]
-    hanging: set[int] = set()
+    weak_components: set[int] = set()
     for k, sides in cut_edges(edges).items():
         if k < len(tracked.joins) and tracked.joins[k].how == "links":
-            hanging |= sides[1] if first in sides[0] else sides[0]
-    return tuple(index for index, c in component_of.items() if c in hanging)
+            weak_components |= sides[1] if first in sides[0] else sides[0]
+    return tuple(index for index, c in component_of.items() if c in weak_components)

@@ -41,12 +41,12 @@ class BackEnd:
     log
         The frames of the part.
     poses
-        (4, 4) T_world_camera by frame index, the identity first.
+        (4, 4) T_world_camera by frame index; that of the first frame is the identity.
     joins
         Edges between components.
-    given
+    given_loops
         Given loops.
-    stored
+    observations
         Stored observations.
     progress, watch
         Receive stages and times.
@@ -58,31 +58,31 @@ class BackEnd:
         log: FrameLog,
         poses: dict[int, Float64],
         joins: Sequence[Join],
-        given: Sequence[GivenLoop],
-        stored: BackEndInput,
+        given_loops: Sequence[GivenLoop],
+        observations: BackEndInput,
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
-        self._config, self._log, self._given = config, log, given
-        self._stored, self._progress, self._watch = stored, progress, watch
+        self._config, self._log, self._given_loops = config, log, given_loops
+        self._observations, self._progress, self._watch = observations, progress, watch
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
     def run(self, stages: Stages, components: tuple[Component, ...]) -> Reconstruction:
         """Return the reconstruction; `stages` stores the result of each step."""
-        closed = self._staged(stages, "loops", self._close_loops)
-        refined = self._staged(stages, "refinement", lambda: self._refine(closed))
-        fused = self._staged(stages, "fusion", lambda: self._fuse(closed, refined))
+        closed = self._run_stage(stages, "loops", self._close_loops)
+        refined = self._run_stage(stages, "refinement", lambda: self._refine(closed))
+        fused = self._run_stage(stages, "fusion", lambda: self._fuse(closed, refined))
         return self._result(closed, refined, fused, components)
 
-    def _staged(self, stages: Stages, name: str, work: Callable[[], T]) -> T:
-        """Return the result of a stage, stored by an interrupted job or computed now."""
-        stored = stages.load(name)
-        if stored is not None:
-            result: T = stored[0]
-            self._watch.seconds.update(stored[1])
+    def _run_stage(self, stages: Stages, name: str, compute: Callable[[], T]) -> T:
+        """Return the result of a stage: loaded from an interrupted job, or computed."""
+        saved = stages.load(name)
+        if saved is not None:
+            result: T = saved[0]
+            self._watch.seconds.update(saved[1])
             return result
-        result = work()
+        result = compute()
         with self._watch.timing("keeping"):
             stages.save(name, (result, dict(self._watch.seconds)))
         give_back()
@@ -92,49 +92,51 @@ class BackEnd:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
             tracked = self._tracked.build(())
-            # For the search, motion in degenerate directions may differ from that elsewhere.
+            # For the search, assume that motion in degenerate directions may differ from the rest.
             degenerate = bool(self._tracked.unobservable)
-            cautious = self._tracked.build((), cautious=True) if degenerate else tracked
-            found = self._stored.loops.finish(self._tracked.poses, _covariances(cautious))
-            loops = with_joins(found, self._tracked.joins)
-            del cautious
-            loops = self._search_loops_again(loops)
+            conservative = self._tracked.build((), conservative=True) if degenerate else tracked
+            detected = self._observations.loops.finish(
+                self._tracked.poses, _covariances(conservative)
+            )
+            loops = with_joins(detected, self._tracked.joins)
+            del conservative
+            loops = self._repeat_loop_search(loops)
             graph = self._tracked.build(loops)
-        # Without loops: with and without external sensors.
-        sequential = guided = graph.poses
+        # Poses before loop closure, without and with external sensors.
+        sequential = aided = graph.poses
         sensors = SensorPriors()
         if self._config.priors:
-            sensed = self._log.sensed(graph.ids.tolist())
-            measured = self._tracked.measured(tracked, self._stored.views)
-            sensors = measure_all(self._config.priors, sensed, measured)
+            sensor_data = self._log.sensor_data(graph.ids.tolist())
+            measured_graph = self._tracked.measured(tracked, self._observations.views)
+            sensors = measure_all(self._config.priors, sensor_data, measured_graph)
         optimisation = Optimisation(with_sensors(graph, sensors), (), True)
         confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation, confirmed = self._optimise(graph, loops, sensors)
-                if sensors and graph.loop.any():  # the poses that loops are compared with
+                if sensors and graph.loop.any():  # loops are compared with these poses
                     without_loops = with_sensors(tracked, sensors)
-                    guided = self._config.optimiser.optimise(without_loops).graph.poses
+                    aided = self._config.optimiser.optimise(without_loops).graph.poses
             loops = _without_rejected(loops, optimisation)
             optimisation = accepted_only(optimisation)
         graph = optimisation.graph
-        visual = VisualEvidence(guided, optimisation)
+        visual = VisualEvidence(aided, optimisation)
         if sensors:
-            # The verdict rests on the images alone: external sensors can't improve it.
+            # The verdict uses the images alone: external sensors can't improve it.
             images_only = self._tracked.build(loops, confirmed=confirmed).with_poses(graph.poses)
-            visual = VisualEvidence(guided, replace(optimisation, graph=images_only))
+            visual = VisualEvidence(aided, replace(optimisation, graph=images_only))
         return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)
 
     def _optimise(
         self, graph: PoseGraph, loops: Sequence[ClosedLoop], sensors: SensorPriors
     ) -> tuple[Optimisation, frozenset[int]]:
-        """Optimise a graph with loops; again if neighbouring views no longer agree.
+        """Optimise a graph with loops; repeat if neighbouring views become inconsistent.
 
-        The registrations between those get their usual uncertainty: see `worse_neighbours`.
-        Returns the frames of these registrations as well.
+        Registrations between such views then get their usual uncertainty (`worse_neighbours`). Also
+        returns the frames of these registrations.
         """
-        row = {int(index): k for k, index in enumerate(graph.ids)}
+        row_of = {int(index): k for k, index in enumerate(graph.ids)}
         suspects = frozenset(
             e.record.index
             for e in self._tracked.posed
@@ -143,39 +145,39 @@ class BackEnd:
         confirmed: frozenset[int] = frozenset()
         while True:
             optimisation = self._config.optimiser.optimise(with_sensors(graph, sensors))
-            views = self._stored.views.of(row) if suspects else []
-            at = [row[v.index] for v in views]
-            before, after = graph.poses[at], optimisation.graph.poses[at]
-            worse = worse_neighbours(views, before, after, suspects)
-            right = suspects.intersection(k for i, j in worse for k in range(i + 1, j + 1))
-            if not right:
+            views = self._observations.views.of(row_of) if suspects else []
+            rows = [row_of[v.index] for v in views]
+            before, after = graph.poses[rows], optimisation.graph.poses[rows]
+            worse_pairs = worse_neighbours(views, before, after, suspects)
+            cleared = suspects.intersection(k for i, j in worse_pairs for k in range(i + 1, j + 1))
+            if not cleared:
                 return optimisation, confirmed
-            confirmed, suspects = confirmed | right, suspects - right
+            confirmed, suspects = confirmed | cleared, suspects - cleared
             graph = self._tracked.build(loops, confirmed=confirmed)
 
-    def _search_loops_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
-        """Search loops again once those found have corrected the poses in between.
+    def _repeat_loop_search(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
+        """Search loops again after the detected ones have corrected the poses in between.
 
-        Along a long trajectory the drift exceeds the search range of loops; its middle is right
-        once the ends are joined.
+        Along a long trajectory the drift exceeds the search range of loops; the poses in its middle
+        are corrected only after its ends are joined.
         """
-        for _ in range(_MAX_SEARCHES if self._stored.loops.many else 0):
+        for _ in range(_MAX_SEARCHES if self._observations.loops.many else 0):
             graph = self._tracked.build(loops)
             if not graph.loop.any():
                 break
             graph = accepted_only(self._config.optimiser.optimise(graph)).graph
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
-            if not self._stored.loops.candidates_change(poses):
+            if not self._observations.loops.candidates_change(poses):
                 break
-            found = self._stored.loops.finish(poses, _covariances(graph))
-            loops = with_joins(found, self._tracked.joins)
+            detected = self._observations.loops.finish(poses, _covariances(graph))
+            loops = with_joins(detected, self._tracked.joins)
         return loops
 
     def _refine(self, closed: Optimised) -> Refined:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
-            refinement = self._stored.refiner.finish(
+            refinement = self._observations.refiner.finish(
                 graph.ids.tolist(), graph.poses, closed.sensors
             )
             if refinement.kept:
@@ -184,8 +186,8 @@ class BackEnd:
         return Refined(graph, refinement)
 
     def _fuse(self, closed: Optimised, refined: Refined) -> Fused:
-        graph, refinement, model = refined.graph, refined.refinement, self._stored.model
-        moved = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
+        graph, refinement, model = refined.graph, refined.refinement, self._observations.model
+        poses_changed = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
         self._progress.stage("fusing", model.views)
         with self._watch.timing("fusion"):
             ids = graph.ids.tolist()
@@ -194,8 +196,8 @@ class BackEnd:
                 self._progress.advance,
                 refinement.errors,
             )
-            started = dict(zip(ids, closed.sequential, strict=True))
-            return Fused(fused, model.sketch(started) if moved else None)
+            initial_poses = dict(zip(ids, closed.sequential, strict=True))
+            return Fused(fused, model.sketch(initial_poses) if poses_changed else None)
 
     def _result(
         self,
@@ -207,7 +209,7 @@ class BackEnd:
         self._progress.stage("checking")
         with self._watch.timing("checking"):
             assessment = Assessment(
-                self._config, self._log, self._tracked, self._stored, self._given
+                self._config, self._log, self._tracked, self._observations, self._given_loops
             )
             assessed = assessment.run(closed, refined, fused.model, components)
         model, entries = assessed.model, self._log.entries
@@ -226,7 +228,7 @@ class BackEnd:
                 objective=closed.optimisation.objective,
                 removed={},
                 seconds=dict(self._watch.seconds),
-                cloud_before=fused.before,
+                cloud_before=fused.cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,
                 priors=closed.sensors.records,
@@ -253,12 +255,12 @@ def _covariances(graph: PoseGraph) -> dict[int, Float64]:
 
 
 def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:
-    """Return loops, and the redundant joins of components, which close loops as well."""
-    known = {(c.record.i, c.record.j) for c in loops}
-    more = []
+    """Return the loops and the redundant joins of components, which close loops as well."""
+    closed_pairs = {(c.record.i, c.record.j) for c in loops}
+    redundant = []
     for join in joins:
         link = join.link
-        if join.needed or {(link.i, link.j), (link.j, link.i)} & known:
+        if join.needed or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
             continue
         r = link.registration
         record = LoopRecord(
@@ -271,8 +273,8 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
             free_space_violation=r.violation,
             margin=r.margin,
         )
-        more.append(ClosedLoop(record, link.T_i_j, link.information))
-    return [*loops, *more]
+        redundant.append(ClosedLoop(record, link.T_i_j, link.information))
+    return [*loops, *redundant]
 
 
 def _without_rejected(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:

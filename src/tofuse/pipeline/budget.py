@@ -1,9 +1,9 @@
-"""How the memory of a run is divided."""
+"""Division of the memory of a run."""
 
 from __future__ import annotations
 
-# Fractions of the total. The rest is the program itself (some 400 MB), frames being processed, what
-# stages compute from stored views, and the result.
+# Fractions of the total. The remainder is for the program itself (about 400 MB), frames being
+# processed, data computed from stored views, and the result.
 _VOXELS, _VIEWS, _CHECKED = 0.3, 0.03, 0.005
 
 
@@ -13,7 +13,7 @@ def voxels_mb(memory_mb: int) -> int:
 
 
 def checked_bytes(memory_mb: int) -> int:
-    """Return the memory for images that are compared with each other at the end, bytes."""
+    """Return the memory for the images of the final comparison, bytes."""
     return int(_CHECKED * memory_mb * 1_000_000)
 
 

@@ -1,7 +1,7 @@
 """Checkpoints: the state after each stage of a run, from which an interrupted run is resumed.
 
-A state is an .npz file: arrays, and JSON that describes how our own types consist of them
-(`states`). Nothing else is loaded, so that a folder from somebody else executes no code.
+A state is an .npz file: arrays, and JSON that describes how the package's own types consist of
+them (`states`). Nothing else is loaded, so a folder from an untrusted source executes no code.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from tofuse.results.folder import CHECKPOINT
 
 # The state of tracking, which is large, is saved at this interval, and at most at this fraction of
 # the time.
-_EVERY_S, _TIME_FRACTION = 30.0, 0.03
-# Free space to leave for the result: a multiple of the state, and bytes.
-_TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
-# A failure after this time keeps the states, for when there is space or memory again.
-_WORTH_KEEPING_S = 60.0
+_INTERVAL_S, _TIME_FRACTION = 30.0, 0.03
+# Disk space to leave for the result: a multiple of the state's size, and bytes.
+_FREE_STATES, _FREE_BYTES = 2, 50_000_000
+# After a failure, states are kept for another attempt if the run took at least this time.
+_MIN_KEPT_RUN_S = 60.0
 # Names of states, and of temporary files of these.
 _STATE = re.compile(r"[a-z]+\.(state|part)")
 _VERSION = 3  # of the format
@@ -56,7 +56,7 @@ class Stages(Protocol):
         ...
 
     def due(self) -> bool:
-        """Whether a large state, such as that within a stage, should be saved now."""
+        """Whether a large state, such as an intermediate one of a stage, should be saved now."""
         ...
 
 
@@ -85,8 +85,8 @@ class Checkpoints(Stages):
     used
         Whether the run was resumed from a checkpoint.
     fresh
-        Whether the run began without an earlier result in the folder, so that it may write there
-        again without --overwrite; None without checkpoints of this run.
+        Whether the run began without an earlier result in the folder: then it may write there again
+        without --overwrite. None without checkpoints of this run.
     """
 
     def __init__(self, out: Path, key: str, note: Callable[[str], None]) -> None:
@@ -97,8 +97,8 @@ class Checkpoints(Stages):
         out
             The output folder.
         key
-            Digest of everything that determines the result. Checkpoints with another one are not
-            used.
+            Digest of everything that determines the result. Checkpoints with another digest are
+            ignored.
         note
             Shows a message to the user.
         """
@@ -107,10 +107,10 @@ class Checkpoints(Stages):
         self.used = False
         self._key = key
         self._note = note
-        self._works = True
+        self._enabled = True
         self._finished = False
-        self._begun = self._last = perf_counter()
-        self._cost_s = 0.0
+        self._start_s = self._last_save_s = perf_counter()
+        self._save_duration_s = 0.0
         self._foreign: list[Path] = []
         linked = self.folder.is_symlink()
         for file in () if linked else sorted(self.folder.glob("*.state")):
@@ -145,8 +145,8 @@ class Checkpoints(Stages):
         try:
             state = _read(path, self._key)
         except (InputError, StateError) as error:
-            why = error.problem if isinstance(error, InputError) else str(error)
-            self._note(f"the checkpoint of stage {stage} is damaged, and not used ({why})")
+            reason = error.problem if isinstance(error, InputError) else str(error)
+            self._note(f"the checkpoint of stage {stage} is damaged, and not used ({reason})")
             _unlink(path)
             return None
         self.used = True
@@ -154,7 +154,7 @@ class Checkpoints(Stages):
 
     def save(self, stage: str, state: Any) -> None:
         """See `Stages`. If it can't be written, the run continues without checkpoints."""
-        if not self._works or state is None:
+        if not self._enabled or state is None:
             return
         start = perf_counter()
         path = self._path(stage)
@@ -165,28 +165,28 @@ class Checkpoints(Stages):
             _write(part, header, state)
             os.replace(part, path)
             size = path.stat().st_size
-            if shutil.disk_usage(self.folder).free < _TIMES_LEFT * size + _BYTES_LEFT:
+            if shutil.disk_usage(self.folder).free < _FREE_STATES * size + _FREE_BYTES:
                 raise OSError("hardly any space left")
         # A part from elsewhere may have attributes that can't be stored.
         except (OSError, StateError) as error:
-            self._works = False
-            why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            self._enabled = False
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self._note(
-                f"can't save a checkpoint after {stage} ({why.lower()}): if this run is "
+                f"can't save a checkpoint after {stage} ({reason.lower()}): if this run is "
                 "interrupted, the next one starts from the beginning"
             )
             self.discard()
-        self._last = perf_counter()
-        self._cost_s = self._last - start
+        self._last_save_s = perf_counter()
+        self._save_duration_s = self._last_save_s - start
 
     def due(self) -> bool:
         """See `Stages`."""
-        waited = perf_counter() - self._last
-        return self._works and waited >= max(_EVERY_S, self._cost_s / _TIME_FRACTION)
+        elapsed = perf_counter() - self._last_save_s
+        return self._enabled and elapsed >= max(_INTERVAL_S, self._save_duration_s / _TIME_FRACTION)
 
     def discard(self) -> None:
         """Remove all checkpoints."""
-        _clear(self.folder)
+        _remove_states(self.folder)
 
     def finish(self) -> None:
         """Remove all checkpoints, as there is a result."""
@@ -195,10 +195,12 @@ class Checkpoints(Stages):
 
     def give_up(self, error: BaseException) -> None:
         """Remove all checkpoints, unless they save much work and a retry may succeed."""
-        can_help = isinstance(
+        retry_may_succeed = isinstance(
             error, OutputError | OSError | MemoryError | Ended | KeyboardInterrupt
         )
-        if self._finished or not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
+        if self._finished or not (
+            retry_may_succeed and perf_counter() - self._start_s >= _MIN_KEPT_RUN_S
+        ):
             self.discard()
 
     def unusable(self, error: Exception) -> InputError:
@@ -215,10 +217,10 @@ class Checkpoints(Stages):
 
 def discard_states(out: Path) -> None:
     """Remove the checkpoints of an interrupted run from its output folder."""
-    _clear(out / CHECKPOINT)
+    _remove_states(out / CHECKPOINT)
 
 
-def _clear(folder: Path) -> None:
+def _remove_states(folder: Path) -> None:
     """Remove states, and no other files in the folder."""
     if folder.is_symlink() or not folder.is_dir():
         return
@@ -229,47 +231,47 @@ def _clear(folder: Path) -> None:
         folder.rmdir()
 
 
-def digest(facts: Mapping[str, Any], files: Iterable[Path], *, without: Path) -> str:
-    """Return a digest of plain facts, of files, and of this program.
+def digest(facts: Mapping[str, Any], files: Iterable[Path], *, excluded: Path) -> str:
+    """Return a digest of plain data, of files, and of this program.
 
     Parameters
     ----------
     facts
         Plain data.
     files
-        Files and folders, which count by path, size and modification time; the other files in the
-        folder of a single file count as well.
-    without
-        A folder that does not count.
+        Files and folders, by path, size and modification time; for a single file, all files in its
+        folder are included.
+    excluded
+        A folder that is excluded.
     """
     stats = []
     for path in files:
-        stats += _stamps(path.absolute(), without.absolute())
+        stats += _stamps(path.absolute(), excluded.absolute())
     text = json.dumps({"facts": facts, "files": stats, "program": _program()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _stamps(path: Path, without: Path) -> list[Stamp]:
+def _stamps(path: Path, excluded: Path) -> list[Stamp]:
     if path.is_dir():
-        return stamps_in(path, without)
+        return stamps_in(path, excluded)
     return [stamp(each) for each in sorted(path.parent.iterdir()) if each.is_file()]
 
 
 @cache
 def _program() -> str:
-    """Return a digest of our sources and of the numerical libraries."""
+    """Return a digest of the package's sources and of the numerical libraries."""
     import cv2
     import numba
     import numpy
     import scipy
 
-    made_with = (cv2.__version__, numba.__version__, numpy.__version__, scipy.__version__)
-    text = repr((sys.version, platform.machine(), *made_with))
-    found = hashlib.sha256(text.encode())
+    versions = (cv2.__version__, numba.__version__, numpy.__version__, scipy.__version__)
+    text = repr((sys.version, platform.machine(), *versions))
+    hasher = hashlib.sha256(text.encode())
     root = Path(__file__).parents[1]
     for file in sorted(root.rglob("*.py")):
-        found.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes())
-    return found.hexdigest()
+        hasher.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes())
+    return hasher.hexdigest()
 
 
 def _unlink(path: Path) -> None:

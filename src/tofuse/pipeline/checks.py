@@ -1,4 +1,4 @@
-"""The verdict of a run, from its own evidence and without a reference."""
+"""The verdict of a run, from its evidence and without a reference."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.refinement import Refinement
 from tofuse.registration.base import Registration
-from tofuse.results.ranges import Range, in_words, is_one, runs, runs_of, size, union
+from tofuse.results.ranges import Range, in_words, is_single, runs, runs_of, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
@@ -58,8 +58,8 @@ class Evidence:
     Attributes
     ----------
     records, registrations
-        Of every frame, in order; a registration is None for the first and for lost frames.
-        Registrations of frames outside the main model do not count.
+        One per frame, in order; a registration is None for the first and for lost frames.
+        Registrations of frames outside the main model are ignored.
     loops
         All candidate loops.
     sequential
@@ -78,7 +78,7 @@ class Evidence:
         Whether covariances of registrations are realistic, which ICP's are not.
     refinement
         Result of the refinement of all views.
-    given
+    given_loops
         Pairs (i, j) of loops given by the user.
     depths
         Median radial range of every frame with a pose, m.
@@ -95,8 +95,8 @@ class Evidence:
     moving
         (frame index, fraction of the image) of frames with moving objects.
     doubtful
-        Indices of the frames that fit worse than this camera's views usually do.
-    hanging
+        Indices of the frames that fit worse than usual for this camera.
+    single_link_frames
         Indices of the frames that a single registration connects to the first one.
     """
 
@@ -111,7 +111,7 @@ class Evidence:
     tolerance_m: float | None = None
     has_covariances: bool = False
     refinement: Refinement | None = None
-    given: frozenset[tuple[int, int]] = frozenset()
+    given_loops: frozenset[tuple[int, int]] = frozenset()
     depths: tuple[float, ...] = ()
     ambiguity_m: float | None = None
     repeated: tuple[int, ...] = ()
@@ -120,16 +120,16 @@ class Evidence:
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
-    hanging: tuple[int, ...] = ()
+    single_link_frames: tuple[int, ...] = ()
 
     @property
-    def everything(self) -> tuple[Range, ...]:
-        """The whole recording."""
+    def full_range(self) -> tuple[Range, ...]:
+        """First and last frame of the recording."""
         return ((self.records[0].index, self.records[-1].index),)
 
     @property
-    def posed(self) -> tuple[Range, ...]:
-        """From the first to the last frame of the main model."""
+    def posed_range(self) -> tuple[Range, ...]:
+        """First and last frame of the main model."""
         ids = self.optimisation.graph.ids
         return ((int(ids[0]), int(ids[-1])),)
 
@@ -152,13 +152,13 @@ class Evidence:
         return runs_of([record.index for record in self.records], frames)
 
 
-def tolerance_of(given_m: float | None, diagonal_m: float) -> float:
-    """Return the tolerance of poses, m: as given, or in proportion to the model's diagonal."""
-    return max(TOLERANCE_M, TOLERANCE_FRACTION * diagonal_m) if given_m is None else given_m
+def tolerance_of(tolerance_m: float | None, diagonal_m: float) -> float:
+    """Return the tolerance of poses, m: by default proportional to the model's diagonal."""
+    return max(TOLERANCE_M, TOLERANCE_FRACTION * diagonal_m) if tolerance_m is None else tolerance_m
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
-    """Return the verdict and the reasons for it, each code once, the most severe first."""
+    """Return the verdict and its reasons, each code once, the most severe first."""
     reasons = ranked(
         [
             *_poses(evidence),
@@ -181,19 +181,19 @@ def _poses(e: Evidence) -> Iterator[Reason]:
     readable = [r for r in e.records if r.status != "skipped"]
     posed = [r for r in readable if r.status != "lost"]
     main = sum(e.in_main)
-    # Unconnected single frames are no model, however few there are.
+    # A single frame is no model if there are other, unconnected ones.
     scattered = main == 1 and len(posed) > 1
     if 2 * main < len(readable) or scattered:
         if main < len(posed):
             text = f"Only {main} of {len(readable)} readable frames are in the main model."
         else:
             text = f"{len(readable) - main} of {len(readable)} readable frames have no pose."
-        yield Reason("few_poses", e.everything, text)
-    lost = stretches(e.records, "lost")
+        yield Reason("few_poses", e.full_range, text)
+    lost = ranges_with_status(e.records, "lost")
     if lost:
-        text = f"{_sentence(lost)} {'has' if is_one(lost) else 'have'} no pose."
+        text = f"{_sentence(lost)} {'has' if is_single(lost) else 'have'} no pose."
         yield Reason("lost_frames", lost, text)
-    skipped = stretches(e.records, "skipped")
+    skipped = ranges_with_status(e.records, "skipped")
     if skipped:
         yield Reason("unreadable_frames", skipped, f"{_sentence(skipped)} could not be read.")
     if len(posed) == 1:
@@ -203,44 +203,44 @@ def _poses(e: Evidence) -> Iterator[Reason]:
 
 
 def _connections(e: Evidence) -> Iterator[Reason]:
-    """Parts not connected to the main component, or by one link or extrapolated motion only."""
-    apart = [c for c in e.components if not c.connected]
-    if apart:
-        joined = [r for c in e.components if c.connected for r in c.frames]
-        connected = e.runs([any(a <= r.index <= b for a, b in joined) for r in e.records])
-        parts = sorted([connected, *(c.frames for c in apart)])
+    """Parts that are disconnected, or connected by one link or extrapolated motion only."""
+    disconnected = [c for c in e.components if not c.connected]
+    if disconnected:
+        connected_ranges = [r for c in e.components if c.connected for r in c.frames]
+        connected = e.runs([any(a <= r.index <= b for a, b in connected_ranges) for r in e.records])
+        parts = sorted([connected, *(c.frames for c in disconnected)])
         yield Reason(
             "disconnected",
-            union(r for c in apart for r in c.frames),
+            union(r for c in disconnected for r in c.frames),
             f"The recording consists of {len(parts)} disconnected parts: {_listed(parts)}; no "
             "overlap found.",
         )
-    for how, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
-        bridged = union(r for c in e.components if c.joined == how for r in c.frames)
-        # If all poses are bounded, later measurements connect both sides.
+    for joined_by, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
+        bridged = union(r for c in e.components if c.joined == joined_by for r in c.frames)
+        # If all pose errors are bounded, later measurements connect both sides.
         if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
             text = (
-                f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest "
-                f"by {motion} only."
+                f"{_sentence(bridged)} {'is' if is_single(bridged) else 'are'} connected to the "
+                f"rest by {motion} only."
             )
             yield Reason("bridged_gap", bridged, text)
-    hanging = e.runs_of(e.hanging)
-    if hanging:
+    single_link = e.runs_of(e.single_link_frames)
+    if single_link:
         text = (
-            f"{_sentence(hanging)} {'is' if is_one(hanging) else 'are'} connected to the rest by a "
-            "single registration, which no other view confirms."
+            f"{_sentence(single_link)} {'is' if is_single(single_link) else 'are'} connected to "
+            "the rest by a single registration, which no other view confirms."
         )
-        yield Reason("single_link", hanging, text)
+        yield Reason("single_link", single_link, text)
 
 
 def _listed(parts: Sequence[tuple[Range, ...]]) -> str:
     """Name the largest of several parts, in order."""
-    large = sorted(sorted(parts, key=size, reverse=True)[:MAX_LISTED])
-    if all(len(part) == 1 for part in large):
-        text = in_words([part[0] for part in large])
+    largest = sorted(sorted(parts, key=size, reverse=True)[:MAX_LISTED])
+    if all(len(part) == 1 for part in largest):
+        text = in_words([part[0] for part in largest])
     else:
-        text = "; ".join(in_words(part) for part in large)
-    more = len(parts) - len(large)
+        text = "; ".join(in_words(part) for part in largest)
+    more = len(parts) - len(largest)
     return f"{text} and {more} smaller" if more else text
 
 
@@ -251,41 +251,41 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     moments = [Moment(r.index, r.timestamp) for r in e.records]
     unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
     unexpected = {*e.interruptions, *_component_changes(e.records, has_pose), *unmeasured}
-    found = jumps(poses, moments, unexpected)
-    frames = [e.records[k].index for k, _ in found]
-    if len(found) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
+    pose_jumps = jumps(poses, moments, unexpected)
+    frames = [e.records[k].index for k, _ in pose_jumps]
+    if len(pose_jumps) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (
-            f"{len(found)} of {sum(has_pose)} poses are far from the predicted motion, as if the "
-            "views were unordered: the motion cannot confirm them."
+            f"{len(pose_jumps)} of {sum(has_pose)} poses are far from the predicted motion, as if "
+            "the views were unordered: the motion cannot confirm them."
         )
         yield Reason("jumped", ((frames[0], frames[-1]),), text)
-    elif found:
+    elif pose_jumps:
         jumped = e.runs_of(frames)
-        deviation = found[0][1]
+        deviation = pose_jumps[0][1]
         text = (
             f"The pose of {in_words(jumped)} jumps: {deviation}."
-            if is_one(jumped)
+            if is_single(jumped)
             else f"The poses of {in_words(jumped)} jump; that of frame {frames[0]} is {deviation}."
         )
         yield Reason("jumped", jumped, text)
     repeated = e.runs_of(e.repeated)
     if repeated:
         n = sum(record.index in e.repeated for record in e.records)
-        what = "1 image repeats" if n == 1 else f"{n} images repeat"
-        text = f"{what} the one before ({in_words(repeated)}): nothing new was measured."
+        subject = "1 image repeats" if n == 1 else f"{n} images repeat"
+        text = f"{subject} the one before ({in_words(repeated)}): nothing new was measured."
         yield Reason("repeated_images", repeated, text)
     T = e.optimisation.graph.poses
     moved = se3.inverse(T[:1]) @ T
-    still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
-    if len(T) > 2 and (still & (se3.angle(moved) < STILL_RAD)).all():
+    is_still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
+    if len(T) > 2 and (is_still & (se3.angle(moved) < STILL_RAD)).all():
         text = f"The camera never moved in {len(T)} frames: the model is that of a single view."
-        yield Reason("stood_still", e.posed, text)
+        yield Reason("stood_still", e.posed_range, text)
 
 
-def _component_changes(records: Sequence[FrameRecord], chosen: Sequence[bool]) -> list[int]:
+def _component_changes(records: Sequence[FrameRecord], selected: Sequence[bool]) -> list[int]:
     """Return the positions at which the chosen records change to another component."""
-    at = [k for k, has in enumerate(chosen) if has]
-    return [b for a, b in pairwise(at) if records[a].component != records[b].component]
+    positions = [k for k, has in enumerate(selected) if has]
+    return [b for a, b in pairwise(positions) if records[a].component != records[b].component]
 
 
 def _depths(e: Evidence) -> Iterator[Reason]:
@@ -293,18 +293,18 @@ def _depths(e: Evidence) -> Iterator[Reason]:
         return
     unit_verified = any(sensor.metric for sensor in e.priors)
     typical = float(np.median(e.depths))
-    what = f"The typical distance is {typical:.3g} m"
+    statement = f"The typical distance is {typical:.3g} m"
     if e.ambiguity_m is not None and typical > e.ambiguity_m:
-        text = f"{what}, but the camera's ambiguity range is {e.ambiguity_m:.3g} m"
+        text = f"{statement}, but the camera's ambiguity range is {e.ambiguity_m:.3g} m"
     elif unit_verified:
         return
     elif typical > MAX_DEPTH_M:
-        text = f"{what}, farther than ToF cameras see"
+        text = f"{statement}, farther than ToF cameras see"
     elif typical < MIN_DEPTH_M:
-        text = f"{what}, nearer than most ToF cameras see"
+        text = f"{statement}, nearer than most ToF cameras see"
     else:
         return
-    yield Reason("implausible_depth", e.everything, f"{text}: check the depth unit.")
+    yield Reason("implausible_depth", e.full_range, f"{text}: check the depth unit.")
 
 
 def _registrations(e: Evidence) -> Iterator[Reason]:
@@ -324,13 +324,13 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
         yield Reason("weak_registration", weak, text)
     if e.has_covariances:
         return  # degenerate or unconverged registrations are included in the bounds
-    free = {index for index, r in pairs if len(r.unobservable)}
-    if len(free) > MAX_DEGENERATE * len(pairs):
+    degenerate = {index for index, r in pairs if len(r.unobservable)}
+    if len(degenerate) > MAX_DEGENERATE * len(pairs):
         text = (
-            f"In {len(free)} of {len(pairs)} registrations the motion is unobservable in some "
-            "direction (degenerate geometry): the pose is predicted there, and drifts."
+            f"In {len(degenerate)} of {len(pairs)} registrations the motion is unobservable in "
+            "some direction (degenerate geometry): the pose is predicted there, and drifts."
         )
-        yield Reason("unobserved_motion", e.runs_of(free), text)
+        yield Reason("unobserved_motion", e.runs_of(degenerate), text)
     not_converged = {index for index, r in pairs if not r.converged}
     if len(not_converged) > MAX_NOT_CONVERGED * len(pairs):
         text = (
@@ -341,39 +341,39 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
 
 
 def _loops(e: Evidence) -> Iterator[Reason]:
-    rejected = [p for p in e.loops if (p.i, p.j) in e.given and not p.accepted]
+    rejected = [p for p in e.loops if (p.i, p.j) in e.given_loops and not p.accepted]
     if not rejected:
         return
     if len(rejected) == 1:
         (p,) = rejected
         text = f"Given loop closure {p.i}-{p.j} was not used: {p.reason}."
     else:
-        named = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:MAX_LISTED])
+        listed = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:MAX_LISTED])
         more = len(rejected) - MAX_LISTED
-        named += f" and {more} more" if more > 0 else ""
-        text = f"{len(rejected)} given loop closures were not used: {named}."
+        listed += f" and {more} more" if more > 0 else ""
+        text = f"{len(rejected)} given loop closures were not used: {listed}."
     yield Reason("loop_rejected", union((k, k) for p in rejected for k in (p.i, p.j)), text)
 
 
 def _optimiser(e: Evidence) -> Iterator[Reason]:
     if not e.optimisation.converged:
         text = "The optimiser ran out of iterations before it converged."
-        yield Reason("optimiser_gave_up", e.posed, text)
+        yield Reason("optimiser_gave_up", e.posed_range, text)
     tried = any(e.optimisation.objective) and not e.optimisation.improved
     if tried or any(part.before > 0 and not part.improved for part in e.optimisation.parts):
         text = "The optimiser did not improve on the initial poses."
-        yield Reason("not_improved", e.posed, text)
+        yield Reason("not_improved", e.posed_range, text)
     r = e.refinement
     if r is not None and r.pairs and not r.kept:
         text = "Global refinement did not improve consistency and was discarded."
-        yield Reason("not_refined", e.posed, text)
+        yield Reason("not_refined", e.posed_range, text)
 
 
 def _external_sensors(e: Evidence) -> Iterator[Reason]:
     for sensor in e.priors:
         if 2 * sensor.used < sensor.measured:
             text = f"{sensor.text[0].upper()}{sensor.text[1:]}."
-            yield Reason("sensor_differs", e.posed, text)
+            yield Reason("sensor_differs", e.posed_range, text)
 
 
 def _scene(e: Evidence) -> Iterator[Reason]:
@@ -388,13 +388,13 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         yield Reason("moving_objects", where, text)
     doubtful = e.runs_of(e.doubtful)
     if doubtful:
-        rest = (
+        description = (
             "fitted its keyframe worse than this camera's views usually do; look at it first."
-            if is_one(doubtful)
+            if is_single(doubtful)
             else "fitted their keyframes worse than this camera's views usually do; look at them "
             "first."
         )
-        yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {rest}")
+        yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {description}")
 
 
 def _drift(e: Evidence) -> Iterator[Reason]:
@@ -402,7 +402,7 @@ def _drift(e: Evidence) -> Iterator[Reason]:
     graph = e.optimisation.graph
     if len(graph.ids) > 1 and not graph.loop.any():
         text = "No loop was closed: the accumulated drift is unchecked."
-        yield Reason("unchecked_drift", e.posed, text)
+        yield Reason("unchecked_drift", e.posed_range, text)
     yield from _gap(e)
 
 
@@ -411,34 +411,34 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     yield from _loop_drift(e)
     yield from _calibration_alarm(e)
     yield from _unchecked_calibration(e)
-    yield from bounds(e.accuracy, e.tolerance, [r.index for r in e.records])
+    yield from accuracy_reasons(e.accuracy, e.tolerance, [r.index for r in e.records])
 
 
-def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[Reason]:
+def accuracy_reasons(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[Reason]:
     """Yield reasons if the accuracy of frames with these indices exceeds a tolerance, m."""
     if not a.assessed:
         return
-    free = runs_of(frames, a.unbounded)
-    if free:
+    unbounded = runs_of(frames, a.unbounded)
+    if unbounded:
         text = (
-            f"{_poses_of(free)} not constrained in some direction (degenerate geometry): the "
+            f"{_poses_of(unbounded)} not constrained in some direction (degenerate geometry): the "
             "motion is extrapolated there, and its error is not bounded."
         )
-        yield Reason("unobserved_motion", free, text)
-    known = runs_of(frames, a.by_odometry)
-    if known:
+        yield Reason("unobserved_motion", unbounded, text)
+    by_odometry = runs_of(frames, a.by_odometry)
+    if by_odometry:
         text = (
-            f"{_poses_of(known)} not constrained by the images in some direction (degenerate "
+            f"{_poses_of(by_odometry)} not constrained by the images in some direction (degenerate "
             "geometry): the recorded odometry bounds the error there."
         )
-        yield Reason("bounded_by_odometry", known, text)
-    if free:
+        yield Reason("bounded_by_odometry", by_odometry, text)
+    if unbounded:
         return
     if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
-        off, limit = _length(a.position_m), _length(tolerance_m)
+        error, allowed = _length(a.position_m), _length(tolerance_m)
         if a.position_m <= tolerance_m:
-            off, limit = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
-        text = f"Pose errors may reach {off} rms (95 % bound); the tolerance is {limit}."
+            error, allowed = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
+        text = f"Pose errors may reach {error} rms (95 % bound); the tolerance is {allowed}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {_length(a.worst.position_m)}."
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
@@ -448,9 +448,9 @@ def _loop_drift(e: Evidence) -> Iterator[Reason]:
     """Drift beyond covariances: systematic errors of the camera bend the trajectory."""
     graph = e.optimisation.graph
     errors = loop_errors(graph, e.sequential)
-    known = np.isfinite(errors)
+    finite = np.isfinite(errors)
     # The median, as single loops may be wrong.
-    if not known.any() or np.median(errors[known]) <= MAX_LOOP_CHI2:
+    if not finite.any() or np.median(errors[finite]) <= MAX_LOOP_CHI2:
         return
     worst = int(np.nanargmax(errors))
     i, j = graph.edges[graph.loop][worst]
@@ -469,50 +469,53 @@ def _loop_drift(e: Evidence) -> Iterator[Reason]:
 
 def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
     """A calibration error that the refined views show."""
-    found = None if e.refinement is None else e.refinement.calibration_check
-    if found is None or not found.alarm or found.gap is None:
+    check = None if e.refinement is None else e.refinement.calibration_check
+    if check is None or not check.alarm or check.gap is None:
         return
-    gap = found.gap
+    gap = check.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
-    cure = " or ".join(camera_in_words(found.errors))
+    correction = " or ".join(camera_in_words(check.errors))
     text = (
         f"Odometry drift over loop {gap.i}-{gap.j} is {_length(m)}, {_angle(rad)}. "
-        f"{cure[0].upper()}{cure[1:]} would reduce it to {_length(m_after)}, {_angle(rad_after)}: "
-        "check the calibration."
+        f"{correction[0].upper()}{correction[1:]} would reduce it to {_length(m_after)}, "
+        f"{_angle(rad_after)}: check the calibration."
     )
     yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
 
 
 def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
-    """A calibration that the recording can't check."""
-    found = None if e.refinement is None else e.refinement.calibration_check
-    if found is None or found.alarm:
+    """A calibration that the recording does not determine."""
+    check = None if e.refinement is None else e.refinement.calibration_check
+    if check is None or check.alarm:
         return
-    if found.undetermined:
+    if check.undetermined:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
             "assumes that the calibration is right. An error of 1% would move the poses by "
-            f"{_length(0.01 * found.motion['focal'][0])}."
+            f"{_length(0.01 * check.motion['focal'][0])}."
         )
-    elif found.unconfirmed:
-        cure = " or ".join(camera_in_words(found.unconfirmed))
-        why = (
+    elif check.unconfirmed:
+        correction = " or ".join(camera_in_words(check.unconfirmed))
+        qualifier = (
             "but no loop closure confirms it"
-            if found.large
+            if check.large
             else "which is within the usual tolerance"
         )
-        text = f"Views agree better with {cure}, {why}: the stated accuracy includes its effect."
+        text = (
+            f"Views agree better with {correction}, {qualifier}: the stated accuracy includes its "
+            "effect."
+        )
     else:
         return
-    yield Reason("unchecked_calibration", e.posed, text)
+    yield Reason("unchecked_calibration", e.posed_range, text)
 
 
 def _gap(e: Evidence) -> Iterator[Reason]:
-    """The loop with the largest drift relative to the length of its path."""
+    """The loop with the largest drift relative to its path length."""
     graph = e.optimisation.graph
     steps = np.linalg.norm(np.diff(e.sequential[:, :3, 3], axis=0), axis=1)
     turns = se3.angle(se3.inverse(e.sequential[:-1]) @ e.sequential[1:])
-    wide: list[tuple[float, int, int, float, float]] = []
+    drifted: list[tuple[float, int, int, float, float]] = []
     for (i, j), measured in zip(
         graph.edges[graph.loop], graph.measurements[graph.loop], strict=True
     ):
@@ -524,63 +527,74 @@ def _gap(e: Evidence) -> Iterator[Reason]:
             angle / max(GAP_FLOOR_RAD, GAP_FRACTION * float(turns[a:b].sum())),
         )
         if excess > 1:
-            wide.append((excess, int(graph.ids[a]), int(graph.ids[b]), distance, angle))
-    if not wide:
+            drifted.append((excess, int(graph.ids[a]), int(graph.ids[b]), distance, angle))
+    if not drifted:
         return
-    _, first, last, distance, angle = max(wide)
+    _, first, last, distance, angle = max(drifted)
     closed = int(graph.loop.sum())
-    many = f" {len(wide)} of {closed} loops drifted too far; this is the worst." * (closed > 1)
+    count_note = f" {len(drifted)} of {closed} loops drifted too far; this is the worst." * (
+        closed > 1
+    )
     text = (
         f"Odometry drift over loop {first}-{last} was {_length(distance)}, {_angle(angle)} before "
-        f"it was closed.{many}"
+        f"it was closed.{count_note}"
     )
     yield Reason("loop_gap", ((first, last),), text)
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
     if e.cross_view is not None:
-        yield from images(e.cross_view, e.posed)
+        yield from cross_view_reasons(e.cross_view, e.posed_range)
 
 
-def images(s: CrossViewConsistency, everything: tuple[Range, ...]) -> Iterator[Reason]:
+def cross_view_reasons(
+    cross_view: CrossViewConsistency, full_range: tuple[Range, ...]
+) -> Iterator[Reason]:
     """Yield reasons if overlapping images contradict the poses of a range of frames."""
-    if not np.isfinite(s.support()):
+    if not np.isfinite(cross_view.support()):
         return
-    found = f"{_percent(s.support())} of overlapping measurements are consistent with the poses"
-    if np.isfinite(s.rms_m()):
-        found += f" ({s.rms_m() * 1e3:.1f} mm rms)"
-    if s.support() < MIN_SUPPORT:
-        yield Reason("images_disagree", everything, f"Only {found}.")
+    summary = (
+        f"{_percent(cross_view.support())} of overlapping measurements are consistent with the "
+        "poses"
+    )
+    if np.isfinite(cross_view.rms_m()):
+        summary += f" ({cross_view.rms_m() * 1e3:.1f} mm rms)"
+    if cross_view.support() < MIN_SUPPORT:
+        yield Reason("images_disagree", full_range, f"Only {summary}.")
         return
     texts = []
-    alone = runs(s.frames, [support < MIN_SUPPORT for support in s.support_of_views()])
-    if alone:
-        verb = "is" if is_one(alone) else "are"
-        texts.append(f"{_sentence(alone)} {verb} inconsistent with most overlapping frames.")
-    # Consecutive images share the errors of the sensor, but have hardly any drift. Distances of
-    # surfaces are in the bounds, the fraction of inconsistent measurements is not.
-    near = [p for p in s.pairs if p.j == p.i + 1]
-    nearby_support = s.support(near)
-    if s.support() < AGREEMENT_RATIO * nearby_support:
-        nearby = f"{_percent(nearby_support)} ({s.rms_m(near) * 1e3:.1f} mm rms)"
-        texts.append(f"{found}, but {nearby} in consecutive images.")
+    inconsistent = runs(
+        cross_view.frames, [support < MIN_SUPPORT for support in cross_view.support_of_views()]
+    )
+    if inconsistent:
+        verb = "is" if is_single(inconsistent) else "are"
+        texts.append(f"{_sentence(inconsistent)} {verb} inconsistent with most overlapping frames.")
+    # Consecutive images share the errors of the sensor, but have hardly any drift. The bounds
+    # include distances of surfaces, but not the fraction of inconsistent measurements.
+    consecutive = [p for p in cross_view.pairs if p.j == p.i + 1]
+    consecutive_support = cross_view.support(consecutive)
+    if cross_view.support() < AGREEMENT_RATIO * consecutive_support:
+        consecutive_text = (
+            f"{_percent(consecutive_support)} ({cross_view.rms_m(consecutive) * 1e3:.1f} mm rms)"
+        )
+        texts.append(f"{summary}, but {consecutive_text} in consecutive images.")
     if texts:
-        yield Reason("images_differ", alone or everything, " ".join(texts))
+        yield Reason("images_differ", inconsistent or full_range, " ".join(texts))
 
 
-def stretches(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:
+def ranges_with_status(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:
     """Return (first, last) frame index of each range of consecutive frames with that status."""
     return runs([r.index for r in records], [r.status == status for r in records])
 
 
 def _sentence(ranges: Sequence[Range]) -> str:
-    """Begin a sentence with ranges: "Frame 3", "Frames 3-9, 20"."""
+    """Return ranges as the start of a sentence: "Frame 3", "Frames 3-9, 20"."""
     return in_words(ranges).capitalize()
 
 
 def _poses_of(ranges: Sequence[Range]) -> str:
-    one = is_one(ranges)
-    return f"{'The pose' if one else 'Poses'} of {in_words(ranges)} {'is' if one else 'are'}"
+    single = is_single(ranges)
+    return f"{'The pose' if single else 'Poses'} of {in_words(ranges)} {'is' if single else 'are'}"
 
 
 def _percent(fraction: float) -> str:

@@ -16,7 +16,7 @@ from tofuse.results.types import Component, Reconstruction
 # Reconstructs frames, given their poses in one frame and the joins of their components.
 Reconstruct = Callable[[FrameLog, dict[int, Float64], Sequence[Join]], Reconstruction]
 
-# An unconnected component gets a model of its own if it has more frames than these.
+# An unconnected component gets its own model if it has more frames than this.
 _MAX_WITHOUT_MODEL = 5
 
 
@@ -53,14 +53,14 @@ def numbered_components(
     numbered = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
     components = []
     for k, part in enumerate(parts):
-        mine = [e.has_pose and e.record.component == k for e in numbered.entries]
-        ranges = runs([e.record.index for e in log.entries], mine)
+        is_member = [e.has_pose and e.record.component == k for e in numbered.entries]
+        ranges = runs([e.record.index for e in log.entries], is_member)
         result = None
         if part.T_main_component is None and part.group.frames > _MAX_WITHOUT_MODEL:
             frames = [e.record.index for e in numbered.posed if e.record.component == k]
-            own = log.of(frames)  # in its own model it is the main component
-            poses = poses_in_world(own, part.group.T_group_component)
-            result = reconstruct(own, poses, part.group.joins)
+            component_log = log.of(frames)  # in its own model it is the main component
+            poses = poses_in_world(component_log, part.group.T_group_component)
+            result = reconstruct(component_log, poses, part.group.joins)
         components.append(Component(ranges, part.T_main_component, part.joined, result))
     return numbered, tuple(components)
 

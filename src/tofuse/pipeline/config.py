@@ -1,4 +1,4 @@
-"""The configuration of a reconstruction: which part does each job."""
+"""The configuration of a reconstruction: its parts and their options."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ ViewKind = Literal["range", "cloud"]
 
 @dataclass(frozen=True)
 class Config(Bounded):
-    """Everything that decides a result, apart from the recording and the seed.
+    """Everything that determines a result, except the recording and the seed.
 
     Attributes
     ----------
     method
-        Name of the configuration that it started from, for people.
+        Name of the configuration that it is based on, for display.
     filters
         Applied in this order to every frame.
     odometry
@@ -66,8 +66,8 @@ class Config(Bounded):
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
     memory_mb
-        Approximate memory of a run; `pipeline.budget` divides it. What does not fit is on disk
-        until it is needed.
+        Approximate memory of a run; `pipeline.budget` divides it. Data that does not fit is stored
+        on disk.
     """
 
     method: str
@@ -115,10 +115,10 @@ def methods() -> dict[str, Callable[[ViewKind], Config]]:
 
 def from_method(name: str, kind: ViewKind = "range") -> Config:
     """Return the configuration of that name for a kind of view; InputError if there is none."""
-    known = methods()
-    if name not in known:
-        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(known)}")
-    return known[name](kind)
+    available = methods()
+    if name not in available:
+        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
+    return available[name](kind)
 
 
 def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:
@@ -128,8 +128,8 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     ----------
     changes
         Nested options as in a TOML file. Tables are merged; a table that names another part
-        replaces the whole part, a list replaces the whole list. `memory_mb` is divided: fusion
-        gets its part of it, unless the same changes say otherwise.
+        replaces it completely, and so does a list. `memory_mb` is divided: fusion gets its share,
+        unless the same changes set that.
     where
         Names the file in errors.
 
@@ -163,9 +163,9 @@ def read_changes(path: str | Path) -> dict[str, Any]:
 
 
 def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Add fusion's part of the memory that is asked for."""
+    """Add fusion's share of the requested memory."""
     megabytes = changes.get("memory_mb")
-    if type(megabytes) is not int:  # not asked for, or refused later
+    if type(megabytes) is not int:  # not requested, or rejected later
         return changes
     part = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
     return dict(_merge(part, changes))
@@ -185,7 +185,7 @@ def kind_of(frame: Frame) -> ViewKind:
 
 
 def check_views(config: Config, kind: ViewKind) -> None:
-    """Raise InputError if a part of the configuration can't work on views of that kind.
+    """Raise InputError if a part of the configuration does not support that kind of view.
 
     Parameters
     ----------

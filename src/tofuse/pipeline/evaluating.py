@@ -82,8 +82,8 @@ def evaluate(
     reference_error_m
         Rms error of the reference, m.
     config
-        That of the result the poses belong to: images are compared with its self-calibrated camera,
-        if any. By default read from an estimate that is a result.
+        Configuration of the result that the poses belong to: images are compared with its
+        self-calibrated camera, if any. By default read from an estimate that is a result.
 
     Raises
     ------
@@ -99,30 +99,37 @@ def evaluate(
     clock = frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
-    found, known = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
-    if clock is None and (found.timestamps is None) != (known.timestamps is None):
+    timed_estimate, timed_reference = (
+        _poses(estimate, names[0]),
+        _poses(reference, names[1], is_reference=True),
+    )
+    if clock is None and (timed_estimate.timestamps is None) != (
+        timed_reference.timestamps is None
+    ):
         raise InputError(
             "has poses by frame, the other file by time",
-            where=names[0] if found.timestamps is None else names[1],
+            where=names[0] if timed_estimate.timestamps is None else names[1],
             remedy="pass the recording, which has the times, with --recording",
         )
-    times, poses = _timed(found, estimate, clock, names[0])
-    reference_times, reference_poses = _timed(known, reference, clock, names[1])
+    times, poses = _timed(timed_estimate, estimate, clock, names[0])
+    reference_times, reference_poses = _timed(timed_reference, reference, clock, names[1])
     frame_times = None if recording is None else recording.timestamps
     try:
         error = evaluate_trajectory(times, poses, reference_times, reference_poses, frame_times)
-    except InputError as wrong:
-        raise InputError(wrong.problem, where=", ".join(names), remedy=wrong.remedy) from wrong
+    except InputError as cause:
+        raise InputError(cause.problem, where=", ".join(names), remedy=cause.remedy) from cause
     interval = None if reference_error_m is None else error.ate_within(reference_error_m)
     consistency = None
     if recording is not None:
-        here = poses_of_frames(recording.timestamps, times, poses)
-        consistency = map_consistency(recording, here, correctors=_correctors(estimate, config))
+        frame_poses = poses_of_frames(recording.timestamps, times, poses)
+        consistency = map_consistency(
+            recording, frame_poses, correctors=_correctors(estimate, config)
+        )
     return Evaluation(error, interval, consistency)
 
 
 def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corrector, ...]:
-    """Return the correctors of the result the poses belong to; none if they are of no result."""
+    """Return the correctors of the result that the poses belong to; none without a result."""
     if config is not None:
         return CameraErrors.made_with(config)
     if not isinstance(estimate, str | Path):
@@ -137,23 +144,23 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
         return CameraErrors.made_with(run["config"])
 
 
-def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
-    if isinstance(given, str | Path):
-        return read_reference(given) if is_reference else read_poses(given)
-    poses = np.asarray(given, float)
+def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
+    if isinstance(source, str | Path):
+        return read_reference(source) if is_reference else read_poses(source)
+    poses = np.asarray(source, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError(f"has shape {poses.shape}", where=name, remedy="pass (N, 4, 4) poses")
     return TimedPoses(poses, frames=np.arange(len(poses)))
 
 
 def _timed(
-    found: TimedPoses, given: Poses, clock: Clock | None, name: str
+    timed: TimedPoses, source: Poses, clock: Clock | None, name: str
 ) -> tuple[Float64, Float64]:
     """Return times (N,) and poses (N, 4, 4); those of an array are of the recording's frames."""
-    if isinstance(given, str | Path) or clock is None:
-        return found.timed(clock, name)
-    if len(found.poses) != len(clock[0]):
+    if isinstance(source, str | Path) or clock is None:
+        return timed.timed(clock, name)
+    if len(timed.poses) != len(clock[0]):
         raise InputError(
-            f"holds {len(found.poses)} poses, and the recording {len(clock[0])} frames", where=name
+            f"holds {len(timed.poses)} poses, and the recording {len(clock[0])} frames", where=name
         )
-    return clock[0], found.poses
+    return clock[0], timed.poses

@@ -2,16 +2,16 @@
 
 Lens and illumination together make an image darker off the axis, about as a power of the cosine to
 the axis (natural vignetting of a lens is the fourth power; illumination adds to it, and cameras may
-compensate either). Uncompensated, it is a texture that is fixed to the camera, and biases every
-alignment towards no motion. Two views aligned by geometry alone see the same surfaces at different
-places of the image: the difference of their albedo shows the exponent, whatever the scene.
+compensate either). Uncompensated, it is a texture fixed to the camera, and biases every alignment
+towards no motion. Two views aligned by geometry alone observe the same surfaces at different image
+positions: the difference of their albedo determines the exponent, for any scene.
 
 Along a wall, geometry alone does not constrain the motion. Then views are aligned by geometry and
-amplitude, compensated by the exponent that this shows, and aligned again until it converges. The
+amplitude, the exponent is estimated and compensated, and this is repeated until it converges. The
 exponents of pairs are pooled, weighted by their information, which grows with the motion.
 
-Colour in ambient light falls off with nothing. Where a lamp on the camera lights the scene, colour
-gets darker with range and incidence. Infrared images of a ToF camera fall off with the squared
+Colour in ambient light has no falloff. Where a lamp on the camera lights the scene, colour gets
+darker with range and incidence. Infrared images of a ToF camera fall off with the squared
 range, unless the camera compensates it. The range stands for both: on a plane, which keeps its
 distance to the camera as it moves along, the cosine of incidence is inverse to the range; and
 unlike the cosine it is nearly free of noise.
@@ -50,8 +50,8 @@ _GEOMETRIC = ProjectiveOptions(levels=PATIENT, photometric=False, prior_m=3.0, p
 _PHOTOMETRIC = replace(_GEOMETRIC, photometric=True)
 # Maximum number of photometric alignments, and the change of the exponent at convergence.
 _MAX_ROUNDS, _CONVERGED = 5, 0.1
-# Corresponding points are within this distance of the surface: m, plus a fraction of the depth.
-_NEAR_M, _NEAR = 0.01, 0.01
+# Maximum distance of corresponding points from the surface: m, plus a fraction of the depth.
+_MAX_DISTANCE_M, _MAX_DISTANCE_FRACTION = 0.01, 0.01
 # Minimum numbers of points of a pair (few, as pairs are weighted by their information, and some
 # cameras have few pixels) and of pairs, and the significance level.
 _MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 50, 3, 0.01
@@ -59,7 +59,7 @@ _MIN_POINTS, _MIN_PAIRS, _SIGNIFICANCE = 50, 3, 0.01
 
 @dataclass(frozen=True)
 class Law:
-    """A quantity by a power of which light falls off.
+    """A quantity; light falls off as a power of it.
 
     Attributes
     ----------
@@ -68,8 +68,8 @@ class Law:
     compensated
         Returns a view with an albedo that is compensated for an exponent.
     travel
-        Mean motion, by which the law shows, of points (N, 3) from their position in one view to
-        that in another one.
+        Mean motion of points (N, 3) from one view to another, in the units in which the law is
+        observable.
     """
 
     logarithm: Callable[[Float64], Float64]
@@ -77,7 +77,7 @@ class Law:
     travel: Callable[[Float64, Float64], float]
 
 
-def _in_image(p: Float64, q: Float64) -> float:
+def _image_motion(p: Float64, q: Float64) -> float:
     return float(np.linalg.norm(p[:, :2] / p[:, 2:] - q[:, :2] / q[:, 2:], axis=1).mean())
 
 
@@ -89,7 +89,7 @@ def _log_range(p: Float64) -> Float64:
 OFF_AXIS = Law(
     lambda p: -0.5 * np.log1p((p[:, :2] ** 2).sum(1) / p[:, 2] ** 2),
     PreparedView.with_falloff,
-    _in_image,
+    _image_motion,
 )
 RANGE = Law(
     _log_range,
@@ -101,7 +101,7 @@ RANGE = Law(
 def estimate_falloff(
     recording: Recording, prepare: Prepare, options: SurfaceOptions, law: Law = OFF_AXIS
 ) -> float:
-    """Return the exponent of a falloff that views still show; 0 if not significant.
+    """Return the exponent of the remaining falloff in the views; 0 if not significant.
 
     Parameters
     ----------
@@ -112,19 +112,19 @@ def estimate_falloff(
     options
         How views are prepared, with the falloffs that are compensated.
     law
-        By which amplitude, or else colour, falls off.
+        Law of the falloff of amplitude, or else of colour.
     """
     views = _Views(recording, prepare, options)
     slopes: list[_Slope] = []
     for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
         # The initial exponent is the median so far: nearly compensated amplitude hardly biases.
-        initial = float(np.median([one.exponent for one in slopes])) if slopes else 0.0
+        initial = float(np.median([s.exponent for s in slopes])) if slopes else 0.0
         slope = _slope_from(views, int(start), initial, law)
         if slope is not None:
             slopes.append(slope)
     if len(slopes) < _MIN_PAIRS:
         return 0.0
-    exponents, information = np.array([(one.exponent, one.information) for one in slopes]).T
+    exponents, information = np.array([(s.exponent, s.information) for s in slopes]).T
     exponent, error = pooled(exponents, information)
     # Student's t, as the spread is estimated from few pairs.
     threshold = float(stdtrit(len(slopes) - 1, 1 - _SIGNIFICANCE)) * error
@@ -172,7 +172,7 @@ def _slope_from(views: _Views, start: int, initial: float, law: Law) -> _Slope |
         if aligned is None:
             if best is not None or stride < _STRIDE:
                 break
-            T, stride = np.eye(4), 1  # that was too far
+            T, stride = np.eye(4), 1  # the stride was too large
             continue
         T, slope = aligned
         if slope is not None:
@@ -240,23 +240,26 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
     inside = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]
     z = target.planes[v, u, 3].astype(np.float64)
-    near = (z > 0) & (np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9)) < _NEAR_M + _NEAR * q[:, 2])
-    lighter = target.albedo[v, u, 0] - packed[inside, POINT_ALBEDO]
-    near &= np.isfinite(lighter)
-    if np.count_nonzero(near) < _MIN_POINTS:
+    matched = (z > 0) & (
+        np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9))
+        < _MAX_DISTANCE_M + _MAX_DISTANCE_FRACTION * q[:, 2]
+    )
+    log_ratio = target.albedo[v, u, 0] - packed[inside, POINT_ALBEDO]
+    matched &= np.isfinite(log_ratio)
+    if np.count_nonzero(matched) < _MIN_POINTS:
         return None
-    motion = law.travel(p[near], q[near])
+    motion = law.travel(p[matched], q[matched])
     if motion < _MIN_MOTION:
         return None
-    change = law.logarithm(q[near]) - law.logarithm(p[near])
-    y = lighter[near].astype(np.float64)
-    keep = np.ones(len(y), bool)
+    log_change = law.logarithm(q[matched]) - law.logarithm(p[matched])
+    y = log_ratio[matched].astype(np.float64)
+    inliers = np.ones(len(y), bool)
     slope = squares = 0.0
     for _ in range(4):  # least squares, trimmed at three robust standard deviations
-        x = change[keep] - change[keep].mean()
+        x = log_change[inliers] - log_change[inliers].mean()
         squares = max(float(x @ x), 1e-12)
-        slope = float(x @ (y[keep] - y[keep].mean()) / squares)
-        off = y - slope * change
-        off -= np.median(off[keep])
-        keep = np.abs(off) < 3 * 1.48 * float(np.median(np.abs(off[keep]))) + 1e-9
+        slope = float(x @ (y[inliers] - y[inliers].mean()) / squares)
+        residual = y - slope * log_change
+        residual -= np.median(residual[inliers])
+        inliers = np.abs(residual) < 3 * 1.48 * float(np.median(np.abs(residual[inliers]))) + 1e-9
     return _Slope(slope, squares, motion)

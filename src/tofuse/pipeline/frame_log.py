@@ -27,7 +27,7 @@ class Entry:
     Attributes
     ----------
     record
-        What is reported of it.
+        Its record in the result.
     step
         Its tracking result; None if it could not be read.
     recording
@@ -84,7 +84,7 @@ class FrameLog:
     interruptions: list[int] = field(default_factory=list)
     repeated: list[int] = field(default_factory=list)
     _steps: dict[int, Step] = field(default_factory=dict, init=False, repr=False)
-    _counted: int = field(default=0, init=False, repr=False)
+    _n_indexed: int = field(default=0, init=False, repr=False)
 
     def add(
         self,
@@ -121,17 +121,17 @@ class FrameLog:
 
     @property
     def links(self) -> list[Link]:
-        """All links between components that were found while tracking."""
+        """All links between components found during tracking."""
         return [link for e in self.posed if e.step is not None for link in e.step.links]
 
     def of(self, frames: Collection[int]) -> FrameLog:
-        """Return the part of the log with these frame indices."""
+        """Return the part of the log that consists of these frame indices."""
         kept = set(frames)
         rows = [k for k, e in enumerate(self.entries) if e.record.index in kept]
-        starts = [int(np.searchsorted(rows, at)) for at in self.interruptions]
+        starts = [int(np.searchsorted(rows, position)) for position in self.interruptions]
         return FrameLog(
             [self.entries[k] for k in rows],
-            sorted({at for at in starts if 0 < at < len(rows)}),
+            sorted({position for position in starts if 0 < position < len(rows)}),
             [index for index in self.repeated if index in kept],
         )
 
@@ -146,11 +146,11 @@ class FrameLog:
 
     def step_of(self, frame: int) -> Step:
         """Return the tracking result of a frame with a pose."""
-        if self._counted != len(self.entries):
-            for entry in self.entries[self._counted :]:
+        if self._n_indexed != len(self.entries):
+            for entry in self.entries[self._n_indexed :]:
                 if entry.step is not None:
                     self._steps[entry.record.index] = entry.step
-            self._counted = len(self.entries)
+            self._n_indexed = len(self.entries)
         return self._steps[frame]
 
     def numbered(self, numbers: Mapping[int, int]) -> FrameLog:
@@ -163,16 +163,16 @@ class FrameLog:
         ]
         return FrameLog(entries, self.interruptions, self.repeated)
 
-    def stretches(self, views: ViewStore[PreparedView]) -> list[TrackedComponent]:
+    def tracked_components(self, views: ViewStore[PreparedView]) -> list[TrackedComponent]:
         """Return the components as tracked, in the order in which they began."""
         members: dict[int, list[Entry]] = {}
         for entry in self.posed:
             assert entry.step is not None
             members.setdefault(entry.step.component, []).append(entry)
-        found = []
+        components = []
         for component, entries in members.items():
             poses = [e.step.T_component_camera for e in entries if e.step is not None]
-            found.append(
+            components.append(
                 TrackedComponent(
                     component,
                     np.array([e.record.index for e in entries], np.intp),
@@ -183,10 +183,10 @@ class FrameLog:
                     _odometry(entries),
                 )
             )
-        return found
+        return components
 
-    def sensed(self, ids: Sequence[int]) -> SensorData:
-        """Return the measurements of external sensors for some frame indices."""
+    def sensor_data(self, ids: Sequence[int]) -> SensorData:
+        """Return the measurements of external sensors for frames by index."""
         by_index = {e.record.index: e for e in self.entries}
         entries = [by_index[index] for index in ids]
         gravity = np.full((len(ids), 4), np.nan)
@@ -208,14 +208,14 @@ def _odometry(entries: Sequence[Entry]) -> Float64:
 
 
 def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:
-    """Return (4, 4) T_world_camera by frame index, the first one the identity.
+    """Return (4, 4) T_world_camera by frame index; the first one is the identity.
 
     Parameters
     ----------
     log
         All frames.
     T_world_component
-        (4, 4) by component, for those that are wanted.
+        (4, 4) by component; frames of other components are omitted.
     """
     poses: dict[int, Float64] = {}
     T_first: Float64 | None = None

@@ -21,7 +21,7 @@ class Intake:
     def __init__(self) -> None:
         self.kind: ViewKind | None = None
         self._index: int | None = None
-        self._before: RangeFrame | None = None  # uncorrected
+        self._previous: RangeFrame | None = None  # uncorrected
 
     def check_kind(self, frame: Frame) -> bool:
         """Return whether it is the first frame; InputError for another kind than those before."""
@@ -49,18 +49,20 @@ class Intake:
         self.kind = self.kind or kind
 
     def is_repeated(self, frame: Frame) -> bool:
-        """Whether an image equals the one before: the camera hangs, as noise never repeats."""
+        """Whether an image equals the previous one: the camera is stuck, as noise never repeats."""
         if not isinstance(frame, RangeFrame):
             return False
-        before, self._before = self._before, frame
-        if before is None:
+        previous, self._previous = self._previous, frame
+        if previous is None:
             return False
-        # Most differ there already; the first rows of some cameras have no pixels.
+        # Most images already differ there; the first rows of some cameras are invalid.
         middle = len(frame.depth) // 2
-        if not np.array_equal(before.depth[middle : middle + 1], frame.depth[middle : middle + 1]):
+        if not np.array_equal(
+            previous.depth[middle : middle + 1], frame.depth[middle : middle + 1]
+        ):
             return False
-        return np.array_equal(before.depth, frame.depth) and len(frame) > 0
+        return np.array_equal(previous.depth, frame.depth) and len(frame) > 0
 
     def end(self) -> None:
         """Release the last frame."""
-        self._before = None
+        self._previous = None

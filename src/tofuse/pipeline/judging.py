@@ -1,6 +1,6 @@
 """Assessing poses from other sources: their consistency with the depth, and their accuracy.
 
-The poses replace tracking; the rest is as in a run: loops are closed, and all views are refined
+The poses replace tracking; otherwise it is a run: loops are closed, and all views are refined
 jointly. The error bound of the given poses is their distance from the refined ones plus the error
 bound of those. If images contradict even the refined poses, the recording is tracked again, and the
 trajectory with more support by the images counts.
@@ -34,11 +34,11 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, jumps
-from tofuse.pipeline.checks import bounds, images, tolerance_of
+from tofuse.pipeline.checks import accuracy_reasons, cross_view_reasons, tolerance_of
 from tofuse.pipeline.config import Config, check_views, from_method
 from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.reconstruct import view_kind, with_views
+from tofuse.pipeline.reconstruct import reconstruct_with_views, view_kind
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.pair_measurements import measured_pairs
 from tofuse.posegraph.view_store import PosedView
@@ -162,28 +162,43 @@ def judge(
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
     )
-    given = replace(config, odometry=GivenPoses())
-    check_views(given, kind)
+    given_config = replace(config, odometry=GivenPoses())
+    check_views(given_config, kind)
     compared_images = _Images(recording)
 
-    def made(led: Recording, by: Config) -> tuple[Reconstruction, Views, ViewSupport]:
-        result, views = with_views(led, by, threads=threads, progress=progress)
-        return result, views, compared_images.under(result.trajectory)
+    def reconstructed(
+        source: Recording, config_used: Config
+    ) -> tuple[Reconstruction, Views, ViewSupport]:
+        result, views = reconstruct_with_views(
+            source, config_used, threads=threads, progress=progress
+        )
+        return result, views, compared_images.support_at(result.trajectory)
 
     progress.stage("comparing images")
-    seen = compared_images.under(poses)
-    refined, views, after = made(with_odometry(recording, poses), given)
-    started = True
-    if not after.is_supported:
-        other, other_views, seen_other = made(recording, config)
-        if seen_other.support > after.support:
-            refined, views, after, started = other, other_views, seen_other, False
+    initial_support = compared_images.support_at(poses)
+    refined, views, refined_support = reconstructed(with_odometry(recording, poses), given_config)
+    from_poses = True
+    if not refined_support.is_supported:
+        independent, independent_views, independent_support = reconstructed(recording, config)
+        if independent_support.support > refined_support.support:
+            refined, views, refined_support, from_poses = (
+                independent,
+                independent_views,
+                independent_support,
+                False,
+            )
     progress.stage("registering pairs")
     with use_threads(threads), threadpool_limits(1):
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    reasons = ranked([*_reasons(poses, accuracy, deviation, seen, after, refined, tolerance_m)])
+    reasons = ranked(
+        [
+            *_reasons(
+                poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
+            )
+        ]
+    )
     return Judgement(
         poses,
         accuracy,
@@ -194,7 +209,7 @@ def judge(
         deviation,
         distances,
         refined,
-        started,
+        from_poses,
     )
 
 
@@ -228,12 +243,12 @@ class _Images:
         self._recording = recording
         self._views: dict[int, PreparedView | None] = {}
 
-    def under(self, poses: Float64) -> ViewSupport:
+    def support_at(self, poses: Float64) -> ViewSupport:
         """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
         rows = evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
-        found = [(k, view) for k in rows if (view := self._view(k)) is not None]
-        chosen = [k for k, _ in found]
-        return ViewSupport(compare_views([view for _, view in found], poses[chosen]))
+        views = [(k, view) for k in rows if (view := self._view(k)) is not None]
+        used_rows = [k for k, _ in views]
+        return ViewSupport(compare_views([view for _, view in views], poses[used_rows]))
 
     def _view(self, k: int) -> PreparedView | None:
         """Return the k-th frame as a prepared view; None if it can't be read."""
@@ -284,59 +299,61 @@ def judge_files(
     recording = opening.open()
     out = options.out
     with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:
-        found = judge(
+        judgement = judge(
             recording,
             trajectory,
             tolerance_m=options.tolerance,
             threads=options.threads,
             progress=progress,
         )
-        facts = {**found.refined.recording, "opening": opening.to_dict()}
-        found = replace(found, refined=replace(found.refined, recording=facts))
+        facts = {**judgement.refined.recording, "opening": opening.to_dict()}
+        judgement = replace(judgement, refined=replace(judgement.refined, recording=facts))
         if folder is not None:
             progress.stage("writing")
             with threadpool_limits(1):
-                _write(found, trajectory, recording, folder)
-    return found
+                _write(judgement, trajectory, recording, folder)
+    return judgement
 
 
-def _write(found: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder) -> None:
+def _write(
+    judgement: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder
+) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.report.extras import ReportExtras
     from tofuse.viewer.view_file import write_report_and_view
 
-    def report(result: Reconstruction, here: Path) -> None:
-        headline = sentence(found, trajectory.name) if result is found.refined else ""
+    def report(result: Reconstruction, path: Path) -> None:
+        headline = sentence(judgement, trajectory.name) if result is judgement.refined else ""
         title = f"{trajectory.name} on {Path(recording.path).name}"
-        write_report_and_view(result, here, ReportExtras(title=title, headline=headline))
-        if result is found.refined:
-            text = json.dumps(plain(found.to_dict()), indent=1, allow_nan=False)
-            (here / "judge.json").write_text(text + "\n", encoding="utf-8")
+        write_report_and_view(result, path, ReportExtras(title=title, headline=headline))
+        if result is judgement.refined:
+            text = json.dumps(plain(judgement.to_dict()), indent=1, allow_nan=False)
+            (path / "judge.json").write_text(text + "\n", encoding="utf-8")
 
-    write_result(found.refined, folder, report)
+    write_result(judgement.refined, folder, report)
 
 
-def sentence(found: Judgement, name: str) -> str:
+def sentence(judgement: Judgement, name: str) -> str:
     """Summarise the judgement: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
-    diagonal = found.refined.cloud.diagonal_m
-    given = bound(found.accuracy, diagonal)
-    better = bound(found.refined.diagnostics.accuracy, diagonal)
-    how = "refined" if found.started else "tracked again"
-    return f"{name}: {given}; {how}: {better}.{_agreement(found.deviation)}"
+    diagonal = judgement.refined.cloud.diagonal_m
+    given_bound = bound(judgement.accuracy, diagonal)
+    refined_bound = bound(judgement.refined.diagnostics.accuracy, diagonal)
+    label = "refined" if judgement.started else "tracked again"
+    return f"{name}: {given_bound}; {label}: {refined_bound}.{_agreement(judgement.deviation)}"
 
 
-def _agreement(found: Deviation | None) -> str:
+def _agreement(deviation: Deviation | None) -> str:
     """State whether the depth contradicts the poses."""
-    if found is None:
+    if deviation is None:
         return ""
-    if not found.consistent:
+    if not deviation.consistent:
         return (
-            f" Inconsistent with the depth: surfaces displaced by about {length(found.estimate_m)},"
-            f" at least {length(found.at_least_m)} (95 %)."
+            " Inconsistent with the depth: surfaces displaced by about "
+            f"{length(deviation.estimate_m)}, at least {length(deviation.at_least_m)} (95 %)."
         )
-    if not np.isfinite(found.at_most_m):
+    if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
-    return f" Consistent with the depth to within {length(found.at_most_m)} (95 %)."
+    return f" Consistent with the depth to within {length(deviation.at_most_m)} (95 %)."
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
@@ -347,14 +364,14 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
     by, poses = recording.metadata.get(POSES_BY), recording.reference
     if by is None or poses is None:
         return ""
-    apart = _distances(poses, result.trajectory)
-    apart = apart[np.isfinite(apart)]
-    if len(apart) < 2:
+    distances = _distances(poses, result.trajectory)
+    distances = distances[np.isfinite(distances)]
+    if len(distances) < 2:
         return ""
-    rms, own = float(np.sqrt((apart**2).mean())), result.diagnostics.accuracy.position_m
-    if not np.isfinite(own):
+    rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
+    if not np.isfinite(bound_m):
         return f"{by}'s poses differ from these by {length(rms)} rms."
-    return f"{by}'s poses: ±{length(rms + own)} (95 %); these: ±{length(own)}."
+    return f"{by}'s poses: ±{length(rms + bound_m)} (95 %); these: ±{length(bound_m)}."
 
 
 def _read(path: Path) -> TimedPoses:
@@ -391,10 +408,10 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
             )
         for T in poses[np.isfinite(poses).all((1, 2))]:
             se3.check_pose(T, where=where)
-    known = int(np.isfinite(poses).all((1, 2)).sum())
-    if known < 2:
+    n_posed = int(np.isfinite(poses).all((1, 2)).sum())
+    if n_posed < 2:
         raise InputError(
-            f"has a pose for {known} of the {len(recording)} frames",
+            f"has a pose for {n_posed} of the {len(recording)} frames",
             where=where,
             remedy="pass timestamps in seconds on the clock of the recording",
         )
@@ -402,105 +419,111 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
 
 
 def _distances(poses: Float64, refined: Float64) -> Float64:
-    both = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
+    common = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
     out = np.full(len(poses), np.nan)
-    if both.any():
-        out[both] = distances_between(poses[both], refined[both])
+    if common.any():
+        out[common] = distances_between(poses[common], refined[common])
     return out
 
 
 def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
     """Return the bound of the given poses: distance from the refined ones plus their bound."""
-    known = refined.diagnostics.accuracy
-    both = np.flatnonzero(np.isfinite(distances))
-    if not known.assessed or not len(both):
-        return known
-    moved, turned = displacement(refined.trajectory[both], poses[both])
+    refined_accuracy = refined.diagnostics.accuracy
+    common = np.flatnonzero(np.isfinite(distances))
+    if not refined_accuracy.assessed or not len(common):
+        return refined_accuracy
+    moved, turned = displacement(refined.trajectory[common], poses[common])
     # In the worst case both have the same direction.
-    position, rotation = moved + known.position_m, turned + known.rotation_rad
-    worst = int(both[np.argmax(distances[both])])
+    position, rotation = moved + refined_accuracy.position_m, turned + refined_accuracy.rotation_rad
+    worst = int(common[np.argmax(distances[common])])
     at_worst = WorstFrame(
         int(refined.diagnostics.frames[worst].index),
-        float(distances[worst]) + known.position_m,
+        float(distances[worst]) + refined_accuracy.position_m,
         rotation,
     )
-    if known.unbounded and known.worst is not None:
-        at_worst = known.worst
+    if refined_accuracy.unbounded and refined_accuracy.worst is not None:
+        at_worst = refined_accuracy.worst
     diagonal = refined.cloud.diagonal_m
     relative = position / diagonal if diagonal > 0 else np.inf
-    return Accuracy(position, rotation, relative, True, at_worst, known.unbounded)
+    return Accuracy(position, rotation, relative, True, at_worst, refined_accuracy.unbounded)
 
 
 def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviation | None:
     """Compare the poses with registered pairs of views that have a given and a refined pose."""
-    row = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
-    both = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
-    known = set(both.tolist())
-    posed = [view for view in views if row[view.index] in known]
+    row_of = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
+    common = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
+    common_rows = set(common.tolist())
+    posed = [view for view in views if row_of[view.index] in common_rows]
     if len(posed) < 2:
         return None
-    at = [row[view.index] for view in posed]
+    rows = [row_of[view.index] for view in posed]
     depth_m = float(np.median([view.depth for view in posed]))
-    fit = fitted(measured_pairs(posed, refined.trajectory[at]), depth_m)
-    return deviation_of(fit, poses[at]) if fit.unknowns > 0 else None
+    fit = fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
+    return deviation_of(fit, poses[rows]) if fit.unknowns > 0 else None
 
 
 def _reasons(
     poses: Float64,
     accuracy: Accuracy,
     deviation: Deviation | None,
-    seen: ViewSupport,
-    after: ViewSupport,
+    initial_support: ViewSupport,
+    refined_support: ViewSupport,
     refined: Reconstruction,
     tolerance_m: float | None,
 ) -> Iterator[Reason]:
     frames = refined.diagnostics.frames
     indices = [f.index for f in frames]
-    everything = ((indices[0], indices[-1]),)
-    if seen.overlapping < _MIN_OVERLAPPING * after.overlapping:
+    full_range = ((indices[0], indices[-1]),)
+    if initial_support.overlapping < _MIN_OVERLAPPING * refined_support.overlapping:
         text = (
-            f"Only {seen.overlapping:.0%} of the images overlap with another under these poses; "
-            f"under the refined ones {after.overlapping:.0%} do."
+            f"Only {initial_support.overlapping:.0%} of the images overlap with another under "
+            f"these poses; under the refined ones {refined_support.overlapping:.0%} do."
         )
-        yield Reason("images_disagree", everything, text)
-    yield from images(seen.cross_view, everything)
-    allowed = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
-    wrong = [] if deviation is None else [*_wrong(deviation, allowed, everything)]
-    yield from wrong
+        yield Reason("images_disagree", full_range, text)
+    yield from cross_view_reasons(initial_support.cross_view, full_range)
+    allowed_m = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
+    contradictions = (
+        [] if deviation is None else [*_contradiction(deviation, allowed_m, full_range)]
+    )
+    yield from contradictions
     # Uncertain poses are no further reason if they are known to be wrong.
     yield from (
-        r for r in bounds(accuracy, allowed, indices) if not wrong or r.code != "uncertain_poses"
+        r
+        for r in accuracy_reasons(accuracy, allowed_m, indices)
+        if not contradictions or r.code != "uncertain_poses"
     )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
     moments = [Moment(f.index, f.timestamp) for f in frames]
-    own = {k for k, _ in jumps(_or_none(refined.trajectory), moments)}
-    jumped = {k: words for k, words in jumps(_or_none(poses), moments) if k not in own}
+    actual_jumps = {k for k, _ in jumps(_or_none(refined.trajectory), moments)}
+    jumped = {k: words for k, words in jumps(_or_none(poses), moments) if k not in actual_jumps}
     if jumped:
         first = next(iter(jumped))
-        where = runs_of(indices, [indices[k] for k in jumped])
+        ranges = runs_of(indices, [indices[k] for k in jumped])
         text = (
-            f"The poses of {in_words(where)} jump, and the refined ones don't; that of frame "
+            f"The poses of {in_words(ranges)} jump, and the refined ones don't; that of frame "
             f"{indices[first]} is {jumped[first]}."
         )
-        yield Reason("jumped", where, text)
+        yield Reason("jumped", ranges, text)
 
 
-def _wrong(found: Deviation, allowed_m: float, everything: tuple[Range, ...]) -> Iterator[Reason]:
+def _contradiction(
+    deviation: Deviation, allowed_m: float, full_range: tuple[Range, ...]
+) -> Iterator[Reason]:
     """Yield a reason if poses contradict the depth by more than the tolerance."""
-    if found.at_least_m <= allowed_m:
+    if deviation.at_least_m <= allowed_m:
         return
     text = (
         f"Registrations contradict the poses: surfaces are displaced by about "
-        f"{length(found.estimate_m)} rms, at least {length(found.at_least_m)} (95 %); the "
+        f"{length(deviation.estimate_m)} rms, at least {length(deviation.at_least_m)} (95 %); the "
         f"tolerance is {length(allowed_m)}."
     )
-    steps = tuple((int(a), int(b)) for a, b in found.ids[found.steps])
+    steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
     if steps:
         a, b = steps[0]
         text += f" The motion from frame {a} to {b} is wrong by itself"
         others = len(steps) - 1
         text += f", and {others} other{'' if others == 1 else 's'}." if others else "."
-    yield Reason("inconsistent_poses", steps or everything, text)
+    yield Reason("inconsistent_poses", steps or full_range, text)
 
 
 def _or_none(poses: Float64) -> list[Float64 | None]:
@@ -508,5 +531,5 @@ def _or_none(poses: Float64) -> list[Float64 | None]:
 
 
 def _consistency(recording: Recording, poses: Float64) -> Consistency | None:
-    found = map_consistency(recording, poses)
-    return found if found.pairs else None
+    consistency = map_consistency(recording, poses)
+    return consistency if consistency.pairs else None

@@ -1,4 +1,4 @@
-"""Poses while frames arrive, with the components connected and the loops closed so far.
+"""Online poses, with the components connected and the loops closed so far.
 
 A loop takes effect a fixed number of frames after it was searched for.
 """
@@ -19,8 +19,8 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
 from tofuse.registration.base import Link
 
-# The loops of a search take effect this many frames after it started, even if it was done earlier,
-# so that poses are the same on every machine. A slow machine waits there.
+# The loops of a search take effect this number of frames after its start, even if it finished
+# earlier, so that poses are the same on every machine. A slow machine waits for it.
 DELAY = 10
 # The graph is optimised again after this fraction of new frames at the earliest, so that the cost
 # per frame is constant.
@@ -45,21 +45,21 @@ class LiveLoops:
         self._due = 0
 
     def advance(self) -> bool:
-        """Advance by a frame with a pose, already pushed to the loops; whether new loops closed."""
+        """Advance by a posed frame, already pushed to the loops; whether new loops closed."""
         self._frames += 1
-        found: list[ClosedLoop] = []
+        new_loops: list[ClosedLoop] = []
         if self._job is not None and self._frames >= self._due:
-            found = [loop for loop in self._job.result() if loop.T_i_j is not None]
-            self.closed += found
+            new_loops = [loop for loop in self._job.result() if loop.T_i_j is not None]
+            self.closed += new_loops
             self._job = None
         if self._job is None:
-            work = self._loops.detection_job()
-            if work is not None:
+            job = self._loops.detection_job()
+            if job is not None:
                 if self._pool is None:
                     self._pool = job_pool(1, "tofuse-loops")
-                self._job = self._pool.submit(work)
+                self._job = self._pool.submit(job)
                 self._due = self._frames + DELAY
-        return bool(found)
+        return bool(new_loops)
 
     def wait(self) -> None:
         """Wait for the running search; its loops take effect when they are due."""
@@ -68,15 +68,15 @@ class LiveLoops:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the thread, with the result of the running search."""
-        found = None if self._job is None else self._job.result()
-        return {**self.__dict__, "_pool": None, "_job": found}
+        loops = None if self._job is None else self._job.result()
+        return {**self.__dict__, "_pool": None, "_job": loops}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        found = state["_job"]
+        loops = state["_job"]
         self.__dict__.update(state)
-        if found is not None:
+        if loops is not None:
             self._job = Future()
-            self._job.set_result(found)
+            self._job.set_result(loops)
 
     def finish(self) -> None:
         """Wait for the running search, and end the thread."""
@@ -86,19 +86,19 @@ class LiveLoops:
 
 
 class LivePoses:
-    """Poses in the frame of the first component, as known so far.
+    """Current poses in the frame of the first component.
 
-    At the end of the recording components are joined and loops are closed anew.
+    At the end of the recording components are joined and loops are closed again.
     """
 
     def __init__(self, loops: Loops) -> None:
         self._loops = LiveLoops(loops)
         self._component = 0
-        self._pending = False  # whether there are closed loops that moved no pose yet
-        self._since = 0  # frames of this component since the last optimisation
-        self._size = 0  # frames of this component
+        self._pending = False  # whether there are closed loops that were not yet optimised
+        self._n_new = 0  # frames of this component since the last optimisation
+        self._n_frames = 0  # frames of this component
         # Poses of the components that are connected to the first one, and the correction of the
-        # present one by loops.
+        # current one by loops.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
 
@@ -106,21 +106,21 @@ class LivePoses:
         """Add the next frame; return the loops of its component if optimisation is due, else []."""
         if step.component != self._component:
             self._component, self._T_closed_tracked = step.component, np.eye(4)
-            self._pending, self._since, self._size = False, 0, 0
+            self._pending, self._n_new, self._n_frames = False, 0, 0
         for link in step.links:
             self._connect(link, log)
         if step.T_component_camera is None:
             return []
-        self._size, self._since = self._size + 1, self._since + 1
+        self._n_frames, self._n_new = self._n_frames + 1, self._n_new + 1
         self._pending |= self._loops.advance()
-        if not self._pending or self._since < _MIN_NEW_FRACTION * self._size:
+        if not self._pending or self._n_new < _MIN_NEW_FRACTION * self._n_frames:
             return []
-        self._pending, self._since = False, 0
-        here = {e.record.index for e in log.of_component(step.component).posed}
-        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= here]
+        self._pending, self._n_new = False, 0
+        component_frames = {e.record.index for e in log.of_component(step.component).posed}
+        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= component_frames]
 
     def apply_loops(self, tracked: PoseGraph, optimised: PoseGraph) -> None:
-        """Correct the following poses as loops corrected the last pose of a graph."""
+        """Apply the correction of a graph's last pose by loops to all following poses."""
         self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
 
     def pose(self, step: Step) -> Float64 | None:
@@ -133,13 +133,13 @@ class LivePoses:
 
     def _connect(self, link: Link, log: FrameLog) -> None:
         a, b = log.step_of(link.i), log.step_of(link.j)
-        known = self._T_world_component
-        if not link.certain or a.component not in known or b.component in known:
+        T_world = self._T_world_component
+        if not link.certain or a.component not in T_world or b.component in T_world:
             return
         assert a.T_component_camera is not None
         assert b.T_component_camera is not None
         T_a_b = a.T_component_camera @ link.T_i_j @ se3.inverse(b.T_component_camera)
-        known[b.component] = known[a.component] @ T_a_b
+        T_world[b.component] = T_world[a.component] @ T_a_b
 
     def wait(self) -> None:
         """Wait for the running search."""

@@ -42,9 +42,9 @@ class Mapper:
     config
         A configuration, or the name of one.
     seed
-        One seed, one result.
+        The result is reproducible for each seed.
     threads
-        How many threads to use; None: all cores. The result does not depend on it.
+        Number of threads; None: all cores. The result does not depend on it.
     loops
         Given loops, in frame indices.
     progress
@@ -65,7 +65,7 @@ class Mapper:
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         self.watch = Stopwatch()
-        self._given = tuple(loops)
+        self._given_loops = tuple(loops)
         self._progress = progress or Silent()
         self._intake = Intake()
         self._log = FrameLog()
@@ -76,7 +76,7 @@ class Mapper:
     def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
         self._tracker = self.config.odometry.start(self.seed, self.config.search)
-        self._observations = Observations(self.config, self.seed, self._given)
+        self._observations = Observations(self.config, self.seed, self._given_loops)
         self._live_poses = LivePoses(self._observations.loops)
         self._component = 0
 
@@ -94,7 +94,7 @@ class Mapper:
         Parameters
         ----------
         frame
-            As the camera gave it. Its `index` must be larger than those before.
+            Uncorrected and unfiltered. Its `index` must be larger than those before.
         T_odometry
             (4, 4) T_world_camera from odometry, in any fixed world frame.
         gravity
@@ -107,9 +107,9 @@ class Mapper:
 
         Returns
         -------
-        T_world_camera (4, 4) as known so far; None if the frame is lost, or in a component that is
-        not yet connected to the first one. Loops take effect some frames later; `finish` joins
-        components and moves all poses once more.
+        Current estimate of T_world_camera (4, 4); None if the frame is lost, or in a component that
+        is not yet connected to the first one. Loops take effect some frames later; `finish` joins
+        components and optimises all poses again.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Mapper:
         with threads(self.threads), serial_chunks(busy):
             ready = self._prepare(frame, history, prepared)
             step = self._track(ready, T_odometry, repeated)
-            self._remember(ready, step, T_odometry, gravity)
+            self._store(ready, step, T_odometry, gravity)
             self._close_loops(step)
             return self._report(ready, step)
 
@@ -134,10 +134,10 @@ class Mapper:
         self, frame: Frame, history: Sequence[Frame] | None, prepared: Prepared | None
     ) -> Ready:
         with self.watch.timing("filters"):
-            expected = None
+            T_expected = None
             if self._log.entries and self._log.entries[-1].has_pose:
-                expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
-            return self._preparation.ready(frame, expected, history, prepared)
+                T_expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
+            return self._preparation.process(frame, T_expected, history, prepared)
 
     def _track(self, ready: Ready, T_odometry: Float64 | None, repeated: bool) -> Step:
         with self.watch.timing("tracking"):
@@ -149,10 +149,10 @@ class Mapper:
             self._component = step.component
             self._preparation.begin_component()
         if step.status == "tracked" and step.T_component_camera is not None:
-            self._preparation.placed(ready.filtered, step.T_component_camera)
+            self._preparation.add_pose(ready.filtered, step.T_component_camera)
         return step
 
-    def _remember(
+    def _store(
         self, ready: Ready, step: Step, T_odometry: Float64 | None, gravity: Float64 | None
     ) -> None:
         frame = ready.frame
@@ -170,7 +170,7 @@ class Mapper:
         self._queue.submit(lambda: self._observations.sample(ready, lost=lost))
 
     def _close_loops(self, step: Step) -> None:
-        """Correct the present component by loops that were searched for some frames ago."""
+        """Correct the current component by loops whose search started some frames ago."""
         with self.watch.timing("loops"):
             loops = self._live_poses.update(step, self._log)
             if loops:
@@ -185,12 +185,12 @@ class Mapper:
         return T_world_camera
 
     def prepare(self, frame: Frame) -> Prepared | None:
-        """Prepare a frame before its turn, for `push`, as far as that depends on it alone.
+        """Prepare a frame for `push` in advance, as far as that depends on this frame alone.
 
         May be called by other threads while earlier frames are pushed. The result of `push` does
         not depend on it.
         """
-        return self._preparation.ahead(frame, self._tracker)
+        return self._preparation.prepare_ahead(frame, self._tracker)
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
         """Record that a frame could not be read.
@@ -214,8 +214,8 @@ class Mapper:
         Parameters
         ----------
         config
-            Provides corrections, filters and odometry of the new recording; None continues with
-            those so far. Numbers of its components must not have been used before.
+            Provides corrections, filters and odometry of the new recording; None keeps the current
+            ones. Its component numbers must not have been used before.
         """
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
@@ -235,7 +235,7 @@ class Mapper:
         return self._observations.views.views
 
     def end(self) -> None:
-        """End tracking, and release what only further frames would need."""
+        """End tracking, and release the state that only further frames would need."""
         if not self._ended:
             self._intake.end()
             self._ended = True
@@ -253,7 +253,7 @@ class Mapper:
         Raises
         ------
         InputError
-            If no frame has a pose: there is nothing to make a model of.
+            If no frame has a pose.
         """
         if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
@@ -276,7 +276,7 @@ class Mapper:
         return Assembly(
             self.config,
             self._observations,
-            self._given,
+            self._given_loops,
             self._progress,
             self.watch,
             self.seed,

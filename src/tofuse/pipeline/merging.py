@@ -1,9 +1,9 @@
 """Multi-session mapping: merging the results of several runs into one map.
 
-Each session, a recording with the poses of its result, is a component of one large run. The rest is
-as in a run: components are joined where registered views of both confirm it and none contradicts,
-loops between them are closed, all views are refined jointly, and fused. The world frame is that of
-the first result. Sessions that can't be joined remain separate components.
+Each session, a recording with the poses of its result, is a component of one large run. Its further
+stages are those of a run: components are joined where registered views of both confirm it and none
+contradicts, loops between them are closed, all views are refined jointly, and fused. The world
+frame is that of the first result. Sessions that can't be joined remain separate components.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.paint import TEXTURE, paint
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.reconstruct import Tracked, described, push_frames
+from tofuse.pipeline.reconstruct import TrackingState, push_frames, with_recording_facts
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.loops import GivenLoop
@@ -95,7 +95,7 @@ def merge(
     Returns
     -------
     A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
-    first one are components with models of their own.
+    first one are components with their own models.
 
     Raises
     ------
@@ -147,29 +147,31 @@ def merge_sessions(
 ) -> Reconstruction:
     """Join, refine and fuse sessions; see `merge`."""
     progress = progress or Silent()
-    recording, firsts = joined_recording(sessions)
-    links = _earlier_links(sessions, firsts)
+    recording, offsets = joined_recording(sessions)
+    links = _earlier_links(sessions, offsets)
     mapper = Mapper(config, seed=seed, threads=threads, loops=links, progress=progress)
     progress.stage("reading sessions", len(recording))
     with threadpool_limits(1):
-        for session, first in zip(sessions, firsts, strict=True):
-            mapper.interrupt(_config_of(session, first))
-            own = replace(recording, indices=session.recording.indices + first)
-            push_frames(Tracked(mapper), own, session.config.window, NoCheckpoints())
+        for session, offset in zip(sessions, offsets, strict=True):
+            mapper.interrupt(_config_of(session, offset))
+            session_recording = replace(recording, indices=session.recording.indices + offset)
+            push_frames(
+                TrackingState(mapper), session_recording, session.config.window, NoCheckpoints()
+            )
         result = mapper.finish()
         progress.stage("comparing sessions")
         with use_threads(mapper.threads):
-            return _with_sessions(result, sessions, firsts, mapper.views, recording)
+            return _with_sessions(result, sessions, offsets, mapper.views, recording)
 
 
 def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
-    """Return the recordings of all sessions as one, and the index of the first frame of each."""
+    """Return the recordings of all sessions as one, and the first frame index of each."""
     sources: list[Source] = []
     names: list[str] = []
-    firsts, count = [], 0
+    offsets, count = [], 0
     for session in sessions:
         source = session.recording.source
-        firsts.append(count)
+        offsets.append(count)
         count += len(source.timestamps)
         if isinstance(source, JoinedSource):
             sources += source.parts
@@ -177,53 +179,53 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
         else:
             sources.append(source)
             names.append(session.name)
-    indices = [s.recording.indices + first for s, first in zip(sessions, firsts, strict=True)]
+    indices = [s.recording.indices + offset for s, offset in zip(sessions, offsets, strict=True)]
     formats = dict.fromkeys(s.recording.format for s in sessions)
     path = " ".join(s.recording.path for s in sessions)
     joined = JoinedSource(sources, names)
-    return Recording(joined, path, "+".join(formats), np.concatenate(indices)), firsts
+    return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
 
 
-def _earlier_links(sessions: Sequence[Session], firsts: Sequence[int]) -> list[GivenLoop]:
+def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[GivenLoop]:
     """Return the loops that earlier merges closed between sessions, to be registered again.
 
     The loop search selects the pairs with the largest overlap, which need not connect all sessions.
     """
     return [
-        GivenLoop(i + first, j + first, by_user=False)
-        for session, first in zip(sessions, firsts, strict=True)
+        GivenLoop(i + offset, j + offset, by_user=False)
+        for session, offset in zip(sessions, offsets, strict=True)
         for i, j in session.links
     ]
 
 
-def _config_of(session: Session, first: int) -> Config:
+def _config_of(session: Session, offset: int) -> Config:
     """Return the configuration of a session, with its stated poses as odometry."""
-    given = session.config.odometry
-    assert isinstance(given, GivenPoses)
-    stated = {k + first: pose for k, pose in session.stated.items()}
-    return replace(session.config, odometry=StatedPoses(stated, given))
+    odometry = session.config.odometry
+    assert isinstance(odometry, GivenPoses)
+    stated = {k + offset: pose for k, pose in session.stated.items()}
+    return replace(session.config, odometry=StatedPoses(stated, odometry))
 
 
 def _with_sessions(
     result: Reconstruction,
     sessions: Sequence[Session],
-    firsts: Sequence[int],
+    offsets: Sequence[int],
     views: Sequence[PosedView[PreparedView]],
     recording: Recording,
 ) -> Reconstruction:
     """Return the result with its sessions, their overlaps and changes."""
-    pose = Model.of(result).poses
+    merged_poses = Model.of(result).poses
     records = tuple(
         SessionRecord(
             session.name,
             str(session.result.absolute()),
             session.opening.to_dict(),
             session.config.to_dict(),
-            first,
+            offset,
             len(session.recording.source.timestamps),
-            _T_main_session(session.posed, first, pose, fixed=k == 0),
+            _T_main_session(session.posed, offset, merged_poses, fixed=k == 0),
         )
-        for k, (session, first) in enumerate(zip(sessions, firsts, strict=True))
+        for k, (session, offset) in enumerate(zip(sessions, offsets, strict=True))
     )
     facts = {
         "path": recording.path,
@@ -234,7 +236,7 @@ def _with_sessions(
     stated = [{s.component for s in session.posed.values()} for session in sessions]
     pairs = session_pairs(result, records, stated, views)
     result = replace(
-        described(result, facts),
+        with_recording_facts(result, facts),
         sessions=records,
         session_pairs=pairs,
         changes=session_changes(result, records, views),
@@ -245,7 +247,7 @@ def _with_sessions(
 
 
 def _T_main_session(
-    posed: dict[int, StatedPose], first: int, pose: dict[int, Float64], *, fixed: bool
+    posed: dict[int, StatedPose], offset: int, merged_poses: dict[int, Float64], *, fixed: bool
 ) -> Float64 | None:
     """Return (4, 4) T_main_session between the world frames; None if the session is not joined.
 
@@ -253,31 +255,31 @@ def _T_main_session(
     for the first session (`fixed`), whose world frame is the main one, that of its first frame.
     """
     main = min((s.component for s in posed.values()), default=None)
-    both = [k for k, s in posed.items() if s.component == main and k + first in pose]
-    if not both:
+    common = [k for k, s in posed.items() if s.component == main and k + offset in merged_poses]
+    if not common:
         return None
-    stated = np.array([posed[k].T_component_camera for k in both])
-    here = np.array([pose[k + first] for k in both])
+    stated = np.array([posed[k].T_component_camera for k in common])
+    merged = np.array([merged_poses[k + offset] for k in common])
     if fixed:
-        return np.asarray(here[0] @ se3.inverse(stated[0]), np.float64)
-    return align(stated, here)
+        return np.asarray(merged[0] @ se3.inverse(stated[0]), np.float64)
+    return align(stated, merged)
 
 
 def _reasons(result: Reconstruction) -> Iterator[Reason]:
     """Return the reasons, with the names of sessions that are not joined."""
-    apart = [s.name for s in result.sessions if s.T_main_session is None]
+    unjoined = [s.name for s in result.sessions if s.T_main_session is None]
     for reason in result.diagnostics.reasons:
-        if apart and reason.code == "few_poses" and _has_most(result):
+        if unjoined and reason.code == "few_poses" and _covers_most(result):
             continue
-        if apart and reason.code == "disconnected":
+        if unjoined and reason.code == "disconnected":
             main = [s.name for s in result.sessions if s.T_main_session is not None]
             text = f"No overlap could be confirmed between {' or '.join(main)} and "
-            yield replace(reason, text=f"{text}{', '.join(apart)}. {reason.text}")
+            yield replace(reason, text=f"{text}{', '.join(unjoined)}. {reason.text}")
         else:
             yield reason
 
 
-def _has_most(result: Reconstruction) -> bool:
+def _covers_most(result: Reconstruction) -> bool:
     """Whether the main model contains most frames of the sessions joined to it."""
     joined = [s for s in result.sessions if s.T_main_session is not None]
     frames = [

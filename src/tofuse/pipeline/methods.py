@@ -55,16 +55,16 @@ def thesis(kind: ViewKind) -> Config:
 def default(kind: ViewKind) -> Config:
     """Return the default method of `tofuse run`.
 
-    Range images get a noise model, multipath is compensated if views show it, and they are aligned
-    with keyframes by planes and albedo; views of the model are filtered further. Revisited places
-    close loops, and all views are refined jointly. Clouds are registered in pairs, as far as their
-    poses are accepted, and refined by the planes that they share.
+    Range images get a noise model, multipath is compensated if views show it, and images are
+    aligned with keyframes by planes and albedo; views of the model are filtered further. Revisited
+    places close loops, and all views are refined jointly. Clouds are registered in pairs, as far as
+    their poses are accepted, and refined by common planes.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
         return replace(
             base,
-            filters=(),  # the density of its points shows from where a cloud was seen
+            filters=(),  # the density of a cloud's points shows its viewpoint
             odometry=Pairwise(),
             loops=Nearby(
                 max_distance_m=1.5,

@@ -1,4 +1,4 @@
-"""The store of observations: what all stages after tracking need of frames with a pose."""
+"""The store of observations: data of frames with a pose for all stages after tracking."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.samples import FrameSample, FrameSamples
 
 _MAX_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
-_CHECKED_IMAGES = 60  # images that are compared with each other at the final poses
+_CHECKED_IMAGES = 60  # images of the final comparison
 # Width of stored views: more pixels do not improve loops and refinement.
 _COLUMNS = 200
-# Of the images of a place, all of this many are in the model, and ever fewer of the others: their
-# noise is averaged by then.
+# Number of images of a place that are all fused into the model; of further ones a decreasing
+# fraction, as their noise is then averaged.
 _ENOUGH = 32
 
 
@@ -45,11 +45,13 @@ class Observations:
         Some frames for the report.
     """
 
-    def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
-        ends = [frame for loop in given for frame in (loop.i, loop.j)]
+    def __init__(self, config: Config, seed: int, given_loops: Sequence[GivenLoop]) -> None:
+        loop_frames = [frame for loop in given_loops for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
-        self.views: ViewStore[PreparedView] = ViewStore(Spacing(), always=ends, scratch=scratch)
-        self.loops = config.loops.start(seed, given, self.views, config.search)
+        self.views: ViewStore[PreparedView] = ViewStore(
+            Spacing(), always=loop_frames, scratch=scratch
+        )
+        self.loops = config.loops.start(seed, given_loops, self.views, config.search)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
@@ -60,7 +62,7 @@ class Observations:
         self._has_covariances = False
 
     def add(self, ready: Ready, step: Step) -> None:
-        """Store what joining, loops and refinement need of a frame with a pose."""
+        """Store the data of a frame with a pose for joining, loops and refinement."""
         T, surface = step.T_component_camera, step.surface
         assert T is not None
         if isinstance(ready.frame, RangeFrame):
@@ -77,7 +79,7 @@ class Observations:
         self._refiner.push(view, T)
 
     def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
-        """Store what the model and the verdict need of a frame with a pose."""
+        """Store the data of a frame with a pose for the model and the verdict."""
         depth = _typical_range(frame)
         if isinstance(frame, RangeFrame):
             self._depths[frame.index] = depth
@@ -88,7 +90,7 @@ class Observations:
             self._model.add(clean, step.surface, _MAX_POINTS)
 
     def sample(self, ready: Ready, *, lost: bool) -> None:
-        """Store a small picture of some frames, for the report."""
+        """Store small images of some frames for the report."""
         frame, filtered, clean = ready.frame, ready.filtered, ready.clean
         if (
             isinstance(frame, RangeFrame)
@@ -123,8 +125,8 @@ def _typical_range(frame: Frame) -> float:
             ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
     else:
         ranges = np.linalg.norm(frame.points[::16], axis=1)
-    known = ranges[ranges > 0]
-    return float(np.median(known)) if len(known) else 0.0
+    valid = ranges[ranges > 0]
+    return float(np.median(valid)) if len(valid) else 0.0
 
 
 class _EvenSample:

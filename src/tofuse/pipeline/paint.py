@@ -15,7 +15,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 
-# Maximum number of views and of textured triangles: more are hardly visible, and slow to unwrap.
+# Maximum number of views and of textured triangles: more improve little, and unwrap slowly.
 _VIEWS, _FACES = 60, 60_000
 # Metres of motion that blur as much as one radian.
 _METRES_PER_RADIAN = 1.0
@@ -45,13 +45,13 @@ def paint(
     mesh = result.mesh
     if mesh is None or not len(mesh.faces):
         return None
-    chosen = steadiest_frames(result)
+    frame_positions = steadiest_frames(result)
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
-    progress.stage("painting", len(chosen))
+    progress.stage("painting", len(frame_positions))
     views: list[TextureView] = []
     poses = []
-    for k in chosen:
+    for k in frame_positions:
         progress.advance()
         try:
             frame = recording[int(k)]
@@ -65,7 +65,7 @@ def paint(
             poses.append(result.trajectory[k])
     if not views:
         return None
-    # Sums of BLAS depend on its number of threads; those of the kernels don't.
+    # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
         return textured(mesh.decimated(_FACES), views, np.array(poses), size)
 

@@ -22,8 +22,8 @@ from tofuse.registration.register import register
 from tofuse.results.folder import OutputFolder
 from tofuse.results.pair import LocalView, PairResult, pair_folder, write_pair
 
-# Clouds this far from the origin are centred first: rotation errors would have long lever arms.
-FAR_M = 1000.0
+# Clouds farther from the origin are centred first: rotation errors would have long lever arms.
+MAX_ORIGIN_DISTANCE_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def register_files(
     RegistrationError
         If the views can't be registered.
     OutputError
-        If the result can't be written; nothing that was there before has changed then.
+        If the result can't be written; existing files are then unchanged.
     """
     options, progress = options or PairOptions(), progress or Silent()
     with threads(options.threads), threadpool_limits(1):
@@ -89,19 +89,21 @@ def _registered(
     source: str, target: str, guess: Float64 | None, options: PairOptions, progress: Progress
 ) -> PairResult:
     views = _open_both(source, target, options)
-    data, model = _near_origin(*views, guess)
-    start = np.eye(4)
+    local_source, local_target = _near_origin(*views, guess)
+    T_start = np.eye(4)
     if guess is not None:
-        start = guess.copy()
-        start[:3, 3] += guess[:3, :3] @ data.center - model.center
+        T_start = guess.copy()
+        T_start[:3, 3] += guess[:3, :3] @ local_source.center - local_target.center
         # Projected onto a rotation: rounded entries would move points far from the origin.
-        start = se3.orthonormalise(start)
+        T_start = se3.orthonormalise(T_start)
     progress.stage("registering")
-    began = perf_counter()
-    found = register(data.frame, model.frame, guess=None if guess is None else start)
-    seconds = perf_counter() - began
+    start_s = perf_counter()
+    registration = register(
+        local_source.frame, local_target.frame, guess=None if guess is None else T_start
+    )
+    seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
-    return PairResult(data, model, found, start, name, seconds)
+    return PairResult(local_source, local_target, registration, T_start, name, seconds)
 
 
 def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleView, SingleView]:
@@ -110,16 +112,16 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
     refusals: list[InputError] = []
     for name in (source, target):
 
-        def opened(camera: Path | None, name: str = name) -> SingleView:
+        def open_with(camera: Path | None, name: str = name) -> SingleView:
             return open_view(name, format=options.format, camera=camera, topic=options.topic)
 
         try:
-            views.append(opened(options.camera))
+            views.append(open_with(options.camera))
         except InputError as error:
             if error.where != "--camera":
                 raise
             refusals.append(error)
-            views.append(opened(None))
+            views.append(open_with(None))
     if len(refusals) == 2:
         raise refusals[0]
     return views[0], views[1]
@@ -130,11 +132,11 @@ def _near_origin(
 ) -> tuple[LocalView, LocalView]:
     """Move clouds that are far from the origin near it.
 
-    Without a guess, clouds near each other are shifted equally, so that the identity keeps its
-    meaning; else each is centred, where the registration starts.
+    Without a guess, clouds close to each other are shifted equally, which preserves the identity as
+    initial pose; else each is centred.
     """
     boxes = [_box(view) for view in (source, target)]
-    if not any(np.abs(box).max() > FAR_M for box in boxes):
+    if not any(np.abs(box).max() > MAX_ORIGIN_DISTANCE_M for box in boxes):
         zero = np.zeros(3)
         return LocalView(source, source.frame, zero), LocalView(target, target.frame, zero)
     centers = [np.round(box.mean(0)) for box in boxes]
@@ -142,8 +144,8 @@ def _near_origin(
         if not isinstance(view.frame, CloudFrame):
             centers[k] = np.zeros(3)
     if guess is None and all(isinstance(v.frame, CloudFrame) for v in (source, target)):
-        reach = np.ptp(boxes[0], axis=0).max() + np.ptp(boxes[1], axis=0).max()
-        if np.linalg.norm(centers[0] - centers[1]) <= reach:
+        max_distance = np.ptp(boxes[0], axis=0).max() + np.ptp(boxes[1], axis=0).max()
+        if np.linalg.norm(centers[0] - centers[1]) <= max_distance:
             centers[0] = centers[1]
     return _shifted(source, centers[0]), _shifted(target, centers[1])
 

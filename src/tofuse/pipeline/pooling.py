@@ -20,8 +20,8 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     The k-th estimate is t-distributed about the pooled value, with the squared scale ``tau^2 +
     s^2 / information_k``: tau is the heterogeneity of the estimates, s the unit of the noise
     (random-effects meta-analysis, DerSimonian and Laird 1986; with t, Baker and Jackson 2008).
-    Neither is known, and all three are integrated over a grid with flat priors (of tau and s, on
-    their logarithm).
+    The pooled value, tau and s are integrated over a grid with flat priors (for tau and s, on their
+    logarithm).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     spread = spread or float(np.std(estimates))
     if not spread:
         return centre, 0.0
-    known = information / float(np.median(information))
+    relative = information / float(np.median(information))
     # Within the range of the estimates, extended by their spread.
     lowest = max(centre - _VALUE_RANGE * spread, float(estimates.min()) - spread)
     highest = min(centre + _VALUE_RANGE * spread, float(estimates.max()) + spread)
@@ -47,7 +47,7 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     scales = spread * np.geomspace(_MIN_DEVIATION, _MAX_DEVIATION, _DEVIATIONS)
     value, tau, s = np.meshgrid(values, scales, scales, indexing="ij")
     logs = np.zeros(value.shape)
-    for estimate, precision in zip(estimates, known, strict=True):
+    for estimate, precision in zip(estimates, relative, strict=True):
         variance = tau**2 + s**2 / precision
         logs -= 0.5 * np.log(variance)
         logs -= 0.5 * (_FREEDOM + 1) * np.log1p((estimate - value) ** 2 / variance / _FREEDOM)

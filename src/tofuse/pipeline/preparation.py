@@ -24,7 +24,7 @@ class Ready:
     frame, filtered, clean
         Corrected; filtered for tracking; filtered for the model.
     removals
-        What each filter removed.
+        Number of points that each filter removed.
     surface
         The filtered view prepared for tracking, if that was done in advance.
     """
@@ -59,18 +59,20 @@ class Prepared:
 class Counts:
     """Number of points that each filter received and removed, by its name."""
 
-    seen: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
 
     def add(self, removal: Removal) -> None:
         """Count the points that a filter removed from a frame."""
-        self.seen[removal.name] = self.seen.get(removal.name, 0) + removal.seen
+        self.received[removal.name] = self.received.get(removal.name, 0) + removal.seen
         self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
     @property
     def fractions(self) -> dict[str, float]:
         """Fraction of the points that each filter removed."""
-        return {name: self.removed[name] / max(seen, 1) for name, seen in self.seen.items()}
+        return {
+            name: self.removed[name] / max(received, 1) for name, received in self.received.items()
+        }
 
 
 class Preparation:
@@ -79,7 +81,7 @@ class Preparation:
     Parameters
     ----------
     config
-        Names the corrections and filters.
+        Provides the corrections and filters.
     counts
         Counts of earlier recordings, to add to.
 
@@ -95,8 +97,8 @@ class Preparation:
         self._correctors = [correction.start() for correction in config.corrections]
         self._history: deque[Frame] = deque(maxlen=config.window - 1)
 
-    def ahead(self, frame: Frame, tracker: Tracker) -> Prepared | None:
-        """Prepare a frame in advance, as far as that depends on it alone; None if it doesn't.
+    def prepare_ahead(self, frame: Frame, tracker: Tracker) -> Prepared | None:
+        """Prepare a frame in advance, as far as that depends on it alone; None if unsupported.
 
         May be called by other threads while earlier frames are tracked; results don't depend on it.
         """
@@ -116,7 +118,7 @@ class Preparation:
         ready = self._filtered(frame, ())
         return Prepared(frame, corrected, replace(ready, surface=tracker.prepare(ready.filtered)))
 
-    def ready(
+    def process(
         self,
         frame: Frame,
         T_expected: Float64 | None,
@@ -130,11 +132,11 @@ class Preparation:
         frame
             As recorded.
         T_expected
-            (4, 4) predicted pose in the present component.
+            (4, 4) predicted pose in the current component.
         history
-            Unfiltered frames just before this one, oldest first; None for those pushed before.
+            Unfiltered frames just before this one, oldest first; None for the preceding frames.
         prepared
-            The result of `ahead`, if it was called.
+            The result of `prepare_ahead`, if it was called.
         """
         past = tuple(self._corrected(f) for f in (self._history if history is None else history))
         frame = self._corrected(frame, T_expected, prepared)
@@ -146,27 +148,27 @@ class Preparation:
             self.counts.add(removal)
         return ready
 
-    def placed(self, frame: Frame, T_component_camera: Float64) -> None:
-        """Pass the pose (4, 4) of a frame in the present component to the corrections."""
+    def add_pose(self, frame: Frame, T_component_camera: Float64) -> None:
+        """Pass the pose (4, 4) of a frame in the current component to the corrections."""
         for corrector in self._correctors:
             corrector.add_pose(frame, T_component_camera)
 
     def begin_component(self) -> None:
-        """Reset the maps of corrections: the coordinate frame is a new one."""
+        """Reset the maps of corrections: a new coordinate frame begins."""
         for corrector in self._correctors:
             corrector.reset_poses()
 
     def _corrected(
         self, frame: Frame, T_expected: Float64 | None = None, prepared: Prepared | None = None
     ) -> Frame:
-        """Correct a frame, unless it is among the last corrected ones."""
-        for before in self._history:
-            if before.index == frame.index:
-                return before
-        done = 0
+        """Correct a frame, or return it from the history if it was corrected before."""
+        for previous in self._history:
+            if previous.index == frame.index:
+                return previous
+        n_corrected = 0
         if prepared is not None:
-            frame, done = prepared.frame, prepared.corrected
-        for corrector in self._correctors[done:]:
+            frame, n_corrected = prepared.frame, prepared.corrected
+        for corrector in self._correctors[n_corrected:]:
             frame = corrector.apply(frame, T_expected)
         return frame
 

@@ -1,7 +1,7 @@
-"""Priors of external sensors, used as far as they agree with tracking.
+"""Priors of external sensors, used if they agree with tracking.
 
 Gravity comes from an accelerometer; poses from an odometry file next to the images, or from the
-device that recorded them, as phones do (`recordings.phones`).
+recording device, such as a phone (`recordings.phones`).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _WithOdometry:
 
 def with_odometry(recording: Recording, poses: Float64) -> Recording:
     """Return the recording with poses (N, 4, 4) as its odometry."""
-    of_source = np.full((len(recording.source.timestamps), 4, 4), np.nan)
-    of_source[recording.indices] = poses
-    source: Any = _WithOdometry(recording.source, of_source)
+    source_poses = np.full((len(recording.source.timestamps), 4, 4), np.nan)
+    source_poses[recording.indices] = poses
+    source: Any = _WithOdometry(recording.source, source_poses)
     return replace(recording, source=source)

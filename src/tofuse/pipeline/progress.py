@@ -21,7 +21,7 @@ class Progress(Protocol):
         ...
 
     def advance(self, record: FrameRecord | None = None) -> None:
-        """Finish one step of the stage; with the record of a frame if it is one."""
+        """Finish one step of the stage; with the record of the frame, if the step is a frame."""
         ...
 
     def note(self, text: str) -> None:
@@ -29,7 +29,7 @@ class Progress(Protocol):
         ...
 
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Show a frame of the model at its pose (4, 4) as known so far."""
+        """Show a frame of the model at its current pose (4, 4)."""
         ...
 
 
@@ -50,7 +50,7 @@ class Silent:
 
 
 @dataclass(frozen=True)
-class Both:
+class CombinedProgress:
     """Forwards progress to two receivers."""
 
     first: Progress

@@ -29,8 +29,8 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Reconstruction
 
 _TRACKING = "tracking"
-# Frames that are read and prepared in advance; each takes a multiple of its images' size.
-_AHEAD = 4
+# Number of frames read and prepared in advance; each takes a multiple of its images' size.
+_PREFETCHED_FRAMES = 4
 
 
 def reconstruct(
@@ -76,7 +76,7 @@ def reconstruct(
     config = adapted(config, recording, threads, progress)
 
     def reconstruct_with(config: Config, stages: Stages) -> Reconstruction:
-        # BLAS sums differ with its number of threads; ours don't.
+        # BLAS results depend on its number of threads; those of our kernels don't.
         with threadpool_limits(1):
             mapper = _track(recording, config, seed, threads, loops, progress, stages)
             result = mapper.finish(stages)
@@ -90,7 +90,7 @@ def reconstruct(
     )
 
 
-def with_views(
+def reconstruct_with_views(
     recording: Recording, config: Config, *, threads: int | None = None, progress: Progress
 ) -> tuple[Reconstruction, Sequence[PosedView[PreparedView]]]:
     """Reconstruct a recording, without self-calibration; returns its prepared views as well.
@@ -115,9 +115,9 @@ def _track(
 ) -> Mapper:
     """Push all frames to a new mapper, or the remaining ones to that of an interrupted job."""
     progress.stage("tracking", len(recording))
-    tracked: Tracked | None = stages.load(_TRACKING)
+    tracked: TrackingState | None = stages.load(_TRACKING)
     if tracked is None:
-        tracked = Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
+        tracked = TrackingState(Mapper(config, seed=seed, threads=threads, loops=loops))
     else:
         check_tracked(tracked, recording)
     if tracked.done:
@@ -138,24 +138,24 @@ def _track(
 
 
 def _with_facts(result: Reconstruction, recording: Recording, config: Config) -> Reconstruction:
-    """Add the facts about the recording, and the device's vertical where no sensor gave it."""
-    result = described(result, describe(recording))
+    """Add facts about the recording, and the device's vertical if no sensor measured it."""
+    result = with_recording_facts(result, recording_facts(recording))
     if result.up is None and config.priors:
         result = replace(result, up=device_up(recording, result))
     return result
 
 
-def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
+def with_recording_facts(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
     """Add facts about the recording to a result, and to those of its components."""
     components = tuple(
-        c if c.result is None else replace(c, result=described(c.result, recording))
+        c if c.result is None else replace(c, result=with_recording_facts(c.result, recording))
         for c in result.components
     )
     return replace(result, recording=recording, components=components)
 
 
 @dataclass(eq=False)
-class Tracked:
+class TrackingState:
     """State of tracking: the mapper, the number of frames done, and errors of unreadable ones."""
 
     mapper: Mapper
@@ -163,7 +163,7 @@ class Tracked:
     unreadable: list[str] = field(default_factory=list)
 
 
-def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Stages) -> None:
+def push_frames(tracked: TrackingState, recording: Recording, window: int, stages: Stages) -> None:
     """Push the remaining frames of a recording to the mapper.
 
     Parameters
@@ -181,9 +181,9 @@ def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Sta
     recent: dict[int, Frame] = {}
     first = tracked.done
     if mapper.threads > 1:
-        frames = recording.read_with(mapper.prepare, _AHEAD, first=first)
+        frames = recording.read_with(mapper.prepare, _PREFETCHED_FRAMES, first=first)
     else:
-        frames = ((item, None) for item in recording.read_all(_AHEAD, first=first))
+        frames = ((item, None) for item in recording.read_all(_PREFETCHED_FRAMES, first=first))
     for k in range(first, len(recording)):
         with mapper.watch.timing("reading"):
             item, prepared = next(frames)
@@ -206,7 +206,7 @@ def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Sta
             _save(tracked, stages)
 
 
-def _save(tracked: Tracked, stages: Stages) -> None:
+def _save(tracked: TrackingState, stages: Stages) -> None:
     with tracked.mapper.watch.timing("keeping"):
         stages.save(_TRACKING, tracked)
 
@@ -218,12 +218,12 @@ def view_kind(recording: Recording) -> ViewKind:
 
 
 def past_frames(
-    recording: Recording, index: int, count: int, known: Mapping[int, Frame] = MappingProxyType({})
+    recording: Recording, index: int, count: int, cached: Mapping[int, Frame] = MappingProxyType({})
 ) -> list[Frame]:
     """Return readable frames just before a frame, oldest first.
 
-    They are neighbours in the source, whatever is selected of the recording, and of several joined
-    recordings those of the same one.
+    They are neighbours in the source, whether or not the recording's selection contains them, and
+    belong to the same one of several joined recordings.
 
     Parameters
     ----------
@@ -231,28 +231,28 @@ def past_frames(
         The recording, and the index of the frame.
     count
         Maximum number of frames.
-    known
-        Frames that need not be read again, by index.
+    cached
+        Frames in memory, by index: they are not read again.
     """
     first = part_start(recording, index)
     past = []
     for k in range(max(first, index - count), index):
         try:
-            past.append(known[k] if k in known else recording.source.read(k))
+            past.append(cached[k] if k in cached else recording.source.read(k))
         except UnreadableFrameError:
             continue
     return past
 
 
 def part_start(recording: Recording, index: int) -> int:
-    """Return the index of the first frame of the part that frame `index` is in, if joined."""
-    joined = recording.metadata.get("parts", ())
-    starts = accumulate((part["frames"] for part in joined), initial=0)
+    """Return the first frame index of the joined part that contains frame `index`."""
+    parts = recording.metadata.get("parts", ())
+    starts = accumulate((part["frames"] for part in parts), initial=0)
     return max(start for start in starts if start <= index)
 
 
-def describe(recording: Recording) -> dict[str, Any]:
-    """Return plain facts about a recording, the `input` of `run.json`."""
+def recording_facts(recording: Recording) -> dict[str, Any]:
+    """Return facts about a recording as plain data, the `input` of `run.json`."""
     return {
         "path": recording.path,
         "format": recording.format,
@@ -262,24 +262,24 @@ def describe(recording: Recording) -> dict[str, Any]:
 
 
 def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
-    """Return the upward unit vector (3,) in the result's world, by the poses of a phone.
+    """Return the upward unit vector (3,) in the result's world, from the poses of a phone.
 
-    None if the recording has no poses of such a device, or none of a frame with a pose here.
+    None if the recording has no such poses, or none for a frame with a pose in the result.
     """
     if recording.metadata.get(POSES_BY) != "ARKit" or recording.reference is None:
         return None
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    ups = [
+    candidates = [
         result.trajectory[rows[index], :3, :3] @ T_device_camera[:3, :3].T @ ARKIT_UP
         for index, T_device_camera in zip(
             recording.indices.tolist(), recording.reference, strict=True
         )
         if index in rows
     ]
-    known = np.array(ups, float).reshape(-1, 3)
-    known = known[np.isfinite(known).all(1)]
-    if not len(known):
+    vectors = np.array(candidates, float).reshape(-1, 3)
+    vectors = vectors[np.isfinite(vectors).all(1)]
+    if not len(vectors):
         return None
-    up: Float64 = np.median(known, axis=0)
+    up: Float64 = np.median(vectors, axis=0)
     length = float(np.linalg.norm(up))
     return up / length if length > 0.1 else None

@@ -1,4 +1,4 @@
-"""The report of a result and the data of the viewer, with what only the recording provides."""
+"""The report of a result and the data of the viewer, with data from the recording."""
 
 from __future__ import annotations
 
@@ -101,15 +101,15 @@ def _filter_steps(
 def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:
     """Return the reference poses (N, 4, 4) in the result's world, NaN for frames without one.
 
-    They are aligned at the first frame with a pose in both.
+    They are aligned at the first frame that has both poses.
     """
     reference = recording.reference
     if reference is None:
         return None
-    both = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
-    if len(both) == 0:
+    common = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
+    if len(common) == 0:
         return None
-    k = both[0]
+    k = common[0]
     T_world_reference = result.trajectory[k] @ se3.inverse(reference[k])
     return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
 
@@ -127,9 +127,13 @@ def truth_points(recording: Recording) -> Float32 | None:
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     rng = np.random.default_rng(0)
-    chosen = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
+    triangles = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
     u, v = rng.random((2, _TRUTH_POINTS, 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
+    points = (
+        triangles[:, 0]
+        + u * (triangles[:, 1] - triangles[:, 0])
+        + v * (triangles[:, 2] - triangles[:, 0])
+    )
     return points.astype(np.float32)

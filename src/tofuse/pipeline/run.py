@@ -1,4 +1,4 @@
-"""The whole job of ``tofuse run``: options, recording, reconstruction, output folder."""
+"""The complete job of ``tofuse run``: options, recording, reconstruction, output folder."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def run(
                 progress.note(device)
             progress.stage("writing")
             give_back()
-            # BLAS sums differ with its number of threads, and its threads wait by spinning.
+            # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1):
                 write_result(
                     result,
@@ -99,7 +99,7 @@ def run(
             checkpoints.finish()
         except _STATE_ERRORS as error:
             checkpoints.give_up(error)
-            if checkpoints.used:  # it was modified; without a checkpoint, an error is ours
+            if checkpoints.used:  # it was modified; otherwise the error is a bug
                 raise checkpoints.unusable(error) from error
             raise
         except BaseException as error:
@@ -110,7 +110,7 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A recording and how it is reconstructed.
+    """A recording and the settings of its reconstruction.
 
     `findings` are problems of the recording that a quick inspection found.
     """
@@ -148,7 +148,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
 def _texture(
     job: _Job, result: Reconstruction, options: Options, progress: Progress, watch: Stopwatch
 ) -> Textured | None:
-    """Make the texture if one is configured, and note if there is nothing to make it of."""
+    """Make the texture if one is configured; with a note if that is impossible."""
     size = job.config.fusion.texture
     if not size:
         return None
@@ -191,7 +191,7 @@ def _key(inputs: Sequence[str | Path], options: Options, job: _Job) -> str:
     }
     option_files = (options.camera, options.loops)
     files = [Path(path) for path in (*inputs, *option_files) if path is not None]
-    return digest(facts, files, without=options.out)
+    return digest(facts, files, excluded=options.out)
 
 
 def quick_findings(
@@ -204,7 +204,7 @@ def quick_findings(
     recording
         The recording.
     config
-        How it is reconstructed; what its corrections remove is no finding.
+        Configuration of the run; faults that its corrections remove are no findings.
     turning
         Whether the camera shows a turning object.
     """
@@ -221,17 +221,17 @@ def with_findings(
 ) -> Reconstruction:
     """Return the result with the findings of an inspection, which may change the verdict.
 
-    Two faults do not matter: wrapped background behind a turning object, which is left out, and a
+    Two faults are ignored: wrapped background behind a turning object, as it is removed, and a
     focal length that self-calibration has corrected.
     """
     indices = [f.index for f in result.diagnostics.frames]
-    whole = ((indices[0], indices[-1]),)
+    full_range = ((indices[0], indices[-1]),)
     calibrated = result.diagnostics.calibrated
     harmless = {"phase_wrap"} if turning else set()
     if calibrated is not None and calibrated.focal:
         harmless.add("focal_length")
     severe = [
-        Reason("faulty_recording", whole, f"{f.text} {f.remedy}")
+        Reason("faulty_recording", full_range, f"{f.text} {f.remedy}")
         for f in findings
         if f.severity == "severe" and f.code not in harmless
     ]

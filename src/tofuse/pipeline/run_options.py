@@ -1,4 +1,4 @@
-"""The options of ``tofuse run``, and the configuration that they ask for."""
+"""The options of ``tofuse run``, and the configuration that they specify."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tofuse.pipeline.priors import Prior
 from tofuse.recordings.recording import Recording
 from tofuse.results.run_json import read_run_json
 
-_SAMPLED = 8  # frames that are checked for what --unwrap needs
+_SAMPLED = 8  # frames that are checked for the input of --unwrap
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Options:
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:
-    """Return the configuration that the options ask for, for a kind of view."""
+    """Return the configuration that the options specify, for a kind of view."""
     changes: dict[str, Any] = read_changes(options.config) if options.config else {}
     method = options.method or changes.get("method") or "default"
     if not isinstance(method, str):
@@ -69,7 +69,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         config = changed(config, {"memory_mb": megabytes}, where="--memory")
     if options.tolerance is not None:
         config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
-    front: list[dict[str, Any]] = []
+    leading_filters: list[dict[str, Any]] = []
     if options.min_depth is not None or options.max_depth is not None:
         low = options.min_depth or 0.0
         if options.max_depth is not None and options.max_depth <= low:
@@ -78,23 +78,23 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
                 where="--max-depth",
                 remedy="use a larger one",
             )
-        front.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
-    chosen = config.to_dict()
-    filters = {item["part"] for item in chosen["filters"]}
-    corrections = list(chosen["corrections"])
+        leading_filters.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
+    current = config.to_dict()
+    filters = {item["part"] for item in current["filters"]}
+    corrections = list(current["corrections"])
     if options.object:
         if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
-            front.append({"part": "background"})
+            leading_filters.append({"part": "background"})
         # Scattered light of the background is fixed to the image, and drags the object along.
         names = [item["part"] for item in corrections]
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
-        # Neither gravity nor the camera's odometry applies to the frame of a moving object.
+        # Neither gravity nor the camera's odometry applies to the coordinate frame of the object.
         config = changed(config, {"priors": []}, where="--object")
     if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
         corrections.insert(0, {"part": "unwrap"})
-    if front or corrections != chosen["corrections"]:
-        lists = {"filters": [*front, *chosen["filters"]], "corrections": corrections}
+    if leading_filters or corrections != current["corrections"]:
+        lists = {"filters": [*leading_filters, *current["filters"]], "corrections": corrections}
         config = changed(config, lists, where="--object" if options.object else "--max-depth")
     return config
 
@@ -111,7 +111,7 @@ def check_unwrap(recording: Recording) -> None:
 
 
 def seed_of(options: Options) -> int:
-    """Return the seed: as given, or that of the `run.json` given as configuration; else 0."""
+    """Return the seed: the option, or that of a `run.json` used as configuration; else 0."""
     if options.seed is not None:
         return options.seed
     if options.config is not None and options.config.suffix == ".json":

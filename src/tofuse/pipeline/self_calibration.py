@@ -1,12 +1,12 @@
 """Self-calibration: calibration errors that a recording shows are corrected.
 
 Refined views show whether an error of the focal length or the depth offset distorts the trajectory:
-corrected, they support each other better, and the drift over a loop is smaller
+with a correction, they support each other better, and the drift over a loop is smaller
 (`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
-which stays only if the stated bound of the poses is smaller (`posegraph.accuracy`), although it
+which is kept only if the error bound of the poses is smaller (`posegraph.accuracy`), although it
 includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
-before refinement. And the views must keep it: a drift that some error of the camera happens to
-explain is no error of the camera, and views that are corrected for it undo much of the correction.
+before refinement. And the correction must be stable: if a calibration error only happens to explain
+a drift, the corrected views yield an estimate that undoes much of the correction.
 """
 
 from __future__ import annotations
@@ -31,89 +31,91 @@ _ROUNDS = 2
 _FIELDS = {"focal": "focal", "offset": "offset_m"}
 _SIGMAS = {"focal": "focal_sigma", "offset": "offset_sigma_m"}
 
-Once = Callable[[Config], Reconstruction]
+Reconstruct = Callable[[Config], Reconstruction]
 
 
 def self_calibrated(
-    first: Reconstruction, config: Config, once: Once, progress: Progress
+    initial: Reconstruction, config: Config, reconstruct: Reconstruct, progress: Progress
 ) -> Reconstruction:
-    """Reconstruct again without the calibration errors that the views show.
+    """Reconstruct again with calibration errors corrected, if the views show any.
 
     Parameters
     ----------
-    first
+    initial
         The reconstruction without a correction.
     config
         Its configuration.
-    once
+    reconstruct
         Reconstructs the recording with a configuration.
     progress
         Receives notes.
     """
-    best, corrected = first, CameraErrors()
+    best, applied = initial, CameraErrors()
     for _ in range(_ROUNDS):
-        shown = _shown(best, corrected)
-        if shown is None:
+        estimate = _estimated_error(best, applied)
+        if estimate is None:
             break
-        check, error = shown
-        wrong = corrected.and_then(error)
-        progress.note(f"views agree better with {in_words(wrong)}: reconstructing again with it")
-        again = once(replace(config, corrections=(wrong, *config.corrections)))
-        if not (_is_better(again, best) and _is_kept(again, check)):
+        check, error = estimate
+        correction = applied.and_then(error)
+        progress.note(
+            f"views agree better with {in_words(correction)}: reconstructing again with it"
+        )
+        candidate = reconstruct(replace(config, corrections=(correction, *config.corrections)))
+        if not (_is_better(candidate, best) and _is_stable(candidate, check)):
             progress.note("views do not agree better with it: the calibration stays")
             break
         calibration = SelfCalibration(
-            wrong.focal,
-            wrong.offset_m,
+            correction.focal,
+            correction.offset_m,
             {_FIELDS[check.best]: check.sigmas[check.best]},
-            (_bound(first), _bound(again)),
+            (_bound(initial), _bound(candidate)),
         )
-        best = replace(again, diagnostics=_with_calibration(again, calibration))
-        corrected = wrong
+        best = replace(candidate, diagnostics=_with_calibration(candidate, calibration))
+        applied = correction
     return best
 
 
-def in_words(wrong: CameraErrors) -> str:
+def in_words(correction: CameraErrors) -> str:
     """Describe a correction: "a focal length 4.5 % smaller"."""
-    errors = {name: getattr(wrong, field) for name, field in _FIELDS.items()}
+    errors = {name: getattr(correction, field) for name, field in _FIELDS.items()}
     return " and ".join(errors_in_words({name: e for name, e in errors.items() if e}))
 
 
-def _shown(
-    result: Reconstruction, corrected: CameraErrors
+def _estimated_error(
+    result: Reconstruction, applied: CameraErrors
 ) -> tuple[CalibrationCheck, CameraErrors] | None:
-    """Return the calibration error that explains the views best; None without an alarm.
+    """Return the calibration error that fits the views best; None without an alarm.
 
-    After a correction, also what is left of the same error, though it may be within the tolerance.
+    After a correction, also the remainder of the same error, even if it is within the tolerance.
     """
-    found = _check_of(result)
-    if found is None:
+    check = _check_of(result)
+    if check is None:
         return None
-    best = found.best
-    left = found.improves and best in found.unconfirmed and getattr(corrected, _FIELDS[best])
-    if not (found.alarm or left):
+    best = check.best
+    remaining = check.improves and best in check.unconfirmed and getattr(applied, _FIELDS[best])
+    if not (check.alarm or remaining):
         return None
-    values = {_FIELDS[best]: found.errors[best], _SIGMAS[best]: found.sigmas[best]}
+    values = {_FIELDS[best]: check.errors[best], _SIGMAS[best]: check.sigmas[best]}
     try:
-        return found, CameraErrors(**values)
+        return check, CameraErrors(**values)
     except ValueError:
         return None  # implausibly large
 
 
-def _is_better(again: Reconstruction, before: Reconstruction) -> bool:
-    """Whether no frame lost its pose, and the error bound is smaller."""
-    if again.has_pose.sum() < before.has_pose.sum():
+def _is_better(candidate: Reconstruction, current: Reconstruction) -> bool:
+    """Whether the candidate loses no poses, and its error bound is smaller."""
+    if candidate.has_pose.sum() < current.has_pose.sum():
         return False
-    new, old = _bound(again), _bound(before)
+    new, old = _bound(candidate), _bound(current)
     # If neither is bounded, the support of the views decides.
-    return new < old if np.isfinite([new, old]).any() else _support(again) > _support(before)
+    return new < old if np.isfinite([new, old]).any() else _support(candidate) > _support(current)
 
 
-def _is_kept(again: Reconstruction, check: CalibrationCheck) -> bool:
+def _is_stable(candidate: Reconstruction, check: CalibrationCheck) -> bool:
     """Whether the views do not significantly undo the correction that a check proposed."""
-    found = _check_of(again)
-    left = 0.0 if found is None else found.large.get(check.best, 0.0)
-    return left * check.errors[check.best] >= 0
+    check_after = _check_of(candidate)
+    remaining = 0.0 if check_after is None else check_after.large.get(check.best, 0.0)
+    return remaining * check.errors[check.best] >= 0
 
 
 def _check_of(result: Reconstruction) -> CalibrationCheck | None:
@@ -125,7 +127,7 @@ def _bound(result: Reconstruction) -> float:
     return result.diagnostics.accuracy.position_m
 
 
-def _gain(before: float, after: float) -> str:
+def _bound_change(before: float, after: float) -> str:
     """Describe the change of the bound."""
     if not np.isfinite([before, after]).all():
         return ""
@@ -142,10 +144,10 @@ def _with_calibration(result: Reconstruction, calibration: SelfCalibration) -> D
     """Return the diagnostics with the self-calibration and its reason."""
     d = result.diagnostics
     indices = [f.index for f in d.frames]
-    wrong = CameraErrors(calibration.focal, calibration.offset_m)
+    correction = CameraErrors(calibration.focal, calibration.offset_m)
     text = (
-        f"The calibration of the camera was corrected: views agree with {in_words(wrong)} "
-        f"than stated.{_gain(*calibration.bound_m)}"
+        f"The calibration of the camera was corrected: views agree with {in_words(correction)} "
+        f"than stated.{_bound_change(*calibration.bound_m)}"
     )
     reason = Reason("self_calibrated", ((indices[0], indices[-1]),), text)
     return replace(d, calibrated=calibration, reasons=ranked([*d.reasons, reason]))

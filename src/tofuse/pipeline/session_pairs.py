@@ -19,7 +19,7 @@ from tofuse.results.types import Reconstruction, SessionChange, SessionPair, Ses
 
 View = PosedView[PreparedView]
 
-# Number of views of each session that are compared with those of the others.
+# Maximum number of views of each session for the comparison with others.
 _COMPARED = 60
 
 
@@ -44,10 +44,10 @@ class Model:
 
     def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
         """Return evenly spaced views of a session that have a pose in this model."""
-        mine = [v for v in views if session.has(v.index) and v.index in self.poses]
-        return [mine[k] for k in evenly(np.arange(len(mine)), _COMPARED)]
+        members = [v for v in views if session.has(v.index) and v.index in self.poses]
+        return [members[k] for k in evenly(np.arange(len(members)), _COMPARED)]
 
-    def links(self, one: SessionRecord, other: SessionRecord) -> set[tuple[int, int]]:
+    def links(self, first: SessionRecord, second: SessionRecord) -> set[tuple[int, int]]:
         """Return frame pairs (i < j) of two sessions with accepted registrations."""
         diagnostics = self.result.diagnostics
         ends = [(join.link.i, join.link.j) for join in diagnostics.joins]
@@ -55,25 +55,25 @@ class Model:
         return {
             (min(i, j), max(i, j))
             for i, j in ends
-            if (one.has(i) and other.has(j)) or (one.has(j) and other.has(i))
+            if (first.has(i) and second.has(j)) or (first.has(j) and second.has(i))
         }
 
-    def sure(self, one: SessionRecord, other: SessionRecord) -> float | None:
+    def join_probability(self, first: SessionRecord, second: SessionRecord) -> float | None:
         """Return the probability that the join of two sessions is correct; None if indirect."""
         probabilities = [
             join.probability
             for join in self.result.diagnostics.joins
             if join.probability is not None
-            and any(one.has(k) for k in (join.link.i, join.link.j))
-            and any(other.has(k) for k in (join.link.i, join.link.j))
+            and any(first.has(k) for k in (join.link.i, join.link.j))
+            and any(second.has(k) for k in (join.link.i, join.link.j))
         ]
         return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
 
-    def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> CrossViewConsistency:
+    def cross_view(self, first: Sequence[View], second: Sequence[View]) -> CrossViewConsistency:
         """Return the cross-view consistency between views of two sessions."""
-        both = [*ours, *theirs]
-        poses = np.array([self.poses[v.index] for v in both]).reshape(-1, 4, 4)
-        return compare_views([v.view for v in both], poses, [0] * len(ours) + [1] * len(theirs))
+        views = [*first, *second]
+        poses = np.array([self.poses[v.index] for v in views]).reshape(-1, 4, 4)
+        return compare_views([v.view for v in views], poses, [0] * len(first) + [1] * len(second))
 
 
 def session_pairs(
@@ -82,7 +82,7 @@ def session_pairs(
     stated: Sequence[Collection[int]],
     views: Sequence[View],
 ) -> tuple[SessionPair, ...]:
-    """Return for each two sessions whether they are in one model, and the evidence of overlap.
+    """Return for each pair of sessions whether they are in one model, and the evidence of overlap.
 
     Parameters
     ----------
@@ -93,16 +93,18 @@ def session_pairs(
     views
         Prepared views of frames with a pose.
     """
-    apart = [c.result for c in result.components if c.result is not None and not c.connected]
-    models = [Model.of(each) for each in (result, *apart)]
+    separate = [c.result for c in result.components if c.result is not None and not c.connected]
+    models = [Model.of(each) for each in (result, *separate)]
     pairs = []
     for a, b in combinations(range(len(records)), 2):
-        one, other = records[a], records[b]
+        first, second = records[a], records[b]
         for model in models:
-            ours, theirs = model.views(one, views), model.views(other, views)
-            if ours and theirs:
+            first_views, second_views = model.views(first, views), model.views(second, views)
+            if first_views and second_views:
                 before = bool(set(stated[a]) & set(stated[b]))
-                pairs.append(_pair(a, b, one, other, model, ours, theirs, before=before))
+                pairs.append(
+                    _pair(a, b, first, second, model, first_views, second_views, before=before)
+                )
                 break
         else:
             pairs.append(SessionPair(a, b, joined=False))
@@ -112,34 +114,34 @@ def session_pairs(
 def _pair(
     a: int,
     b: int,
-    one: SessionRecord,
-    other: SessionRecord,
+    first: SessionRecord,
+    second: SessionRecord,
     model: Model,
-    ours: Sequence[View],
-    theirs: Sequence[View],
+    first_views: Sequence[View],
+    second_views: Sequence[View],
     *,
     before: bool,
 ) -> SessionPair:
     """Return the links and the overlap of two sessions in one model."""
-    seen = model.seen(ours, theirs)
-    overlap = np.isfinite(seen.support_of_views())
-    supporting = seen.support()
+    cross_view = model.cross_view(first_views, second_views)
+    overlap = np.isfinite(cross_view.support_of_views())
+    support = cross_view.support()
     return SessionPair(
         a,
         b,
         True,
         before,
-        len(model.links(one, other)),
-        model.sure(one, other),
-        float(min(overlap[: len(ours)].mean(), overlap[len(ours) :].mean())),
-        float(supporting) if np.isfinite(supporting) else None,
+        len(model.links(first, second)),
+        model.join_probability(first, second),
+        float(min(overlap[: len(first_views)].mean(), overlap[len(first_views) :].mean())),
+        float(support) if np.isfinite(support) else None,
     )
 
 
 def session_changes(
     result: Reconstruction, records: Sequence[SessionRecord], views: Sequence[View]
 ) -> tuple[SessionChange, ...]:
-    """Detect changes of the scene between each two sessions in the main model.
+    """Detect changes of the scene between each pair of sessions in the main model.
 
     Parameters
     ----------
@@ -147,12 +149,15 @@ def session_changes(
         Prepared views of frames with a pose.
     """
     model = Model.of(result)
-    mine = [model.views(record, views) for record in records]
-    found = []
+    views_of = [model.views(record, views) for record in records]
+    detected = []
     for a, b in combinations(range(len(records)), 2):
-        both = [
-            ([v.view for v in some], np.array([model.poses[v.index] for v in some]))
-            for some in (mine[a], mine[b])
+        inputs = [
+            (
+                [v.view for v in session_views],
+                np.array([model.poses[v.index] for v in session_views]),
+            )
+            for session_views in (views_of[a], views_of[b])
         ]
-        found += [SessionChange(a, b, change) for change in changes(*both[0], *both[1])]
-    return tuple(found)
+        detected += [SessionChange(a, b, change) for change in changes(*inputs[0], *inputs[1])]
+    return tuple(detected)

@@ -67,7 +67,7 @@ class Session:
 def read_sessions(
     results: Sequence[str | Path], threads: int | None, progress: Progress
 ) -> list[Session]:
-    """Read the sessions of several results, in order; a merged result yields all of its own.
+    """Read the sessions of several results, in order; a merged result yields all of its sessions.
 
     Raises
     ------
@@ -82,9 +82,9 @@ def read_sessions(
     sessions: list[Session] = []
     components = 0
     for folder in folders:
-        found = sessions_of(folder, components, threads, progress)
-        sessions += found
-        numbers = [s.component for session in found for s in session.posed.values()]
+        new_sessions = sessions_of(folder, components, threads, progress)
+        sessions += new_sessions
+        numbers = [s.component for session in new_sessions for s in session.posed.values()]
         components = max([components, *(number + 1 for number in numbers)])
     if len(sessions) < 2:
         raise InputError(
@@ -92,8 +92,8 @@ def read_sessions(
             where=folders[0] if folders else None,
             remedy="pass two or more results of `tofuse run`",
         )
-    for one, other in combinations(sessions, 2):
-        _check_different(one, other)
+    for first, second in combinations(sessions, 2):
+        _check_different(first, second)
     return _uniquely_named(sessions)
 
 
@@ -108,8 +108,8 @@ def sessions_of(
         If the result can't be merged with any other; see `read_sessions`.
     """
     parts, links = _read_parts(folder, components)
-    found = [_session(part, stated, folder, threads, progress) for part, stated in parts]
-    return [replace(found[0], links=links), *found[1:]]
+    sessions = [_session(part, stated, folder, threads, progress) for part, stated in parts]
+    return [replace(sessions[0], links=links), *sessions[1:]]
 
 
 def _read_parts(
@@ -135,9 +135,9 @@ def _read_parts(
 
 def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tuple[int, int], ...]:
     """Return the loop closures (i, j) of a result between its sessions."""
-    begin = sorted(p.first for p in parts)
-    closed = ((int(p["i"]), int(p["j"])) for p in run.get("loops", ()) if p["accepted"])
-    return tuple((i, j) for i, j in closed if bisect_right(begin, i) != bisect_right(begin, j))
+    starts = sorted(p.first for p in parts)
+    loops = ((int(p["i"]), int(p["j"])) for p in run.get("loops", ()) if p["accepted"])
+    return tuple((i, j) for i, j in loops if bisect_right(starts, i) != bisect_right(starts, j))
 
 
 def _session(
@@ -165,12 +165,12 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
     """Return the pose and status that a result states for each frame, by index."""
     poses = _poses(folder, dict(run))
     main = {k: (T, components) for k, T in poses.items()}
-    apart = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
-    for number, k in enumerate(apart, components + 1):
-        own = folder / component_name(k)
-        if is_result(own):
-            main |= {i: (T, number) for i, T in _poses(own, None).items()}
-    found = {}
+    separate = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
+    for number, k in enumerate(separate, components + 1):
+        component_folder = folder / component_name(k)
+        if is_result(component_folder):
+            main |= {i: (T, number) for i, T in _poses(component_folder, None).items()}
+    stated = {}
     for frame in run["frames"]:
         index, status = int(frame["index"]), frame["status"]
         if status not in get_args(Status):
@@ -178,11 +178,11 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
         if index in main:
             T, component = main[index]
             C = frame_covariance(frame) if component == components else None
-            found[index] = StatedPose(status, str(frame["reason"]), T, component, C)
+            stated[index] = StatedPose(status, str(frame["reason"]), T, component, C)
         else:
             reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
-            found[index] = StatedPose("lost", reason)
-    return found
+            stated[index] = StatedPose("lost", reason)
+    return stated
 
 
 def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
@@ -199,29 +199,31 @@ def _config(
     threads: int | None,
     progress: Progress,
 ) -> Config:
-    """Return the configuration of a result, with `GivenPoses` as odometry."""
+    """Return the stored configuration of a result, with `GivenPoses` as odometry."""
     where = f"{folder / 'run.json'}: config"
     config = changed(from_method("default"), stored, where=where)
-    given = GivenPoses()
+    given_poses = GivenPoses()
     if isinstance(config.odometry, Keyframes | GivenPoses):
         odometry = config.odometry
-        given = GivenPoses(odometry.views, odometry.keyframe_angle, odometry.keyframe_distance)
-    config = replace(config, odometry=given)
+        given_poses = GivenPoses(
+            odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
+        )
+    config = replace(config, odometry=given_poses)
     return adapted(config, recording, threads, progress)
 
 
-def _check_different(one: Session, other: Session) -> None:
+def _check_different(first: Session, second: Session) -> None:
     """Raise InputError if frames of one recording are in both sessions."""
 
     def facts(session: Session) -> tuple[object, ...]:
         o = session.opening
         return tuple(path.resolve() for path in o.paths), o.average_still
 
-    both = one.posed.keys() & other.posed.keys()
-    if facts(one) == facts(other) and both:
+    common = first.posed.keys() & second.posed.keys()
+    if facts(first) == facts(second) and common:
         raise InputError(
-            f"is of the same recording as {one.result}: {len(both)} frames are in both",
-            where=other.result,
+            f"is of the same recording as {first.result}: {len(common)} frames are in both",
+            where=second.result,
             remedy="pass one of the two results",
         )
 
@@ -232,10 +234,10 @@ def _uniquely_named(sessions: list[Session]) -> list[Session]:
     taken: set[str] = set()
     out = []
     for session, name in zip(sessions, names, strict=True):
-        unlike, number = name, 1
-        while unlike in taken or (number > 1 and unlike in names):
+        unique, number = name, 1
+        while unique in taken or (number > 1 and unique in names):
             number += 1
-            unlike = f"{name} ({number})"
-        taken.add(unlike)
-        out.append(replace(session, name=unlike))
+            unique = f"{name} ({number})"
+        taken.add(unique)
+        out.append(replace(session, name=unique))
     return out

@@ -21,7 +21,7 @@ from tofuse.registration.prepared_view import PreparedView
 class VisualEvidence:
     """The evidence of the images alone: a graph without external sensors.
 
-    `sequential` are the poses before loops closed, with external sensors.
+    `sequential` are the poses before loop closure, with external sensors.
     """
 
     sequential: Float64
@@ -32,7 +32,7 @@ class VisualEvidence:
 class Optimised:
     """The result of closing loops and optimising.
 
-    `confirmed` are frames whose registrations fit unusually but that the loops show to be right.
+    `confirmed` are frames whose registrations fit unusually badly, but are confirmed by the loops.
     """
 
     loops: list[ClosedLoop]
@@ -53,10 +53,10 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The model, and a cloud at the poses before they were optimised; None if none moved."""
+    """The model, and a cloud at the poses before optimisation; None if that changed no pose."""
 
     model: Model
-    before: Cloud | None
+    cloud_before: Cloud | None
 
 
 @dataclass(frozen=True, eq=False)

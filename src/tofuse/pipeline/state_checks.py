@@ -32,7 +32,7 @@ from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
 
 if TYPE_CHECKING:
-    from tofuse.pipeline.reconstruct import Tracked
+    from tofuse.pipeline.reconstruct import TrackingState
     from tofuse.recordings.recording import Recording
 
 # Type and shape of arrays; letters stand for sizes, equal within one object. Exclamation mark: all
@@ -65,35 +65,35 @@ _ARRAYS: dict[type, dict[str, str]] = {
 
 
 def check_objects(items: Iterable[Any]) -> None:
-    """Refuse objects of ours that their constructors would not have made.
+    """Reject objects of the package that their constructors would not accept.
 
     Raises
     ------
     ValueError, InputError
-        Which attribute is wrong. Constructors may raise others.
+        With the name of the invalid attribute. Constructors may raise others.
     """
-    found = list(items)
-    # What was put away lies in a file: an entry has its shapes, beside an item without arrays.
-    entries = [item for item in found if type(item) is _Entry]
+    objects = list(items)
+    # Spilled objects are in a file: an entry has their shapes, and the object without arrays.
+    entries = [item for item in objects if type(item) is _Entry]
     shells = {id(entry.shell) for entry in entries}
     for entry in entries:
         arrays = dict(vars(entry.shell))
         for name, shape in entry.shapes.items():
             arrays[name] = np.broadcast_to(np.zeros((), arrays[name].dtype), _sizes(shape))
         check_arrays(type(entry.shell), arrays)
-    for item in found:
+    for item in objects:
         if id(item) in shells:
             continue
-        made = getattr(item, "__post_init__", None)
-        if made is not None:
-            made()
+        post_init = getattr(item, "__post_init__", None)
+        if post_init is not None:
+            post_init()
         check_arrays(type(item), vars(item))
         if type(item) is Mesh and not _within(item.faces, len(item.vertices)):
             raise ValueError("a triangle of a mesh names a vertex that is not there")
 
 
-def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
-    """Refuse attributes of a class that do not have the declared types and shapes.
+def check_arrays(kind: type, attributes: Mapping[str, Any]) -> None:
+    """Reject attributes of a class that do not have the declared types and shapes.
 
     Raises
     ------
@@ -101,16 +101,16 @@ def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
         With the name of the attribute.
     """
     sizes: dict[str, int] = {}
-    for name, promised in _ARRAYS.get(kind, {}).items():
-        array = found.get(name)
+    for name, declared in _ARRAYS.get(kind, {}).items():
+        array = attributes.get(name)
         if array is None:
             continue
-        code, *wanted = promised.split()
+        code, *dimensions = declared.split()
         if not isinstance(array, np.ndarray) or array.dtype != np.dtype(code.rstrip("!")):
             raise ValueError(f"{name} of a {kind.__name__} is not an array of {code.rstrip('!')}")
-        fits = len(array.shape) == len(wanted) and all(
-            size == (int(want) if want.isdecimal() else sizes.setdefault(want, size))
-            for size, want in zip(array.shape, wanted, strict=True)
+        fits = len(array.shape) == len(dimensions) and all(
+            size == (int(dimension) if dimension.isdecimal() else sizes.setdefault(dimension, size))
+            for size, dimension in zip(array.shape, dimensions, strict=True)
         )
         if not fits:
             raise ValueError(f"{name} of a {kind.__name__} has shape {array.shape}")
@@ -120,8 +120,8 @@ def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
             se3.check_pose(array, where=f"{name} of a {kind.__name__}")
 
 
-def check_tracked(tracked: Tracked, recording: Recording) -> None:
-    """Refuse a state of tracking of another recording.
+def check_tracked(tracked: TrackingState, recording: Recording) -> None:
+    """Reject a state of tracking of another recording.
 
     Raises
     ------
@@ -129,24 +129,24 @@ def check_tracked(tracked: Tracked, recording: Recording) -> None:
         With the difference.
     """
     entries = tracked.mapper.log.entries
-    done = tracked.done
-    if type(done) is not int or not 0 <= done <= len(recording) or len(entries) != done:
-        raise ValueError(f"{len(entries)} frames are kept of {done} that were tracked")
+    n_done = tracked.done
+    if type(n_done) is not int or not 0 <= n_done <= len(recording) or len(entries) != n_done:
+        raise ValueError(f"{len(entries)} frames are kept of {n_done} that were tracked")
     indices = [entry.record.index for entry in entries]
     times = np.array([entry.record.timestamp for entry in entries])
-    if indices != recording.indices[:done].tolist():
+    if indices != recording.indices[:n_done].tolist():
         raise ValueError("the frames that were tracked have other numbers")
-    if not np.array_equal(times, recording.timestamps[:done]):
+    if not np.array_equal(times, recording.timestamps[:n_done]):
         raise ValueError("the frames that were tracked have other times")
-    known = set(indices)
+    tracked_frames = set(indices)
     for entry in entries:
         step = entry.step
-        named = [] if step is None else [k for link in step.links for k in (link.i, link.j)]
+        referenced = [] if step is None else [k for link in step.links for k in (link.i, link.j)]
         if step is not None and step.reference is not None:
-            named.append(step.reference)
-        if not known.issuperset(named):
+            referenced.append(step.reference)
+        if not tracked_frames.issuperset(referenced):
             raise ValueError(f"frame {entry.record.index} was registered to one that is not there")
-    if not known.issuperset(view.index for view in tracked.mapper.views):
+    if not tracked_frames.issuperset(view.index for view in tracked.mapper.views):
         raise ValueError("a view is of a frame that is not there")
 
 

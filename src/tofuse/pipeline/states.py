@@ -1,7 +1,7 @@
-"""Serialisation of our own types to plain data and arrays, for checkpoints.
+"""Serialisation of the package's own types to plain data and arrays, for checkpoints.
 
 Such data can't execute code or name other types. A class is looked up by its name among those that
-the rooms below define, and is filled, not called; then the checks of its constructor are repeated
+the modules below define, and is filled, not called; then the checks of its constructor are repeated
 (`state_checks`). Shared objects stay shared.
 
 The data is a list of nodes. A value is a plain number, text or None; or the number of a node, in a
@@ -33,7 +33,7 @@ from tofuse.pipeline.state_checks import check_objects
 Arrays = dict[str, NDArray[Any]]
 
 # Packages and modules whose classes can be serialised.
-_ROOMS = (
+_MODULES = (
     "corrections",
     "evaluation",
     "files.spill",
@@ -62,12 +62,12 @@ _ROOMS = (
     "results.types",
     "sensor",
 )
-_KINDS = "biufcSU"  # of arrays
-# Prefix of arrays that are pieces of a temporary file, which may exceed the memory.
+_DTYPE_KINDS = "biufcSU"  # of arrays
+# Prefix of arrays that are pieces of a temporary file, which may be larger than the memory.
 PIECE = "piece-"
-_SMALL = 1 << 14  # bytes; smaller arrays of one type are stored together
+_SMALL_BYTES = 1 << 14  # smaller arrays of one type are stored together
 # Prefix of arrays that are JSON of the nodes, and the number of nodes in each.
-_NODES, _NODES_A_PART = "nodes-", 1 << 14
+_NODES, _NODES_PER_PART = "nodes-", 1 << 14
 _MAX_NODES_BYTES = 1 << 30
 _POOL_BYTES = 1 << 24  # of small arrays that are stored together
 
@@ -138,19 +138,19 @@ def from_json(array: NDArray[Any] | None) -> Any:
 
 
 @cache
-def known_types() -> dict[str, type]:
+def serialisable_types() -> dict[str, type]:
     """Return the classes that can be serialised, by their names."""
-    found: dict[str, type] = {}
+    types: dict[str, type] = {}
     for module in _modules():
         for item in vars(module).values():
             if isinstance(item, type) and item.__module__ == module.__name__ and _is_plain(item):
-                found[_name(item)] = item
-    return found
+                types[_name(item)] = item
+    return types
 
 
 def _modules() -> Iterator[ModuleType]:
-    for room in _ROOMS:
-        module = importlib.import_module(f"tofuse.{room}")
+    for name in _MODULES:
+        module = importlib.import_module(f"tofuse.{name}")
         yield module
         for info in pkgutil.iter_modules(getattr(module, "__path__", ())):
             yield importlib.import_module(f"{module.__name__}.{info.name}")
@@ -158,12 +158,17 @@ def _modules() -> Iterator[ModuleType]:
 
 def _is_plain(cls: type) -> bool:
     """Whether the state of an instance is its attributes, and creating one calls nothing."""
-    ours = all(base.__module__.split(".")[0] in _BASES for base in cls.__mro__)
-    made = _member(cls, "__new__") is object.__new__ and not hasattr(cls, "__del__")
-    return ours and made and hasattr(cls, "__dict__") and not getattr(cls, "_is_protocol", False)
+    has_allowed_bases = all(base.__module__.split(".")[0] in _ALLOWED_BASES for base in cls.__mro__)
+    has_default_new = _member(cls, "__new__") is object.__new__ and not hasattr(cls, "__del__")
+    return (
+        has_allowed_bases
+        and has_default_new
+        and hasattr(cls, "__dict__")
+        and not getattr(cls, "_is_protocol", False)
+    )
 
 
-_BASES = ("tofuse", "abc", "typing", "builtins")
+_ALLOWED_BASES = ("tofuse", "abc", "typing", "builtins")
 
 
 def _name(cls: type) -> str:
@@ -174,7 +179,7 @@ class _Encoder:
     def __init__(self) -> None:
         self._numbers: dict[int, int] = {}
         self._referenced: list[Any] = []  # so that no id of an object is used twice
-        self._named = 0
+        self._n_arrays = 0
         self._complete: Arrays = {}
         self._pools: dict[str, _Pool] = {}
 
@@ -182,9 +187,9 @@ class _Encoder:
         self._value([state])
         nodes: list[Any] = []
         parts = 0
-        for item in self._referenced:  # which grows meanwhile
+        for item in self._referenced:  # grows during the iteration
             nodes.append(self._node(item))
-            if len(nodes) == _NODES_A_PART:
+            if len(nodes) == _NODES_PER_PART:
                 yield f"{_NODES}{parts}", to_json(nodes)
                 nodes, parts = [], parts + 1
             yield from self._complete.items()
@@ -215,17 +220,17 @@ class _Encoder:
         if kind is float:
             return ["float", repr(item)]
         if kind is bytes:
-            return ["bytes", *self._placed(np.frombuffer(item, np.uint8))]
+            return ["bytes", *self._array_reference(np.frombuffer(item, np.uint8))]
         if kind is np.ndarray:
-            turned = item.flags.f_contiguous and not item.flags.c_contiguous
-            whole = item.T if turned else item
-            flat = np.ascontiguousarray(whole).reshape(-1)
-            return ["array", *self._placed(flat), turned, *whole.shape]
+            transposed = item.flags.f_contiguous and not item.flags.c_contiguous
+            contiguous = item.T if transposed else item
+            flat = np.ascontiguousarray(contiguous).reshape(-1)
+            return ["array", *self._array_reference(flat), transposed, *contiguous.shape]
         if isinstance(item, np.generic):
-            return ["number", *self._placed(np.asarray(item).reshape(-1))]
+            return ["number", *self._array_reference(np.asarray(item).reshape(-1))]
         if kind is SpillFile:
             return ["file", item.folder, *self._pieces(item)]
-        if known_types().get(_name(kind)) is kind:
+        if serialisable_types().get(_name(kind)) is kind:
             state = _attributes(item)
             return ["object", _name(kind), *(v for k in state for v in (k, value(state[k])))]
         raise StateError(f"objects of type {_name(kind)} can't be stored")
@@ -235,24 +240,24 @@ class _Encoder:
         return [self._stored(PIECE, piece) for piece in file.pieces()]
 
     def _stored(self, prefix: str, array: Any) -> str:
-        name = f"{prefix}{self._named}"
-        self._named += 1
+        name = f"{prefix}{self._n_arrays}"
+        self._n_arrays += 1
         self._complete[name] = array
         return name
 
-    def _placed(self, flat: NDArray[Any]) -> list[Any]:
-        """Return the written array that contains the values, their start, and their number."""
-        if flat.dtype.kind not in _KINDS:
+    def _array_reference(self, flat: NDArray[Any]) -> list[Any]:
+        """Return the name of the array that contains the values, their start, and their number."""
+        if flat.dtype.kind not in _DTYPE_KINDS:
             raise StateError(f"arrays of {flat.dtype} can't be stored")
-        if flat.nbytes > _SMALL:
+        if flat.nbytes > _SMALL_BYTES:
             return [self._stored("array-", flat), 0, len(flat)]
         pool = self._pools.get(flat.dtype.str)
         if pool is not None and pool.nbytes >= _POOL_BYTES:
             self._complete[pool.name] = pool.array()
             pool = None
         if pool is None:
-            pool = self._pools[flat.dtype.str] = _Pool(f"small-{self._named}")
-            self._named += 1
+            pool = self._pools[flat.dtype.str] = _Pool(f"small-{self._n_arrays}")
+            self._n_arrays += 1
         return [pool.name, pool.add(flat), len(flat)]
 
 
@@ -279,10 +284,10 @@ class _Pool:
 
 
 def _attributes(item: Any) -> dict[str, Any]:
-    """Return the state of an object of ours.
+    """Return the state of an object of the package.
 
-    Of a frozen dataclass its fields, without derived values. (In Python 3.11, access to `__dict__`
-    would create one for good.)
+    For a frozen dataclass its fields, without derived values. (In Python 3.11, access to `__dict__`
+    would create one permanently.)
     """
     cls = type(item)
     if _is_frozen(cls) and _member(cls, "__getstate__") is vars(object)["__getstate__"]:
@@ -312,15 +317,15 @@ class _Decoder:
             raise StateError("the list of nodes is missing")
         self._nodes = nodes
         self._arrays = arrays
-        self._left = sum(array.nbytes for array in arrays.values())  # each is taken once
-        self._made: dict[int, Any] = {}
-        self._begun: set[int] = set()
+        self._remaining_bytes = sum(array.nbytes for array in arrays.values())  # each is read once
+        self._built: dict[int, Any] = {}
+        self._visited: set[int] = set()
 
     def run(self) -> Any:
         try:
             (state,) = self._item(0)
-            ours = frozenset(known_types().values())
-            check_objects(item for item in self._made.values() if type(item) in ours)
+            own_types = frozenset(serialisable_types().values())
+            check_objects(item for item in self._built.values() if type(item) in own_types)
         except StateError:
             raise
         except RecursionError:
@@ -340,86 +345,89 @@ class _Decoder:
         raise StateError("a value is of an unexpected type")
 
     def _item(self, number: int) -> Any:
-        if number in self._made:
-            return self._made[number]
-        if type(number) is not int or not 0 <= number < len(self._nodes) or number in self._begun:
+        if number in self._built:
+            return self._built[number]
+        if type(number) is not int or not 0 <= number < len(self._nodes) or number in self._visited:
             raise StateError("a reference between nodes is invalid")
-        kind, *rest = self._nodes[number]
-        self._begun.add(number)
+        kind, *content = self._nodes[number]
+        self._visited.add(number)
         if kind in ("tuple", "frozenset"):
-            values = map(self._value, rest)
-            self._made[number] = tuple(values) if kind == "tuple" else frozenset(values)
+            values = map(self._value, content)
+            self._built[number] = tuple(values) if kind == "tuple" else frozenset(values)
         elif kind == "object":
-            self._object(number, *rest)
+            self._object(number, *content)
         elif kind in _FILLED:
-            self._container(number, kind, rest)
+            self._container(number, kind, content)
         else:
-            self._made[number] = self._plain(kind, rest)
-        return self._made[number]
+            self._built[number] = self._plain(kind, content)
+        return self._built[number]
 
-    def _container(self, number: int, kind: str, rest: list[Any]) -> None:
+    def _container(self, number: int, kind: str, content: list[Any]) -> None:
         """Fill a container after creating it, as it may contain itself."""
-        made: Any = deque(maxlen=rest[0]) if kind == "deque" else _FILLED[kind]()
-        self._made[number] = made
+        container: Any = deque(maxlen=content[0]) if kind == "deque" else _FILLED[kind]()
+        self._built[number] = container
         if kind in ("dict", "ordered"):
-            for key, value in zip(rest[::2], rest[1::2], strict=True):
-                made[self._value(key)] = self._value(value)
+            for key, value in zip(content[::2], content[1::2], strict=True):
+                container[self._value(key)] = self._value(value)
             return
-        add = made.add if kind == "set" else made.append
-        for value in rest[1:] if kind == "deque" else rest:
+        add = container.add if kind == "set" else container.append
+        for value in content[1:] if kind == "deque" else content:
             add(self._value(value))
 
-    def _object(self, number: int, name: str, *rest: Any) -> None:
-        cls = known_types().get(name)
+    def _object(self, number: int, name: str, *attributes: Any) -> None:
+        cls = serialisable_types().get(name)
         if cls is None:
             raise StateError(f"the type {name!r:.80} is unknown")
-        made: Any = object.__new__(cls)
-        self._made[number] = made
-        state = {key: self._value(value) for key, value in zip(rest[::2], rest[1::2], strict=True)}
+        instance: Any = object.__new__(cls)
+        self._built[number] = instance
+        state = {
+            key: self._value(value)
+            for key, value in zip(attributes[::2], attributes[1::2], strict=True)
+        }
         if not all(type(key) is str for key in state):
             raise StateError("names of attributes are invalid")
         if is_dataclass(cls):
             names = {field.name for field in fields(cls)}
-            lacking = [n for n in names - set(state) if _member(cls, n) is None]
-            if lacking or (_is_frozen(cls) and set(state) - names):
+            missing = [n for n in names - set(state) if _member(cls, n) is None]
+            if missing or (_is_frozen(cls) and set(state) - names):
                 raise StateError(f"the fields do not match those of {name}")
-        if hasattr(made, "__setstate__"):
-            made.__setstate__(state)
+        if hasattr(instance, "__setstate__"):
+            instance.__setstate__(state)
         else:
-            made.__dict__.update(state)
+            instance.__dict__.update(state)
 
     def _file(self, folder: str | None, *names: str) -> SpillFile:
         if folder is not None and not isinstance(folder, str):
             raise StateError("the folder of a temporary file is invalid")
-        made = SpillFile(folder)
+        file = SpillFile(folder)
         for name in names:
             data = self._piece(name) if name.startswith(PIECE) else None
             if data is None or data.dtype != np.uint8:
                 raise StateError("a temporary file is incomplete")
-            made.append(data)
-        return made
+            file.append(data)
+        return file
 
-    def _plain(self, kind: str, rest: list[Any]) -> Any:
+    def _plain(self, kind: str, content: list[Any]) -> Any:
         if kind == "float":
-            return float(rest[0])
+            return float(content[0])
         if kind == "file":
-            return self._file(*rest)
+            return self._file(*content)
         if kind in ("bytes", "number", "array"):
-            name, start, count, *shape = rest
-            whole = self._arrays[name]
-            self._left -= count * whole.itemsize
-            if min(start, count) < 0 or start + count > len(whole) or self._left < 0:
+            name, start, count, *shape = content
+            stored = self._arrays[name]
+            self._remaining_bytes -= count * stored.itemsize
+            if min(start, count) < 0 or start + count > len(stored) or self._remaining_bytes < 0:
                 raise StateError("an array is too short")
-            flat = whole if len(whole) == count else whole[start : start + count].copy()
+            flat = stored if len(stored) == count else stored[start : start + count].copy()
             if kind == "bytes":
                 return flat.tobytes()
             if kind == "number":
                 return flat[0]
-            turned, *sizes = shape
+            transposed, *sizes = shape
             if any(type(size) is not int or size < 0 for size in sizes):
                 raise StateError("the shape of an array is invalid")
             array = flat.reshape(sizes)
-            return array.T if turned else array
+            return array.T if transposed else array
         raise StateError(f"the kind of node {kind!r:.80} is unknown")
 
 

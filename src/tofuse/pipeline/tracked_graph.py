@@ -49,10 +49,10 @@ class TrackedGraph:
     def build(
         self,
         loops: Sequence[ClosedLoop],
-        refined: Refinement | None = None,
+        refinement: Refinement | None = None,
         *,
         confirmed: Collection[int] = (),
-        cautious: bool = False,
+        conservative: bool = False,
     ) -> PoseGraph:
         """Return the pose graph as tracked and joined, or with the edges of the refinement.
 
@@ -60,57 +60,59 @@ class TrackedGraph:
         ----------
         loops
             Closed loops to include.
-        refined
-            Replaces poses and edges of the views that it refined.
+        refinement
+            Replaces the poses and edges of the refined views.
         confirmed
             Frames whose registrations get their uncertainty without `Step.inflation`.
-        cautious
-            Whether the error of predicted motion grows at the largest rate (`at_worst`).
+        conservative
+            Whether the error of predicted motion grows at the maximum rate (`at_worst`).
         """
         ids = [e.record.index for e in self.posed]
         tracked = np.array([self.poses[index] for index in ids])
-        poses = tracked if refined is None else refined.poses
-        refined_edges = () if refined is None else refined.edges
-        replaced = {index for edge in refined_edges for index in (edge.i, edge.j)}
-        place = {index: k for k, index in enumerate(ids)}
+        poses = tracked if refinement is None else refinement.poses
+        refined_edges = () if refinement is None else refinement.edges
+        refined_frames = {index for edge in refined_edges for index in (edge.i, edge.j)}
+        position_of = {index: k for k, index in enumerate(ids)}
         unobservable = [e.record.unobservable for e in self.posed]
-        run = degenerate_runs(unobservable)
-        prediction = Prediction.of(tracked, unobservable) if run.any() else None
-        if prediction is not None and cautious:
+        degenerate_run_of = degenerate_runs(unobservable)
+        prediction = Prediction.of(tracked, unobservable) if degenerate_run_of.any() else None
+        if prediction is not None and conservative:
             prediction = prediction.at_worst()
         times = {e.record.index: e.record.timestamp for e in self.posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
-        sequence = []
+        sequential_edges = []
         for entry in self.posed:
             step, index = entry.step, entry.record.index
             if step is None or step.reference is None or step.registration is None:
                 continue
-            if {step.reference, index} <= replaced:
+            if {step.reference, index} <= refined_frames:
                 continue
             r = step.registration
-            # Over longer intervals than usual the prediction error grows with the time squared.
-            frames = abs(place[index] - place[step.reference])
+            # The prediction error grows with the square of the elapsed time.
+            n_frames = abs(position_of[index] - position_of[step.reference])
             elapsed = abs(times[index] - times[step.reference])
-            longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
+            time_ratio = (
+                max(elapsed / (n_frames * interval), 1.0) if n_frames and interval > 0 else 1.0
+            )
             information = r.information
             if index in confirmed:
                 information = information * step.inflation**2
             if prediction is not None:
-                sigma = prediction.error(int(run[place[index]]), frames)
-                predicted = (sigma[0] * longer**2, sigma[1] * longer**2)
-                information = with_prediction(information, r.unobservable, predicted)
-            sequence.append(Measured(step.reference, index, r.T_target_source, information))
-        needed = [
+                sigma = prediction.error(int(degenerate_run_of[position_of[index]]), n_frames)
+                predicted_sigma = (sigma[0] * time_ratio**2, sigma[1] * time_ratio**2)
+                information = with_prediction(information, r.unobservable, predicted_sigma)
+            sequential_edges.append(Measured(step.reference, index, r.T_target_source, information))
+        join_edges = [
             Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
             for j in self.joins
-            if j.needed and not {j.link.i, j.link.j} <= replaced
+            if j.needed and not {j.link.i, j.link.j} <= refined_frames
         ]
-        closing = [
+        loop_edges = [
             Measured(c.record.i, c.record.j, c.T_i_j, c.information)
             for c in loops
             if c.T_i_j is not None and c.information is not None
         ]
-        return build_graph(ids, poses, [*sequence, *needed, *refined_edges], closing)
+        return build_graph(ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges)
 
     def measured(
         self,
@@ -118,24 +120,26 @@ class TrackedGraph:
         views: ViewStore[PreparedView],
         stated: Sequence[tuple[int, int]] = (),
     ) -> PoseGraph:
-        """Return a graph without edges and directions that are extrapolated motion only.
+        """Return a graph without edges and directions that rest on extrapolated motion alone.
 
         Parameters
         ----------
         graph
-            As built.
+            A graph from `build`.
         views
             Prepared views of frames.
         stated
             See `degenerate_directions`.
         """
-        own = {
+        tracked_pairs = {
             (e.step.reference, e.record.index)
             for e in self.posed
             if e.step is not None and e.step.reference is not None
         }
-        stored = {v.index: v for v in views.of(self.poses)}
-        directions = degenerate_directions(graph, self.unobservable, own, stored, frozenset(stated))
+        view_by_index = {v.index: v for v in views.of(self.poses)}
+        directions = degenerate_directions(
+            graph, self.unobservable, tracked_pairs, view_by_index, frozenset(stated)
+        )
         return without_degenerate(graph, directions, self.gaps)
 
     @property

@@ -1,1 +1,1 @@
-"""Poses and what was measured between them: loops, optimisers, g2o files."""
+"""Poses and measurements between them: loops, optimisers, g2o files."""

@@ -3,10 +3,10 @@
 The joint covariance of the poses covers noise and the errors that the patches of a view share.
 Three terms are added. The motion of the trajectory in the refinement measures the correlated errors
 of single registrations, and the remaining error is in proportion to it; if halves of the images
-show more than the covariance and this together, that takes their place. If poses are wrong, views
-far apart in time that see the same surface disagree by more than consecutive ones. And a loop that
+show more than the covariance and this together, they replace both. If poses are wrong, views far
+apart in time that observe the same surface disagree by more than consecutive ones. And a loop that
 another calibration would close, or views that agree better with it, show that this one bends the
-path. The factor for errors that show in none of these is derived in `docs/uncertainty.md`.
+path. The factor for errors that none of these reveals is derived in `docs/uncertainty.md`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, ali
 
 _LEVEL = 0.95
 # Evenly spaced poses that the rms is computed from, and the least certain ones in addition.
-_EVEN, _WORST = 50, 10
+_EVENLY_SPACED, _WORST = 50, 10
 # Standard deviations of an unmeasured direction, practically unbounded: m and rad.
-_OPEN = np.array([30.0] * 3 + [10.0] * 3)
+_UNMEASURED_SIGMA = np.array([30.0] * 3 + [10.0] * 3)
 # In a large model, errors of this fraction of its diagonal count as unbounded.
 _UNMEASURED_FRACTION = 0.05
 # Ratio of the total error to that in which views differ: errors of the sensor that all views of a
@@ -38,7 +38,7 @@ _UNMEASURED_FRACTION = 0.05
 UNOBSERVED_ERROR_FACTOR = 1.6
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
-_NONE = np.zeros((0, 6))
+_NO_DIRECTIONS = np.zeros((0, 6))
 # Number of pairs over degenerate frames that are aligned again, the shortest first: at the end of a
 # long one the camera came back, which a loop closure verifies.
 _MAX_SPANNING = 2000
@@ -90,7 +90,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ObservedErrors:
-    """Errors that the recording shows and the covariance does not include.
+    """Errors that the recording reveals and the covariance does not include.
 
     Attributes
     ----------
@@ -113,20 +113,20 @@ class ObservedErrors:
     split_m: float = 0.0
     split_rad: float = 0.0
 
-    def beyond(self, stated: _Stated | None) -> Float64:
+    def beyond(self, by_covariance: _CovarianceErrors | None) -> Float64:
         """Return the combined errors (2,) in m and rad that are missing in the covariance.
 
         Parameters
         ----------
-        stated
+        by_covariance
             Errors by the covariance; None if it bounds nothing.
         """
         correlated = np.array([self.moved_m, self.moved_rad])
-        if stated is not None:
+        if by_covariance is not None:
             # As likely to be exceeded as the bounds are.
-            quantile = stated.bounds / np.maximum(stated.rms, 1e-12)
+            quantile = by_covariance.bounds / np.maximum(by_covariance.rms, 1e-12)
             split = np.array([self.split_m, self.split_rad]) * quantile
-            missing = np.sqrt(np.maximum(split**2 - stated.bounds**2, 0.0))
+            missing = np.sqrt(np.maximum(split**2 - by_covariance.bounds**2, 0.0))
             correlated = np.maximum(correlated, missing)
         excess = np.array([self.excess_m, 0.0])
         calibration = np.array([self.calibration_m, self.calibration_rad])
@@ -134,13 +134,13 @@ class ObservedErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stated:
+class _CovarianceErrors:
     """Errors by the covariance alone, in m and rad.
 
     Attributes
     ----------
     positions
-        (m,) positions of the poses that were looked at.
+        (m,) positions of the evaluated poses.
     bounds, rms
         (2,) 95 % bounds on the rms errors of all poses, and expected rms.
     single
@@ -153,28 +153,30 @@ class _Stated:
     single: Float64
 
     @classmethod
-    def by(cls, covariances: GraphCovariances, more: Intp | None = None) -> _Stated | None:
-        """Look at evenly spaced poses and `more`; None if the graph does not constrain all poses.
+    def of_graph(
+        cls, covariances: GraphCovariances, extra: Intp | None = None
+    ) -> _CovarianceErrors | None:
+        """Evaluate evenly spaced poses and `extra`; None if the graph does not constrain all poses.
 
         The rms is that of the evenly spaced ones.
         """
         graph = covariances.graph
         n = len(graph.ids)
-        even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
-        positions = even if more is None else np.union1d(even, more)
+        evenly_spaced = np.unique(np.linspace(0, n - 1, min(n, _EVENLY_SPACED)).round().astype(int))
+        positions = evenly_spaced if extra is None else np.union1d(evenly_spaced, extra)
         C = covariances.joint(positions) if n > 1 else None
         if C is None:
             return None
-        chosen = np.isin(positions, even)
-        found = [_bounds(part, chosen) for part in _aligned(C, graph.poses[positions], chosen)]
-        bounds, rms, single = zip(*found, strict=True)
+        is_even = np.isin(positions, evenly_spaced)
+        results = [_bounds(part, is_even) for part in _aligned(C, graph.poses[positions], is_even)]
+        bounds, rms, single = zip(*results, strict=True)
         return cls(positions, np.array(bounds), np.array(rms), np.stack(single, 1))
 
 
 def degenerate_directions(
     graph: PoseGraph,
     unobservable: Mapping[int, Float64],
-    own: Collection[tuple[int, int]],
+    tracked: Collection[tuple[int, int]],
     views: Mapping[int, PosedView[PreparedView]],
     stated: Collection[tuple[int, int]] = (),
 ) -> list[Float64]:
@@ -190,7 +192,7 @@ def degenerate_directions(
         After refinement.
     unobservable
         (k, 6) degenerate directions of frames, by their index: right perturbations, m and rad.
-    own
+    tracked
         Pairs (i, j) that are the registrations of j in tracking.
     views
         Prepared views by frame index.
@@ -198,39 +200,39 @@ def degenerate_directions(
         Pairs (i, j) that do not come from the overlap of the two views: never degenerate.
     """
     degenerate = np.array(sorted(unobservable), np.intp)
-    out: list[Float64] = []
-    compared: list[int] = []  # edges to align again
+    result: list[Float64] = []
+    to_align: list[int] = []  # edges to align again
     spanning: list[tuple[int, int]] = []  # those over degenerate frames, and their length
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
         if (i, j) in stated:
-            out.append(_NONE)
+            result.append(_NO_DIRECTIONS)
             continue
         # A perturbation of i is the opposite one of j, by the adjoint.
-        there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
-        here = unobservable.get(j, _NONE)
-        known = np.concatenate([there, here])
-        if (i, j) in own:
-            known = known if len(here) else _NONE
+        of_i = unobservable.get(i, _NO_DIRECTIONS) @ se3.adjoint(se3.inverse(T_i_j)).T
+        of_j = unobservable.get(j, _NO_DIRECTIONS)
+        directions = np.concatenate([of_i, of_j])
+        if (i, j) in tracked:
+            directions = directions if len(of_j) else _NO_DIRECTIONS
         elif i in views and j in views:
-            if len(known):
-                compared.append(len(out))
+            if len(directions):
+                to_align.append(len(result))
             elif np.diff(np.searchsorted(degenerate, sorted((i, j)))).any():
-                spanning.append((abs(j - i), len(out)))
-        out.append(known)
-    compared += [k for _, k in sorted(spanning)[:_MAX_SPANNING]]
+                spanning.append((abs(j - i), len(result)))
+        result.append(directions)
+    to_align += [k for _, k in sorted(spanning)[:_MAX_SPANNING]]
 
     def work(start: int, stop: int) -> None:
-        for k in compared[start:stop]:
+        for k in to_align[start:stop]:
             i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
             target = [Target(i, np.eye(4))]
-            found = align(j, target, graph.measurements[k], _ALIGNMENT).unobservable * UNITS
+            realigned = align(j, target, graph.measurements[k], _ALIGNMENT).unobservable * UNITS
             # Directions are known to a few degrees only, and the remainder would look measured: a
             # degenerate pair is taken to be degenerate in all directions of its views.
-            out[k] = np.concatenate([found, out[k]]) if len(found) else _NONE
+            result[k] = np.concatenate([realigned, result[k]]) if len(realigned) else _NO_DIRECTIONS
 
-    run_chunks(work, len(compared), -(-len(compared) // 16))
-    return out
+    run_chunks(work, len(to_align), -(-len(to_align) // 16))
+    return result
 
 
 def without_degenerate(
@@ -255,26 +257,26 @@ def without_degenerate(
         Pairs of frames with only extrapolated motion between them.
     """
     information = graph.information.copy()
-    open_variance = np.diag((_OPEN / UNITS) ** 2)
-    for k, ((a, b), weak) in enumerate(zip(graph.edges, directions, strict=True)):
+    unmeasured_variance = np.diag((_UNMEASURED_SIGMA / UNITS) ** 2)
+    for k, ((a, b), degenerate) in enumerate(zip(graph.edges, directions, strict=True)):
         i, j = int(graph.ids[a]), int(graph.ids[b])
         if (i, j) in unmeasured or (j, i) in unmeasured:
-            information[k] = np.diag(_OPEN**-2.0)
+            information[k] = np.diag(_UNMEASURED_SIGMA**-2.0)
             continue
-        if not len(weak):
+        if not len(degenerate):
             continue
-        u = span(weak, _DISTINCT)
+        basis = span(degenerate, _DISTINCT)
         H = information[k] * np.outer(UNITS, UNITS)
-        scaled = H - H @ u @ np.linalg.pinv(u.T @ H @ u, hermitian=True) @ u.T @ H
-        free = u @ np.linalg.inv(u.T @ open_variance @ u) @ u.T
-        measured = scaled + free
+        scaled = H - H @ basis @ np.linalg.pinv(basis.T @ H @ basis, hermitian=True) @ basis.T @ H
+        unbounded = basis @ np.linalg.inv(basis.T @ unmeasured_variance @ basis) @ basis.T
+        measured = scaled + unbounded
         measured = np.linalg.solve(np.eye(6) + _LEAK**2 * measured, measured)
         information[k] = 0.5 * (measured + measured.T) / np.outer(UNITS, UNITS)
     return replace(graph, information=information)
 
 
 def accuracy_of(
-    covariances: GraphCovariances, shown: ObservedErrors, diagonal_m: float
+    covariances: GraphCovariances, observed: ObservedErrors, diagonal_m: float
 ) -> Accuracy:
     """Return the bounds on the errors of the poses of a graph.
 
@@ -283,78 +285,86 @@ def accuracy_of(
     covariances
         Of a graph after refinement; its information is that of measurements alone, see
         `without_degenerate`.
-    shown
-        Further errors that the recording shows.
+    observed
+        Further errors that the recording reveals.
     diagonal_m
         Of the model, m.
     """
     graph = covariances.graph
     if len(graph.ids) < 2:
         return Accuracy()
-    least_m, least_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
-    limits = np.array([max(least_m, _UNMEASURED_FRACTION * diagonal_m), least_rad])
-    single, unbounded = _single(covariances, limits)
-    free = tuple(graph.ids[unbounded.any(1)].tolist())
-    size = np.nan_to_num(np.trace(single[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
-    stated = _Stated.by(covariances, np.argsort(-size, kind="stable")[:_WORST])
-    if stated is None:
-        first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
-        return Accuracy(assessed=True, worst=first, unbounded=free)
-    extra = shown.beyond(stated)
-    of_all = UNOBSERVED_ERROR_FACTOR * np.hypot(stated.bounds, extra)
-    of_each = UNOBSERVED_ERROR_FACTOR * np.hypot(stated.single, extra)
-    of_each = np.where(unbounded[stated.positions], np.inf, of_each)
-    worst = int(np.argmax((of_each / limits).max(1)))
-    position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
+    prior_m, prior_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
+    limits = np.array([max(prior_m, _UNMEASURED_FRACTION * diagonal_m), prior_rad])
+    pose_covariances, unbounded = _pose_covariances(covariances, limits)
+    unbounded_frames = tuple(graph.ids[unbounded.any(1)].tolist())
+    variance = np.nan_to_num(np.trace(pose_covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
+    by_covariance = _CovarianceErrors.of_graph(
+        covariances, np.argsort(-variance, kind="stable")[:_WORST]
+    )
+    if by_covariance is None:
+        worst_frame = WorstFrame(
+            unbounded_frames[0] if unbounded_frames else int(graph.ids[-1]), np.inf, np.inf
+        )
+        return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
+    extra = observed.beyond(by_covariance)
+    rms_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.bounds, extra)
+    pose_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.single, extra)
+    pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
+    worst_row = int(np.argmax((pose_bounds / limits).max(1)))
+    position, rotation = np.where(unbounded.any(0), np.inf, rms_bounds).tolist()
     return Accuracy(
         position,
         rotation,
         position / diagonal_m if diagonal_m > 0 else np.inf,
         True,
-        WorstFrame(int(graph.ids[stated.positions[worst]]), *of_each[worst].tolist()),
-        free,
+        WorstFrame(
+            int(graph.ids[by_covariance.positions[worst_row]]), *pose_bounds[worst_row].tolist()
+        ),
+        unbounded_frames,
     )
 
 
-def covariances_of(covariances: GraphCovariances, shown: ObservedErrors) -> Float64:
+def covariances_of(covariances: GraphCovariances, observed: ObservedErrors) -> Float64:
     """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
 
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
     metres.
     """
-    more = np.repeat(shown.beyond(_Stated.by(covariances)) ** 2 / 3, 3)
+    extra_variance = np.repeat(observed.beyond(_CovarianceErrors.of_graph(covariances)) ** 2 / 3, 3)
     C = covariances.of_poses.copy()
-    C[1:] += np.diag(more)
+    C[1:] += np.diag(extra_variance)
     return UNOBSERVED_ERROR_FACTOR**2 * C
 
 
-def _single(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:
+def _pose_covariances(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:
     """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
     Relative to the first one, or to another if the first is one of few unbounded ones.
     """
-    first = covariances.of_poses
-    unbounded = _is_unbounded(first, limits)
+    to_first = covariances.of_poses
+    unbounded = _is_unbounded(to_first, limits)
     if 2 * unbounded.any(1).sum() > len(unbounded):
-        many = np.flatnonzero(unbounded.any(1))
-        other = GraphCovariances(covariances.graph, int(many[len(many) // 2])).of_poses
-        others = _is_unbounded(other, limits)
-        if others.any(1).sum() < unbounded.any(1).sum():
-            return other, others
-    return first, unbounded
+        unbounded_rows = np.flatnonzero(unbounded.any(1))
+        to_other = GraphCovariances(
+            covariances.graph, int(unbounded_rows[len(unbounded_rows) // 2])
+        ).of_poses
+        other_unbounded = _is_unbounded(to_other, limits)
+        if other_unbounded.any(1).sum() < unbounded.any(1).sum():
+            return to_other, other_unbounded
+    return to_first, unbounded
 
 
 def _is_unbounded(covariances: Float64, limits: Float64) -> Bool:
     """(N, 2) whether the largest sigma of position or rotation exceeds the limits."""
-    known = np.isfinite(covariances).all((1, 2))
+    finite = np.isfinite(covariances).all((1, 2))
     out = np.ones((len(covariances), 2), np.bool_)
-    C = covariances[known]
+    C = covariances[finite]
     for k, part in enumerate((C[:, :3, :3], C[:, 3:, 3:])):
-        out[known, k] = np.linalg.eigvalsh(part)[:, -1] > limits[k] ** 2
+        out[finite, k] = np.linalg.eigvalsh(part)[:, -1] > limits[k] ** 2
     return out
 
 
-def _aligned(C: Float64, poses: Float64, rms: Bool) -> tuple[Float64, Float64]:
+def _aligned(C: Float64, poses: Float64, chosen: Bool) -> tuple[Float64, Float64]:
     """Covariances (3m, 3m) of positions and rotations in the world, less a rigid motion of all.
 
     Parameters
@@ -363,7 +373,7 @@ def _aligned(C: Float64, poses: Float64, rms: Bool) -> tuple[Float64, Float64]:
         (6m, 6m) of right perturbations.
     poses
         (m, 4, 4).
-    rms
+    chosen
         (m,) poses that are aligned.
     """
     m = len(poses)
@@ -373,29 +383,29 @@ def _aligned(C: Float64, poses: Float64, rms: Bool) -> tuple[Float64, Float64]:
         np.einsum("iab,ibjc,jdc->iajd", R, C[:, part, :, part], R, optimize=True).reshape(3 * m, -1)
         for part in (np.s_[:3], np.s_[3:])
     )
-    turn = np.tile(np.eye(3), (m, 1, 1))
-    motion = np.concatenate([turn, -se3.hat(p - p[rms].mean(0))], 2)
-    return _without(positions, motion, rms), _without(rotations, turn, rms)
+    rotation = np.tile(np.eye(3), (m, 1, 1))
+    motion = np.concatenate([rotation, -se3.hat(p - p[chosen].mean(0))], 2)
+    return _remove_motion(positions, motion, chosen), _remove_motion(rotations, rotation, chosen)
 
 
-def _without(C: Float64, motion: Float64, rms: Bool) -> Float64:
+def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
     """Covariance (3m, 3m) after the best fit of motions (m, 3, k) of the chosen ones is removed."""
     k = motion.shape[2]
     flat = motion.reshape(-1, k)
-    chosen = np.where(np.repeat(rms, 3)[:, None], flat, 0.0)
-    left = np.eye(len(flat)) - flat @ np.linalg.pinv(chosen, rcond=1e-9)
-    return np.asarray(left @ C @ left.T, np.float64)
+    chosen_motion = np.where(np.repeat(chosen, 3)[:, None], flat, 0.0)
+    projector = np.eye(len(flat)) - flat @ np.linalg.pinv(chosen_motion, rcond=1e-9)
+    return np.asarray(projector @ C @ projector.T, np.float64)
 
 
-def _bounds(C: Float64, rms: Bool) -> tuple[float, float, Float64]:
+def _bounds(C: Float64, chosen: Bool) -> tuple[float, float, Float64]:
     """95 % bound of the rms over the chosen ones, its expectation, and bounds of each (m,)."""
-    m, count = len(rms), int(rms.sum())
-    chosen = np.repeat(rms, 3)
-    own = C[np.ix_(chosen, chosen)]
+    m, count = len(chosen), int(chosen.sum())
+    rows = np.repeat(chosen, 3)
+    C_chosen = C[np.ix_(rows, rows)]
     blocks = C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
     return (
-        float(np.sqrt(_quantile(own) / count)),
-        float(np.sqrt(np.trace(own) / count)),
+        float(np.sqrt(_quantile(C_chosen) / count)),
+        float(np.sqrt(np.trace(C_chosen) / count)),
         np.sqrt([_quantile(block) for block in blocks]),
     )
 

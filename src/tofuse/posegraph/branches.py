@@ -48,7 +48,7 @@ class Branches:
         (N,) mask of vertices that belong to no branch. Those with gravity or anchors don't either,
         and loop edges are in no branch.
     eigenvalues
-        (M, 6) of the information of the edges, ascending, if they are known.
+        (M, 6) of the information of the edges, ascending; computed unless given.
 
     Attributes
     ----------
@@ -73,17 +73,17 @@ class Branches:
         self._levels: list[Level] = []
         degree = np.bincount(graph.edges.ravel(), minlength=len(graph.ids))
         for _ in range(_LEVELS):
-            end = (degree == 1) & ~kept
-            left = np.flatnonzero(rigid & ~self.edges & end[graph.edges].any(1))
-            if not len(left):
+            is_leaf = (degree == 1) & ~kept
+            leaf_edges = np.flatnonzero(rigid & ~self.edges & is_leaf[graph.edges].any(1))
+            if not len(leaf_edges):
                 break
-            i, j = graph.edges[left].T
+            i, j = graph.edges[leaf_edges].T
             # Of two ends that only join each other, the later one is removed.
-            of_j = end[j]
-            level = Level(left, np.where(of_j, j, i), np.where(of_j, i, j))
+            is_leaf_j = is_leaf[j]
+            level = Level(leaf_edges, np.where(is_leaf_j, j, i), np.where(is_leaf_j, i, j))
             self._levels.append(level)
-            self.edges[left], self.vertices[level.vertices] = True, True
-            degree -= np.bincount(graph.edges[left].ravel(), minlength=len(degree))
+            self.edges[leaf_edges], self.vertices[level.vertices] = True, True
+            degree -= np.bincount(graph.edges[leaf_edges].ravel(), minlength=len(degree))
 
         e = graph.residuals()[self.edges]
         chi2 = np.einsum("mi,mij,mj->m", e, graph.information[self.edges], e)
@@ -100,10 +100,10 @@ class Branches:
         for edges, vertices, parents in reversed(self._levels):
             A = se3.adjoint(se3.inverse(graph.poses[vertices]) @ graph.poses[parents])
             At = np.swapaxes(A, 1, 2)
-            of_edge = np.linalg.inv(graph.information[edges])
+            C_edge = np.linalg.inv(graph.information[edges])
             forwards = graph.edges[edges, 1] == vertices
-            of_edge = np.where(forwards[:, None, None], of_edge, A @ of_edge @ At)
-            covariances[vertices] = A @ covariances[parents] @ At + of_edge
+            C_edge = np.where(forwards[:, None, None], C_edge, A @ C_edge @ At)
+            covariances[vertices] = A @ covariances[parents] @ At + C_edge
 
     def attach(self, poses: Float64, moved: Bool) -> None:
         """Replace poses (N, 4, 4) of branches by those without error, where `moved` (N,)."""

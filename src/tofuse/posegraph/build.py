@@ -29,7 +29,7 @@ def build_graph(
     sequence: Sequence[Measured],
     loops: Sequence[Measured] = (),
 ) -> PoseGraph:
-    """Make the graph of posed frames and of the measurements between them.
+    """Build the graph of posed frames and of the measurements between them.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def build_graph(
 
 
 def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
-    """Make the graph of a sequence of n - 1 consecutive motions T_(k-1)_k, and loops.
+    """Build the graph of a sequence of n - 1 consecutive motions T_(k-1)_k, and loops.
 
     The poses are the products of the motions; ids count from 0, and the information of the
     sequence is the identity.

@@ -1,9 +1,9 @@
 """Self-calibration check: whether all views together indicate an error of the camera.
 
-A wrong focal length or a depth offset bends the trajectory, and no single registration shows it.
-But where views overlap, and most of all where a path closes a loop, their residuals can't all be
-small. So each error is estimated by itself, with all poses free to follow. An error that lets the
-views agree better is a proposal. It is an alarm if it exceeds the calibration error of usual
+A wrong focal length or a depth offset bends the trajectory, and no single registration reveals it.
+But where views overlap, and above all where a path closes a loop, their residuals can't all be
+small. So each error is estimated separately, with all poses free. An error that makes the views
+more consistent is a proposal. It is an alarm if it exceeds the calibration error of usual
 cameras, and if it closes a loop that pairwise alignments of neighbours leave open.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
@@ -37,30 +37,30 @@ from tofuse.posegraph.view_store import SampledView
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
 TOLERANCES = {"focal": 0.01, "offset": 0.01}
-# Significance of an error in standard deviations, for an alarm and for a closer look; and the
-# fraction of the tolerance that one Newton step must show for the latter.
+# Significance of an error in standard deviations, for an alarm and for a full estimate; and the
+# fraction of the tolerance that one Newton step must reach for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
 # A loop is closed if its error is below this, m and rad.
-_CLOSED = (0.01, np.radians(0.5))
+_MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
 # Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
 _MAX_SIGMA = 0.8
-# Change of the views' support that the choice of points alone explains.
-_CHANCE = 0.003
+# Change of the views' support that the sampling of points alone explains.
+_SUPPORT_NOISE = 0.003
 # Secant steps to the error that closes a loop: their maximum number; the first one, relative to the
 # tolerance; and the change at convergence, and an implausible error, relative to the first one.
-_SECANTS, _FIRST_STEP, _CONVERGED, _IMPLAUSIBLE = 4, 2.0, 0.05, 10.0
-# An error that only the drift over the loop shows must exceed the tolerance by this factor; and the
-# fraction of it that the views must confirm: they may measure another one.
-_BY_LOOP, _KEPT = 2.0, 0.5
-# The spread between views is not known from fewer.
+_MAX_SECANT_STEPS, _FIRST_STEP, _CONVERGENCE, _IMPLAUSIBLE = 4, 2.0, 0.05, 10.0
+# An error that only the drift over the loop reveals must exceed the tolerance by this factor; and
+# the fraction of it that the views must confirm, as they may measure another one.
+_LOOP_FACTOR, _MIN_CONFIRMED = 2.0, 0.5
+# Minimum number of views from which their spread is estimated.
 _MIN_VIEWS = 8
-_SMALL = 1e-3  # error of the camera, to differentiate by
-_NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
-# The solution may be far from the start.
+_DELTA = 1e-3  # error of the camera for numerical differentiation
+_INDEX = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
+# The solution may be far from the initial poses.
 _ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
-# This many pairs determine errors that all views share; of more, about as many, with every n-th
-# point, are used.
-_ENOUGH_PAIRS, _EVERY = 500, 3
+# This many pairs determine errors that all views share; larger sets are subsampled to about as
+# many, with every n-th point.
+_MAX_PAIRS, _POINT_STRIDE = 500, 3
 
 
 @dataclass(frozen=True)
@@ -92,31 +92,31 @@ class Gap:
         """Whether the estimated errors explain it: one part is halved, the other is not larger.
 
         Or points at the views' depth move by less than half the distance. A gap of less than a
-        centimetre and half a degree has no significance, as not every error bends every path.
+        centimetre and half a degree is not significant, as not every error bends every path.
         """
-        seen = self._apparent_m(*self.before)
-        least = self._apparent_m(*_CLOSED)
-        if self.depth and self.remaining_m < 0.5 * seen and seen > least:
+        apparent = self._apparent_m(*self.before)
+        limit = self._apparent_m(*_MAX_CLOSURE_ERROR)
+        if self.depth and self.remaining_m < 0.5 * apparent and apparent > limit:
             return True
-        parts = list(zip(self.before, self.after, _CLOSED, strict=True))
-        if any(b > max(a, least) for a, b, least in parts):
+        parts = list(zip(self.before, self.after, _MAX_CLOSURE_ERROR, strict=True))
+        if any(b > max(a, limit) for a, b, limit in parts):
             return False
-        return all(a < least for a, _, least in parts) or any(b < 0.5 * a for a, b, _ in parts)
+        return all(a < limit for a, _, limit in parts) or any(b < 0.5 * a for a, b, _ in parts)
 
     @property
     def significant(self) -> bool:
         """Whether it is more than noise."""
-        return any(a >= least for a, least in zip(self.before, _CLOSED, strict=True))
+        return any(a >= limit for a, limit in zip(self.before, _MAX_CLOSURE_ERROR, strict=True))
 
     @property
     def contradicts(self) -> bool:
         """Whether the estimated errors change it much without closing it, or widen it.
 
-        Errors of the camera hardly change the gap of a short loop, which shows nothing of them.
+        Errors of the camera hardly change the gap of a short loop, which does not reveal them.
         """
         before = self._apparent_m(*self.before)
         changes = self._apparent_m(*self.change) > 0.5 * before
-        widens = self.remaining_m > before + self._apparent_m(*_CLOSED)
+        widens = self.remaining_m > before + self._apparent_m(*_MAX_CLOSURE_ERROR)
         return self.significant and not self.closes and (changes or widens)
 
 
@@ -129,7 +129,7 @@ class CalibrationCheck:
     alarm
         Whether the camera's calibration should be checked.
     errors, sigmas
-        Estimates of each error by itself, as in `Refinement.errors`, and their standard deviations
+        Separate estimates of each error, as in `Refinement.errors`, and their standard deviations
         from the spread between views. They are proposals and change nothing. Only significant
         ones; in case of an alarm, all that the views determine.
     support
@@ -185,7 +185,7 @@ class CalibrationCheck:
     @property
     def improves(self) -> bool:
         """Whether the views agree better with the error `best`, not by chance."""
-        return self.support is not None and self.support[1] - self.support[0] > _CHANCE
+        return self.support is not None and self.support[1] - self.support[0] > _SUPPORT_NOISE
 
     @property
     def large(self) -> dict[str, float]:
@@ -219,89 +219,103 @@ def check_calibration(
         return CalibrationCheck()
     sensitivity = response(views, poses, pairs, options, priors=priors)
     estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
-    determined = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
-    motion = {name: _motion(poses, sensitivity.motion[k]) for name, k in _NUMBERS.items()}
-    small = [np.array(motion[n]) * abs(float(estimate[_NUMBERS[n]])) for n in determined]
+    determined = [name for name, k in _INDEX.items() if _determined(name, sigma[k])]
+    motion = {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()}
+    motions = [np.array(motion[n]) * abs(float(estimate[_INDEX[n]])) for n in determined]
     without_error = CalibrationCheck(
         focal_sigma=float(sigma[kernels.FOCAL]),
         motion=motion,
-        moved=tuple(max(small, key=lambda m: m[0], default=np.zeros(2)).tolist()),
+        moved=tuple(max(motions, key=lambda m: m[0], default=np.zeros(2)).tolist()),
     )
     likely = [
         name
         for name in determined
-        if abs(estimate[_NUMBERS[name]])
-        > max(_LIKELY * sigma[_NUMBERS[name]], _MIN_FIRST_STEP * TOLERANCES[name])
+        if abs(estimate[_INDEX[name]])
+        > max(_LIKELY * sigma[_INDEX[name]], _MIN_FIRST_STEP * TOLERANCES[name])
     ]
-    sigmas = {name: float(sigma[_NUMBERS[name]]) for name in determined}
+    sigmas = {name: float(sigma[_INDEX[name]]) for name in determined}
     by_loop = partial(_check_by_loop, views, refined, sigmas, without_error, options)
     if not likely:
         return by_loop()
-    few, some = list(views), pairs
-    if len(pairs) > _ENOUGH_PAIRS:
-        few = [v.with_points(np.s_[::_EVERY]) for v in views]
-        some = spread_evenly(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
-    patient = replace(options, rounds=_ROUNDS)
+    sampled_views, sampled_pairs = list(views), pairs
+    if len(pairs) > _MAX_PAIRS:
+        sampled_views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
+        sampled_pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // len(pairs)))
+    coarse_to_fine = replace(options, rounds=_ROUNDS)
 
-    def estimated(name: str) -> Refined:
-        # The overlaps are known; the poses only follow.
-        number = [_NUMBERS[name]]
-        return refine(few, poses, patient, calibrate=number, priors=priors, pairs=some)
+    def refine_with(name: str) -> Refined:
+        # The overlaps are fixed; the poses are re-estimated.
+        error_index = [_INDEX[name]]
+        return refine(
+            sampled_views,
+            poses,
+            coarse_to_fine,
+            calibrate=error_index,
+            priors=priors,
+            pairs=sampled_pairs,
+        )
 
-    found = {name: estimated(name) for name in likely}
-    together = found[likely[0]].errors
-    if len(likely) > 1:  # one error resembles another: estimated together, the true one remains
-        numbers = [_NUMBERS[name] for name in likely]
-        together = align_views(
-            few, poses, patient, calibrate=numbers, priors=priors, pairs=some
+    estimates = {name: refine_with(name) for name in likely}
+    joint_errors = estimates[likely[0]].errors
+    if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
+        error_indices = [_INDEX[name] for name in likely]
+        joint_errors = align_views(
+            sampled_views,
+            poses,
+            coarse_to_fine,
+            calibrate=error_indices,
+            priors=priors,
+            pairs=sampled_pairs,
         ).errors
-    name_of_best = max(likely, key=lambda name: abs(together[_NUMBERS[name]]) / TOLERANCES[name])
-    best = found[name_of_best]
+    best_name = max(likely, key=lambda name: abs(joint_errors[_INDEX[name]]) / TOLERANCES[name])
+    best = estimates[best_name]
     large = any(
-        _large(name, one.errors[_NUMBERS[name]], sigma[_NUMBERS[name]])
-        for name, one in found.items()
+        _large(name, result.errors[_INDEX[name]], sigma[_INDEX[name]])
+        for name, result in estimates.items()
     )
-    number = _NUMBERS[name_of_best]
-    certain = abs(best.errors[number]) > _SIGNIFICANT * sigma[number]
-    improves = certain and _gain(best, views) > _CHANCE
+    best_index = _INDEX[best_name]
+    certain = abs(best.errors[best_index]) > _SIGNIFICANT * sigma[best_index]
+    improves = certain and _support_gain(best, views) > _SUPPORT_NOISE
     gap = None
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
     # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
     alarm = large and improves and gap is not None and gap.closes
     if alarm:  # alternative explanations
-        found |= {name: estimated(name) for name in determined if name not in found}
-    elif (closed := by_loop()).alarm:
-        return closed
+        estimates |= {name: refine_with(name) for name in determined if name not in estimates}
+    elif (loop_check := by_loop()).alarm:
+        return loop_check
     support = float(best.before.of_views(len(views)).mean())
     position, rotation = aligned_motion(poses, best.poses)
     return replace(
         without_error,
         alarm=alarm,
         errors={
-            name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found
+            name: float(estimates[name].errors[k])
+            for name, k in _INDEX.items()
+            if name in estimates
         },
-        sigmas={name: sigmas[name] for name in _NUMBERS if name in found},
-        support=(support, support + _gain(best, views)),
+        sigmas={name: sigmas[name] for name in _INDEX if name in estimates},
+        support=(support, support + _support_gain(best, views)),
         gap=gap,
-        best=name_of_best,
+        best=best_name,
         moved=(_rms(position), _rms(rotation)),
     )
 
 
-def of_submaps(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
+def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     """Combine the checks of the submaps of one recording.
 
-    They share the camera, so a true error shows in most of them. Of the alarms, that with the
+    They share the camera, so a true error is detected in most of them. Of the alarms, that with the
     median error is returned.
     """
     alarms = sorted((s for s in checks if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
     if 2 * len(alarms) > len(checks):
         return alarms[len(alarms) // 2]
-    quiet = [s for s in checks if not s.alarm]
-    # One submap that determines the camera speaks for all of them.
-    quiet.sort(key=lambda s: (s.gap is None, s.undetermined))
-    return quiet[0] if quiet else CalibrationCheck()
+    without_alarm = [s for s in checks if not s.alarm]
+    # One submap that determines the camera represents all of them.
+    without_alarm.sort(key=lambda s: (s.gap is None, s.undetermined))
+    return without_alarm[0] if without_alarm else CalibrationCheck()
 
 
 def _rms(vectors: Float64) -> float:
@@ -310,13 +324,13 @@ def _rms(vectors: Float64) -> float:
 
 def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
     """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
-    position, rotation = aligned_motion(poses, poses @ se3.exp(_SMALL * twists))
-    return _rms(position) / _SMALL, _rms(rotation) / _SMALL
+    position, rotation = aligned_motion(poses, poses @ se3.exp(_DELTA * twists))
+    return _rms(position) / _DELTA, _rms(rotation) / _DELTA
 
 
-def _gain(found: Refined, views: Sequence[SampledView]) -> float:
+def _support_gain(refined: Refined, views: Sequence[SampledView]) -> float:
     n = len(views)
-    return float(found.after.of_views(n).mean() - found.before.of_views(n).mean())
+    return float(refined.after.of_views(n).mean() - refined.before.of_views(n).mean())
 
 
 def loop_gap(
@@ -340,8 +354,8 @@ def loop_gap(
     loop = _Loop.longest(views, refined, options)
     if loop is None:
         return None
-    without = loop.miss(refined.poses, np.zeros(kernels.ERRORS))
-    return loop.gap(without, loop.miss(poses, errors))
+    without = loop.closure_error(refined.poses, np.zeros(kernels.ERRORS))
+    return loop.gap(without, loop.closure_error(poses, errors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,8 +380,8 @@ class _Loop:
         """Median depth of the two ends, m."""
         return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
 
-    def miss(self, poses: Float64, errors: Float64) -> Float64:
-        """Return the motion (4, 4) by which chained pairwise alignments miss the end of the loop.
+    def closure_error(self, poses: Float64, errors: Float64) -> Float64:
+        """Return the motion (4, 4) by which chained pairwise alignments fail to close the loop.
 
         Parameters
         ----------
@@ -376,10 +390,10 @@ class _Loop:
         errors
             (ERRORS,) assumed errors of the camera.
         """
-        return self.chained(poses, errors)[0]
+        return self.align_chain(poses, errors)[0]
 
-    def chained(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
-        """Return `miss`, and the poses (j - i + 1, 4, 4) of the chain relative to its first."""
+    def align_chain(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
+        """Return `closure_error`, and the chain's poses (j - i + 1, 4, 4) relative to its first."""
         i, j = self.i, self.j
         chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
         pairs = np.concatenate([chain, [[i, j]]])
@@ -390,68 +404,71 @@ class _Loop:
             chained.append(chained[-1] @ step)
         return np.asarray(se3.inverse(T[-1]) @ chained[-1], np.float64), np.array(chained)
 
-    def kept_by_views(self, poses: Float64, number: int, error: float) -> float:
+    def error_by_views(self, poses: Float64, error_index: int, error: float) -> float:
         """Return an error of the camera as all views of the loop estimate it, starting from one.
 
-        They keep a true error, also if their residuals at a wrong one are small. One that only
-        closes the gap is far from what they measure.
+        A true error is confirmed, even if residuals at a wrong one are small. An error that only
+        closes the gap differs from the one that the views measure.
 
         Parameters
         ----------
         poses
-            As for `miss`.
-        number, error
-            Which error, and its initial value.
+            As for `closure_error`.
+        error_index, error
+            Index of the error, and its initial value.
         """
         errors = np.zeros(kernels.ERRORS)
-        errors[number] = error
-        start = self.chained(poses, errors)[1]
+        errors[error_index] = error
+        chain = self.align_chain(poses, errors)[1]
         options = replace(self.options, rounds=_ROUNDS)
         views = self.views[self.i : self.j + 1]
-        kept = align_views(views, start, options, calibrate=[number], errors=errors)
-        return float(kept.errors[number])
+        aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
+        return float(aligned.errors[error_index])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
-        """Return the gap, given `miss` without and with errors of the camera."""
+        """Return the gap, given `closure_error` without and with errors of the camera."""
         first, last = (self.views[k].index for k in (self.i, self.j))
         change = se3.inverse(before) @ after
-        return Gap(first, last, _size(before), _size(after), self.depth, _size(change))
+        return Gap(first, last, _norms(before), _norms(after), self.depth, _norms(change))
 
     def closing_error(
-        self, poses: Float64, uncorrected: Float64, number: int, step: float
+        self, poses: Float64, uncorrected: Float64, error_index: int, step: float
     ) -> tuple[float, Float64]:
-        """Return the error of the camera that closes the loop best, and `miss` with it.
+        """Return the error of the camera that closes the loop best, and `closure_error` with it.
 
         Gauss-Newton on the gap at the views' depth, with derivatives by secants.
 
         Parameters
         ----------
         poses
-            As for `miss`.
+            As for `closure_error`.
         uncorrected
-            (4, 4) `miss` without errors of the camera.
-        number
-            Which error.
+            (4, 4) `closure_error` without errors of the camera.
+        error_index
+            Index of the error.
         step
-            First difference.
+            First secant step.
         """
-        unit = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
+        scale = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
         errors = np.zeros(kernels.ERRORS)
-        before, residual = 0.0, se3.log(uncorrected) * unit
+        previous_error, residual = 0.0, se3.log(uncorrected) * scale
         error = step
-        for _ in range(_SECANTS):
-            errors[number] = error
-            miss = self.miss(poses, errors)
-            last, residual = residual, se3.log(miss) * unit
-            slope = (residual - last) / (error - before)
-            before = error
+        for _ in range(_MAX_SECANT_STEPS):
+            errors[error_index] = error
+            closure = self.closure_error(poses, errors)
+            previous_residual, residual = residual, se3.log(closure) * scale
+            slope = (residual - previous_residual) / (error - previous_error)
+            previous_error = error
             error -= float(slope @ residual) / max(float(slope @ slope), 1e-12)
-            if abs(error - before) < _CONVERGED * step or abs(error) > _IMPLAUSIBLE * step:
+            if (
+                abs(error - previous_error) < _CONVERGENCE * step
+                or abs(error) > _IMPLAUSIBLE * step
+            ):
                 break
-        return before, miss
+        return previous_error, closure
 
 
-def _size(T: Float64) -> tuple[float, float]:
+def _norms(T: Float64) -> tuple[float, float]:
     return float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
 
 
@@ -459,15 +476,15 @@ def _check_by_loop(
     views: Sequence[SampledView],
     refined: Refined,
     sigmas: Mapping[str, float],
-    none: CalibrationCheck,
+    without_error: CalibrationCheck,
     options: RefineOptions,
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from the drift over the longest loop alone.
 
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
-    residuals show nothing. Pairwise alignments from the poses before it don't depend on it. But any
-    drift leaves a gap that some error of the camera nearly closes: the views must keep the error,
-    and not find another one.
+    residuals reveal nothing. Pairwise alignments from the poses before it don't depend on it. But
+    any drift leaves a gap that some error of the camera nearly closes: the views must confirm the
+    error.
 
     Parameters
     ----------
@@ -475,35 +492,38 @@ def _check_by_loop(
         As for `check_calibration`.
     sigmas
         Standard deviations of the errors that the views determine.
-    none
+    without_error
         The result if there is no error.
     """
     loop = _Loop.longest(views, refined, options)
     if loop is None:
-        return none
+        return without_error
     poses = refined.start
-    uncorrected = loop.miss(poses, np.zeros(kernels.ERRORS))
+    uncorrected = loop.closure_error(poses, np.zeros(kernels.ERRORS))
     if not loop.gap(uncorrected, uncorrected).significant:
-        return none
-    found: dict[str, tuple[float, Gap]] = {}
+        return without_error
+    candidates: dict[str, tuple[float, Gap]] = {}
     for name in sigmas:
         step = _FIRST_STEP * TOLERANCES[name]
-        error, corrected = loop.closing_error(poses, uncorrected, _NUMBERS[name], step)
+        error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
-        if not (gap.closes and _large(name, error, sigmas[name], _BY_LOOP)):
+        if not (gap.closes and _large(name, error, sigmas[name], _LOOP_FACTOR)):
             continue
-        kept = loop.kept_by_views(poses, _NUMBERS[name], error)
-        if _large(name, kept, sigmas[name], _BY_LOOP) and kept / error > _KEPT:
-            found[name] = error, gap
-    if not found:
-        return none
-    best = min(found, key=lambda name: found[name][1].remaining_m)
+        confirmed = loop.error_by_views(poses, _INDEX[name], error)
+        if (
+            _large(name, confirmed, sigmas[name], _LOOP_FACTOR)
+            and confirmed / error > _MIN_CONFIRMED
+        ):
+            candidates[name] = error, gap
+    if not candidates:
+        return without_error
+    best = min(candidates, key=lambda name: candidates[name][1].remaining_m)
     return replace(
-        none,
+        without_error,
         alarm=True,
-        errors={name: error for name, (error, _) in found.items()},
-        sigmas={name: sigmas[name] for name in found},
-        gap=found[best][1],
+        errors={name: error for name, (error, _) in candidates.items()},
+        sigmas={name: sigmas[name] for name in candidates},
+        gap=candidates[best][1],
         best=best,
     )
 
@@ -512,14 +532,14 @@ def longest_loop(pairs: Intp) -> tuple[int, int] | None:
     """The pair (i, j) furthest apart in time between which all consecutive views overlap."""
     if not len(pairs):
         return None
-    joined = np.zeros(int(pairs.max()) + 1, bool)
-    joined[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
-    broken = np.concatenate([[0], np.cumsum(~joined)])
+    overlapping = np.zeros(int(pairs.max()) + 1, bool)
+    overlapping[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
+    breaks = np.concatenate([[0], np.cumsum(~overlapping)])
     i, j = pairs.T
-    whole = (broken[j] == broken[i]) & (j > i + 1)
-    if not whole.any():
+    unbroken = (breaks[j] == breaks[i]) & (j > i + 1)
+    if not unbroken.any():
         return None
-    k = int(np.argmax(np.where(whole, j - i, -1)))
+    k = int(np.argmax(np.where(unbroken, j - i, -1)))
     return int(i[k]), int(j[k])
 
 

@@ -44,7 +44,7 @@ class Response:
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
 
-    def sigma(self, pairs: Intp, views: int) -> Float64:
+    def sigma(self, pairs: Intp, view_count: int) -> Float64:
         """(ERRORS,) standard deviations, from the spread between views (sandwich estimator).
 
         It includes noise that neighbouring pixels share and errors of single views, but not errors
@@ -54,14 +54,14 @@ class Response:
         ----------
         pairs
             (M, 2) positions of the views.
-        views
+        view_count
             Number of views.
         """
-        left = self.gradient + self.information * self.estimate()
-        of_view = np.zeros((views, left.shape[1]))
+        residual_gradient = self.gradient + self.information * self.estimate()
+        view_gradient = np.zeros((view_count, residual_gradient.shape[1]))
         for ends in pairs.T:
-            np.add.at(of_view, ends, left)
-        spread = np.sqrt((of_view**2).sum(0))
+            np.add.at(view_gradient, ends, residual_gradient)
+        spread = np.sqrt((view_gradient**2).sum(0))
         return np.asarray(spread / np.maximum(self.information.sum(0), 1e-12), np.float64)
 
 
@@ -103,23 +103,23 @@ def response(
         Measurements by other sensors.
     """
     priors = priors or Priors.none()
-    none, asked = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
+    zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
     stage = options.rounds[-1]
     state = directed_pairs(views, pairs, options)
     system = priors.system(len(views), np.stack([state.target, state.source], 1))
-    evaluate(views, poses, none, np.ones_like(asked), state, stage, options)
+    evaluate(views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options)
     without_exposure(state)
     rescale(state, stage)
-    evaluate(views, poses, none, asked, state, stage, options)
+    evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
     H, g = without_exposure(state)
-    m = len(priors.pairs)
+    prior_count = len(priors.pairs)
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
-    more_H, more_g = priors.equations(T_i_j[len(H) :])
+    prior_H, prior_g = priors.equations(T_i_j[len(H) :])
     n = len(poses)
     matrix, gradient = system.relative(
-        np.concatenate([H[:, :6, :6], more_H]),
-        np.concatenate([g[:, :6], more_g]),
+        np.concatenate([H[:, :6, :6], prior_H]),
+        np.concatenate([g[:, :6], prior_g]),
         T_i_j,
         weak_prior(n),
     )
@@ -130,22 +130,24 @@ def response(
     def relative(step: Float64) -> Float64:
         return step[state.source] - (A @ step[state.target][..., None])[..., 0]
 
-    start = factor.step()
-    assert start is not None, "the system is finite"
-    rest = relative(start)
-    slope = g[:, :6] + (H[:, :6, :6] @ rest[..., None])[..., 0]
+    initial_step = factor.step()
+    assert initial_step is not None, "the system is finite"
+    initial_motion = relative(initial_step)
+    slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
     first, second = np.empty((len(H), kernels.ERRORS)), np.empty((len(H), kernels.ERRORS))
     motion = np.empty((kernels.ERRORS, n, 6))
     for k in range(kernels.ERRORS):
         mixed = H[:, :6, 6 + k]
-        column = system.gradient(np.concatenate([mixed, np.zeros((m, 6))]), T_i_j)
-        by_error = factor.solve(column)
-        assert by_error is not None, "the system is finite"
-        motion[k] = by_error
-        follow = relative(motion[k])
-        first[:, k] = g[:, 6 + k] + (mixed * rest).sum(1) + (slope * follow).sum(1)
-        second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * follow).sum(1)
-        second[:, k] += np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
+        column = system.gradient(np.concatenate([mixed, np.zeros((prior_count, 6))]), T_i_j)
+        follow = factor.solve(column)
+        assert follow is not None, "the system is finite"
+        motion[k] = follow
+        relative_motion = relative(motion[k])
+        first[:, k] = (
+            g[:, 6 + k] + (mixed * initial_motion).sum(1) + (slope * relative_motion).sum(1)
+        )
+        second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * relative_motion).sum(1)
+        second[:, k] += np.einsum("mi,mij,mj->m", relative_motion, H[:, :6, :6], relative_motion)
     second *= _robust_curvature(options.robust)
     half = len(pairs)
     return Response(first[:half] + first[half:], second[:half] + second[half:], motion)

@@ -215,9 +215,9 @@ class _Step:
             q_new, t_new = q.copy(), t.copy()
             d = x.reshape(-1, 6)
             half = np.concatenate([d[:, 3:] / 2, np.ones((len(d), 1))], axis=1)
-            turned = quaternion.multiply(half, q[self.free])
+            rotated = quaternion.multiply(half, q[self.free])
             # Normalised after every step: the constraint |q| = 1.
-            q_new[self.free] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+            q_new[self.free] = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
             t_new[self.free] += d[:, :3]
             value_new = self.problem.objective(q_new, t_new)
             if value_new < value:
@@ -238,24 +238,24 @@ def normal_equations(
     number = np.cumsum(free) - 1
     size = 6 * int(free.sum())
     i, j = edges.T
-    rows, cols, keep = [], [], []
+    rows, cols, masks = [], [], []
     for a, b in ((i, i), (j, j), (i, j), (j, i)):
-        ok = free[a] & free[b]
-        block_rows = 6 * number[a[ok]][:, None, None] + np.arange(6)[:, None]
-        block_cols = 6 * number[b[ok]][:, None, None] + np.arange(6)
-        shape = (int(ok.sum()), 6, 6)
+        both_free = free[a] & free[b]
+        block_rows = 6 * number[a[both_free]][:, None, None] + np.arange(6)[:, None]
+        block_cols = 6 * number[b[both_free]][:, None, None] + np.arange(6)
+        shape = (int(both_free.sum()), 6, 6)
         rows.append(np.broadcast_to(block_rows, shape).ravel())
         cols.append(np.broadcast_to(block_cols, shape).ravel())
-        keep.append(ok)
-    where = (np.concatenate(rows), np.concatenate(cols))
+        masks.append(both_free)
+    indices = (np.concatenate(rows), np.concatenate(cols))
 
     def assemble(J_i: Float64, J_j: Float64, r: Float64) -> tuple[Any, Float64]:
         pairs = ((J_i, J_i), (J_j, J_j), (J_i, J_j), (J_j, J_i))
         blocks = [
-            (np.swapaxes(A[ok], 1, 2) @ B[ok]).ravel()
-            for (A, B), ok in zip(pairs, keep, strict=True)
+            (np.swapaxes(A[both_free], 1, 2) @ B[both_free]).ravel()
+            for (A, B), both_free in zip(pairs, masks, strict=True)
         ]
-        H = sparse.csc_matrix((np.concatenate(blocks), where), shape=(size, size))
+        H = sparse.csc_matrix((np.concatenate(blocks), indices), shape=(size, size))
         g = np.zeros((len(free), 6))
         np.add.at(g, i, -np.einsum("mki,mk->mi", J_i, r))
         np.add.at(g, j, -np.einsum("mki,mk->mi", J_j, r))

@@ -61,15 +61,15 @@ class Quaternion:
         P[:, :3, :3] = np.eye(3)
         P[:, 3:, 3:6] = 2 * (s[:, None, None] * np.eye(3) - se3.hat(v))
         P[:, 3:, 6] = -2 * v
-        off = np.zeros((len(q), 7, 7))
-        off[:, 3:, 3:] = q[:, :, None] * q[:, None]
-        return P, off
+        normal_projector = np.zeros((len(q), 7, 7))
+        normal_projector[:, 3:, 3:] = q[:, :, None] * q[:, None]
+        return P, normal_projector
 
     def retract(self, poses: Float64, step: Float64) -> Float64:
         """See `Chart.retract`."""
         q = quaternion.from_matrix(poses[:, :3, :3]) + step[:, 3:]
         q /= np.linalg.norm(q, axis=1, keepdims=True)
-        return _moved(poses, step[:, :3], quaternion.to_matrix(q))
+        return _retracted(poses, step[:, :3], quaternion.to_matrix(q))
 
 
 class Cosines:
@@ -90,18 +90,18 @@ class Cosines:
         for axis, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
             P[:, 3 + axis, 3:] = (turned[:, a, b] - turned[:, b, a]) / 2
         symmetric = ((turned + np.swapaxes(turned, 1, 2)) / 2).reshape(n, 9, 9)
-        off = np.zeros((n, 12, 12))
-        off[:, 3:, 3:] = np.swapaxes(symmetric, 1, 2) @ symmetric
-        return P, off
+        normal_projector = np.zeros((n, 12, 12))
+        normal_projector[:, 3:, 3:] = np.swapaxes(symmetric, 1, 2) @ symmetric
+        return P, normal_projector
 
     def retract(self, poses: Float64, step: Float64) -> Float64:
         """See `Chart.retract`."""
         out = poses.copy()
         out[:, :3, :3] += step[:, 3:].reshape(-1, 3, 3)
-        return _moved(poses, step[:, :3], se3.orthonormalise(out)[:, :3, :3])
+        return _retracted(poses, step[:, :3], se3.orthonormalise(out)[:, :3, :3])
 
 
-def _moved(poses: Float64, slide: Float64, R: Float64) -> Float64:
+def _retracted(poses: Float64, slide: Float64, R: Float64) -> Float64:
     """Return poses with rotations R, translated along the screw motion, as by `se3.exp`."""
     out = poses.copy()
     turn = se3.so3_log(np.swapaxes(poses[:, :3, :3], 1, 2) @ R)

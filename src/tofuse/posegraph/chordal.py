@@ -1,4 +1,4 @@
-"""Chordal initialisation of a pose graph: poses that need no start.
+"""Chordal initialisation of a pose graph, without an initial estimate.
 
 A descent converges to the nearest minimum: from odometry that drifted far, to a wrong one. If
 rotations were arbitrary 3 x 3 matrices, the measured rotations would be linear in them, so that
@@ -17,7 +17,7 @@ from tofuse.geometry import se3
 from tofuse.posegraph.sparse import PairSystem
 
 # Smallest information along a direction, relative to the largest of the edge: its inverse exists.
-_LEAST = 1e-12
+_MIN_INFORMATION = 1e-12
 
 
 def chordal_poses(
@@ -42,20 +42,25 @@ def chordal_poses(
     -------
     None where the edges do not determine all poses.
     """
-    largest = np.trace(information, axis1=1, axis2=2)
-    used = largest > 0
+    scale = np.trace(information, axis1=1, axis2=2)
+    used = scale > 0
     pairs, measurements, information = pairs[used], measurements[used], information[used]
     system = PairSystem(len(poses), pairs, fixed, size=3)
     i, j = system.pairs.T
-    Z, largest = measurements[:, :3, :3], largest[used]
-    C = np.linalg.inv(information + (_LEAST * largest)[:, None, None] * np.eye(6))
+    Z, scale = measurements[:, :3, :3], scale[used]
+    C = np.linalg.inv(information + (_MIN_INFORMATION * scale)[:, None, None] * np.eye(6))
 
-    precise = 3 / np.trace(C[:, 3:, 3:], axis1=1, axis2=2)
-    same = precise[:, None, None] * np.eye(3)
+    precision = 3 / np.trace(C[:, 3:, 3:], axis1=1, axis2=2)
+    W_rotation = precision[:, None, None] * np.eye(3)
     Rt = np.where(fixed[:, None, None], np.swapaxes(poses[:, :3, :3], 1, 2), 0.0)
     # R_j^T = Z^T R_i^T, column by column.
-    off = precise[:, None, None] * (Rt[j] - np.swapaxes(Z, 1, 2) @ Rt[i])
-    columns = _solved(system, (same, -precise[:, None, None] * Z, same), -Z @ off, off)
+    rotation_residual = precision[:, None, None] * (Rt[j] - np.swapaxes(Z, 1, 2) @ Rt[i])
+    columns = _solved(
+        system,
+        (W_rotation, -precision[:, None, None] * Z, W_rotation),
+        -Z @ rotation_residual,
+        rotation_residual,
+    )
     if columns is None:
         return None
     out = np.tile(np.eye(4), (len(poses), 1, 1))
@@ -68,11 +73,11 @@ def chordal_poses(
     Rj = R[i] @ Z
     W = Rj @ np.linalg.inv(C[:, :3, :3]) @ np.swapaxes(Rj, 1, 2)
     t = np.where(fixed[:, None], poses[:, :3, 3], 0.0)
-    apart = (t[j] - t[i])[..., None] - R[i] @ measurements[:, :3, 3:]
-    moved = _solved(system, (W, -W, W), -W @ apart, W @ apart)
-    if moved is None:
+    translation_residual = (t[j] - t[i])[..., None] - R[i] @ measurements[:, :3, 3:]
+    translations = _solved(system, (W, -W, W), -W @ translation_residual, W @ translation_residual)
+    if translations is None:
         return None
-    out[~fixed, :3, 3] = moved[~fixed, :, 0]
+    out[~fixed, :3, 3] = translations[~fixed, :, 0]
     return out
 
 
@@ -84,6 +89,6 @@ def _solved(
     factor = system.factor(*gradients[0])
     if factor is None:
         return None
-    found = [factor.solve(gradient) for _, gradient in gradients]
-    known = [x for x in found if x is not None]
-    return np.stack(known, -1) if len(known) == len(found) else None
+    solutions = [factor.solve(gradient) for _, gradient in gradients]
+    finite = [x for x in solutions if x is not None]
+    return np.stack(finite, -1) if len(finite) == len(solutions) else None

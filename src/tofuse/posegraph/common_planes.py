@@ -3,7 +3,7 @@
 The maximum likelihood of eq 2.8 for an unknown surface (Liu and Zhang 2021, "BALM"). The points of
 all views together are divided into cells, each with a plane, and the poses minimise the distances
 of the points from these planes. The planes are unknowns too, and are eliminated from the normal
-equations. Points are then assigned to cells anew, and cells shrink from coarse to fine as long as
+equations. Points are then reassigned to cells, and cells shrink from coarse to fine as long as
 the noise leaves planes in them.
 """
 
@@ -30,20 +30,20 @@ _CHUNKS = 8
 # Small compared with the information of a cell, so that unconstrained poses stay.
 _DAMPING = 1e-6
 # Points of the median cell, as a multiple of the minimum.
-_FULL = 1.5
+_MIN_FILL = 1.5
 # Sizes above the smallest that is flat initially, and sizes below the last that is full.
 _SIZES_ABOVE = 3
 _SIZES_BELOW = 3
-# Change of the support of clouds when their points are divided in another way. The support of pairs
-# of images is defined differently, and has its own limit (`calibration_check`).
-CHANCE = 0.003
+# Change of the support of clouds due to another division of their points. The support of pairs of
+# images is defined differently, and has a separate limit (`calibration_check`).
+SUPPORT_NOISE = 0.003
 # Largest mean motion of a view's points in a step, as a fraction of the size of the cells.
 _MAX_STEP = 0.5
 # Smallest variance of a cell, as a fraction of the median: smaller ones are so by chance.
 _MIN_VARIANCE = 0.25
-# Cosine of incidence below which the side of a plane that a view sees is unknown; and the distance
-# of two sides, in units of their thickness, above which they are separate surfaces.
-_MIN_COSINE, _LAYERS = 0.15, 3.0
+# Cosine of incidence below which the side of a plane that a view observes is unknown; and the
+# distance of two sides, in units of their thickness, above which they are separate surfaces.
+_MIN_COSINE, _SEPARATION = 0.15, 3.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Aligned:
         Standard deviation of the points across the surface, m.
     before, after
         (N,) support of each view at the initial and at the refined poses: 1 if all its points lie
-        on planes that other views see too.
+        on planes that other views share.
     """
 
     poses: Float64
@@ -127,8 +127,8 @@ class _Points:
     def extent(self) -> float:
         """Extent of the median view, m; 0 if all are empty."""
         ends = np.searchsorted(self.view, np.arange(1, self.count))
-        found = [extent(p) for p in np.split(self.p, ends) if len(p)]
-        return float(np.median(found)) if found else 0.0
+        extents = [extent(p) for p in np.split(self.p, ends) if len(p)]
+        return float(np.median(extents)) if extents else 0.0
 
     def world(self, poses: Float64) -> Float64:
         """(M, 3) points in the world, by poses (N, 4, 4)."""
@@ -158,7 +158,7 @@ class _Cells:
 
     @cached_property
     def shared(self) -> Bool:
-        """(S,) cells that several views see."""
+        """(S,) cells that several views observe."""
         return self.views > 1
 
     def typical(self) -> tuple[float, float, float]:
@@ -166,8 +166,8 @@ class _Cells:
         if not self.shared.any():
             return np.inf, 1.0, 0.0
         deviation = np.sqrt(np.maximum(self.spread[self.shared], 0))
-        thick, wide = np.median(deviation[:, :2], axis=0)
-        return float(thick), float(wide), float(np.median(np.diff(self.start)[self.shared]))
+        thickness, width = np.median(deviation[:, :2], axis=0)
+        return float(thickness), float(width), float(np.median(np.diff(self.start)[self.shared]))
 
 
 def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptions) -> Aligned:
@@ -191,9 +191,9 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
     best: tuple[float, Float64] | None = None
     for size in _sizes(points, poses, options).tolist():
         poses, cells = _level(points, poses, size, options.iterations, options)
-        thick, wide, most = cells[0].typical()
-        flat = thick <= options.flatness * wide
-        if most < _FULL * options.min_points or (best is not None and not flat):
+        thickness, width, point_count = cells[0].typical()
+        flat = thickness <= options.flatness * width
+        if point_count < _MIN_FILL * options.min_points or (best is not None and not flat):
             break
         if flat:
             best = size, poses
@@ -209,15 +209,15 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
     i, j = system.pairs.T
     relative = se3.inverse(poses[i]) @ poses[j]
     covariance = factor.relative_covariances(relative)
-    first = _divided(points, start, size, options.divisions)
+    initial_cells = _divided(points, start, size, options.divisions)
     return Aligned(
         poses,
         system.pairs,
         covariance,
         size,
         sigma,
-        np.mean([_support(points, each, limit) for each in first], axis=0),
-        np.mean([_support(points, each, limit) for each in cells], axis=0),
+        np.mean([_support(points, division, limit) for division in initial_cells], axis=0),
+        np.mean([_support(points, division, limit) for division in cells], axis=0),
     )
 
 
@@ -230,15 +230,15 @@ def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
     sizes, first = [options.coarsest * points.extent], 0
     while sizes[-1] > 0:
         cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
-        thick, wide, most = cells.typical()
-        if most < _FULL * options.min_points:
+        thickness, width, point_count = cells.typical()
+        if point_count < _MIN_FILL * options.min_points:
             break
-        if thick <= options.flatness * wide:
+        if thickness <= options.flatness * width:
             first = max(0, len(sizes) - 1 - _SIZES_ABOVE)
         sizes.append(options.shrink * sizes[-1])
     # With better poses, more views may share a cell.
-    more = sizes[-1] * options.shrink ** np.arange(1, _SIZES_BELOW + 1)
-    return np.concatenate([sizes[first:], more[more > 0]])
+    smaller = sizes[-1] * options.shrink ** np.arange(1, _SIZES_BELOW + 1)
+    return np.concatenate([sizes[first:], smaller[smaller > 0]])
 
 
 def _unmoved(poses: Float64) -> Aligned:
@@ -258,23 +258,25 @@ def _level(
 
     If the support of the views falls, these are the initial ones.
     """
-    first = _divided(points, poses, size, divisions)
-    found, cells = poses, first
+    initial_cells = _divided(points, poses, size, divisions)
+    refined, cells = poses, initial_cells
     for _ in range(iterations):
-        factor, _ = _system(points, found, cells, options)
+        factor, _ = _system(points, refined, cells, options)
         step = factor.step() if factor is not None else None
         if step is None:
             break
-        step, motion = _bounded(points, found, step, _MAX_STEP * size)
-        found = se3.orthonormalise(found @ se3.exp(step))
-        cells = [_cells(points, found, c.mean[np.diff(c.start) > 0]) for c in cells]
+        step, motion = _bounded(points, refined, step, _MAX_STEP * size)
+        refined = se3.orthonormalise(refined @ se3.exp(step))
+        cells = [_cells(points, refined, c.mean[np.diff(c.start) > 0]) for c in cells]
         if motion < options.convergence * size:
             break
-    # Divided anew, as cells that moved along have been fitted for longer.
-    cells = _divided(points, found, size, divisions)
-    limit = options.robust * first[0].typical()[0]
-    before, after = (np.mean([_support(points, c, limit) for c in each]) for each in (first, cells))
-    return (found, cells) if after >= before - CHANCE else (poses, first)
+    # Divided again, as cells that moved along were fitted in more iterations.
+    cells = _divided(points, refined, size, divisions)
+    limit = options.robust * initial_cells[0].typical()[0]
+    before, after = (
+        np.mean([_support(points, c, limit) for c in divided]) for divided in (initial_cells, cells)
+    )
+    return (refined, cells) if after >= before - SUPPORT_NOISE else (poses, initial_cells)
 
 
 def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> list[_Cells]:
@@ -283,16 +285,16 @@ def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> li
     return [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
 
 
-def _bounded(points: _Points, poses: Float64, step: Float64, most: float) -> tuple[Float64, float]:
+def _bounded(points: _Points, poses: Float64, step: Float64, limit: float) -> tuple[Float64, float]:
     """Shorten a step until no view's points move further than `limit`; also their motion, m."""
     before = points.world(poses)
     while True:
         motion = np.linalg.norm(points.world(poses @ se3.exp(step)) - before, axis=1)
         total = np.bincount(points.view, motion, minlength=points.count)
         mean = total / np.maximum(np.bincount(points.view, minlength=points.count), 1)
-        if mean.max() <= most:
+        if mean.max() <= limit:
             return step, float(motion.mean())
-        step = step * min(0.9 * most / mean.max(), 0.9)
+        step = step * min(0.9 * limit / mean.max(), 0.9)
 
 
 def _centres(points: _Points, poses: Float64, size: float, shift: float = 0.0) -> Float64:
@@ -315,13 +317,13 @@ def _means(x: Float64, cell: Int64) -> Float64:
 def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
     """Assign each point to the nearest centre, and fit the planes.
 
-    The two sides of a wall may be closer to each other than a cell is wide, so cells that were seen
-    from opposite sides are divided.
+    The two sides of a wall may be closer to each other than a cell is wide, so cells observed from
+    opposite sides are divided.
     """
     x = points.world(poses)
     cell, _ = KdTree(centres).nearest(x)
     cells = _fit(points, x, cell, len(centres))
-    behind = _seen_from_behind(cells, poses)
+    behind = _back_sides(cells, poses)
     if not behind.any():
         return cells
     cell[cells.order[behind]] += len(centres)
@@ -346,14 +348,14 @@ def _fit(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
     return _Cells(order, start, points.p[order], x, view, mean, axes, spread, views)
 
 
-def _seen_from_behind(cells: _Cells, poses: Float64) -> Bool:
+def _back_sides(cells: _Cells, poses: Float64) -> Bool:
     """(M,) mask of the points, ordered by cell, on the back of a cell with two separate sides."""
     size = len(cells.mean)
     cell = np.repeat(np.arange(size), np.diff(cells.start))
-    towards = poses[cells.view, :3, 3] - cells.mean[cell]
-    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    viewing_direction = poses[cells.view, :3, 3] - cells.mean[cell]
+    viewing_direction /= np.maximum(np.linalg.norm(viewing_direction, axis=1, keepdims=True), 1e-12)
     normal = cells.axes[cell, 0]
-    cosine = (towards * normal).sum(1)
+    cosine = (viewing_direction * normal).sum(1)
     height = ((cells.x - cells.mean[cell]) * normal).sum(1)
     sides = [cosine > _MIN_COSINE, cosine < -_MIN_COSINE]
     means, squares, counts = [], np.zeros(size), np.zeros(size)
@@ -363,9 +365,9 @@ def _seen_from_behind(cells: _Cells, poses: Float64) -> Bool:
         squares += np.bincount(cell, np.where(side, (height - mean[cell]) ** 2, 0.0), size)
         counts += count
         means.append(np.where(count > 0, mean, np.nan))
-    thick = np.sqrt(squares / np.maximum(counts, 1))
-    apart = means[0] - means[1] > _LAYERS * thick  # never where one side has no points
-    return sides[1] & apart[cell]
+    thickness = np.sqrt(squares / np.maximum(counts, 1))
+    separate = means[0] - means[1] > _SEPARATION * thickness  # never where one side has no points
+    return sides[1] & separate[cell]
 
 
 def _system(
@@ -375,17 +377,17 @@ def _system(
     n = points.count
     variances = [_variance(cells, options.min_points) for cells in divisions]
     pairs = _pairs(divisions, variances, n)
-    number = np.full((n, n), -1, np.int64)
-    number[pairs[:, 0], pairs[:, 1]] = np.arange(len(pairs))
+    pair_index = np.full((n, n), -1, np.int64)
+    pair_index[pairs[:, 0], pairs[:, 1]] = np.arange(len(pairs))
     rotations = np.ascontiguousarray(poses[:, :3, :3])
-    own, gradient = np.zeros((n, 6, 6)), np.zeros((n, 6))
-    mixed = np.zeros((len(pairs), 6, 6))
+    diagonal, gradient = np.zeros((n, 6, 6)), np.zeros((n, 6))
+    off_diagonal = np.zeros((len(pairs), 6, 6))
     for cells, variance in zip(divisions, variances, strict=True):
 
         def work(
             a: int, b: int, cells: _Cells = cells, variance: Float64 = variance
         ) -> tuple[Float64, Float64, Float64]:
-            out = np.zeros_like(own), np.zeros_like(gradient), np.zeros_like(mixed)
+            out = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(off_diagonal)
             kernels.plane_equations(
                 cells.p,
                 cells.x,
@@ -395,41 +397,41 @@ def _system(
                 cells.axes[a:b],
                 variance[a:b],
                 rotations,
-                number,
+                pair_index,
                 options.robust,
                 *out,
             )
             return out
 
         for parts in run_chunks(work, len(variance), _CHUNKS):
-            for total, part in zip((own, gradient, mixed), parts, strict=True):
+            for total, part in zip((diagonal, gradient, off_diagonal), parts, strict=True):
                 total += part / len(divisions)
     system = PairSystem(n, pairs)
-    none, flat = np.zeros_like(mixed), np.zeros((len(pairs), 6))
-    matrix, right = system.assemble(none, mixed, none, flat, flat, (own, gradient))
-    return system.factor(matrix, right, _DAMPING), system
+    none, flat = np.zeros_like(off_diagonal), np.zeros((len(pairs), 6))
+    matrix, rhs = system.assemble(none, off_diagonal, none, flat, flat, (diagonal, gradient))
+    return system.factor(matrix, rhs, _DAMPING), system
 
 
 def _variance(cells: _Cells, min_points: int) -> Float64:
     """(S,) variance of the residuals of each cell, 0 if it has too few points or only one view."""
-    enough = cells.shared & (np.diff(cells.start) >= min_points)
-    variance = np.where(enough, cells.spread[:, 0], 0.0)
-    if enough.any():
-        floor = _MIN_VARIANCE * float(np.median(variance[enough]))
-        variance[enough] = np.maximum(variance[enough], max(floor, 1e-18))
+    valid = cells.shared & (np.diff(cells.start) >= min_points)
+    variance = np.where(valid, cells.spread[:, 0], 0.0)
+    if valid.any():
+        floor = _MIN_VARIANCE * float(np.median(variance[valid]))
+        variance[valid] = np.maximum(variance[valid], max(floor, 1e-18))
     return variance
 
 
 def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) -> Intp:
-    """Pairs of views i < j that see the same cell."""
-    common = np.zeros((n, n))
+    """Pairs of views i < j that observe the same cell."""
+    shared_cells = np.zeros((n, n))
     for cells, variance in zip(divisions, variances, strict=True):
         cell = np.repeat(np.arange(len(variance)), np.diff(cells.start))
-        sees = np.zeros((len(variance), n))
-        sees[cell, cells.view] = 1
-        sees = sees[variance > 0]
-        common += sees.T @ sees
-    return np.argwhere(np.triu(common, 1) > 0).astype(np.intp)
+        visible = np.zeros((len(variance), n))
+        visible[cell, cells.view] = 1
+        visible = visible[variance > 0]
+        shared_cells += visible.T @ visible
+    return np.argwhere(np.triu(shared_cells, 1) > 0).astype(np.intp)
 
 
 def _support(points: _Points, cells: _Cells, limit: float) -> Float64:
@@ -438,5 +440,5 @@ def _support(points: _Points, cells: _Cells, limit: float) -> Float64:
         cells.x, cells.view, cells.start, cells.mean, cells.axes, cells.views, limit, out
     )
     total = np.bincount(points.view, minlength=points.count)
-    found: Float64 = out / np.maximum(total, 1)
-    return found
+    support: Float64 = out / np.maximum(total, 1)
+    return support

@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.posegraph.branches import Branches
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
-from tofuse.posegraph.sparse import Factor, bounded, first_of_parts, parts_of
+from tofuse.posegraph.sparse import Factor, first_of_parts, parts_of, sparsify
 
 # A loop with a smaller weight is rejected.
 MIN_WEIGHT = 0.05
@@ -53,7 +53,7 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
 class GraphCovariances:
     """Covariances of the poses of an optimised graph relative to one of them.
 
-    They are by the edges that `bounded` chooses: without the others they are slightly larger.
+    They are by the edges that `sparsify` chooses: without the others they are slightly larger.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class GraphCovariances:
         out[self._part != self._part[self.origin]] = np.nan
         return out
 
-    def joint(self, some: Intp) -> Float64 | None:
+    def joint(self, positions: Intp) -> Float64 | None:
         """Return the (6v, 6v) joint covariance of v poses, given their positions.
 
         None where the measurements do not constrain all poses of the graph.
@@ -102,9 +102,9 @@ class GraphCovariances:
         if self._part.any():
             return None
         kept = self._fixed.copy()
-        kept[some] = True
+        kept[positions] = True
         core, factor = self._factor(Branches(self.graph, kept))
-        return None if factor is None else factor.joint_covariance(np.searchsorted(core, some))
+        return None if factor is None else factor.joint_covariance(np.searchsorted(core, positions))
 
     def _factor(self, branches: Branches) -> tuple[Intp, Factor | None]:
         """Return the vertices in no branch, and the factor of their normal equations."""
@@ -115,16 +115,16 @@ class GraphCovariances:
 
 
 def _core(graph: PoseGraph, branches: Branches) -> tuple[Intp, Intp]:
-    """Return the vertices in no branch, and those of their edges that `bounded` chooses."""
+    """Return the vertices in no branch, and those of their edges that `sparsify` chooses."""
     core, edges = np.flatnonzero(~branches.vertices), np.flatnonzero(~branches.edges)
-    return core, edges[bounded(len(core), np.searchsorted(core, graph.edges[edges]))]
+    return core, edges[sparsify(len(core), np.searchsorted(core, graph.edges[edges]))]
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     """(L,) squared Mahalanobis distances of the loops from odometry alone.
 
     Chi-square with six degrees of freedom if both covariances are right; NaN for loops between
-    poses that odometry does not connect, and for those that `bounded` leaves out.
+    poses that odometry does not connect, and for those that `sparsify` leaves out.
 
     Parameters
     ----------
@@ -141,12 +141,12 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     out = np.full(len(graph.edges), np.nan)
     loops = edges[graph.loop[edges]]
     i, j = graph.edges[loops].T
-    same = part[i] == part[j]
+    connected = part[i] == part[j]
     reduced = graph.subgraph(core, edges)
     factor = _problem(reduced, fixed[core]).factor(
         sequential[core], np.where(reduced.loop, 0.0, 1.0)
     )
-    if factor is None or not same.any():
+    if factor is None or not connected.any():
         return out[graph.loop]
     a, b = graph.edges[edges].T
     T_i_j = se3.inverse(sequential[a]) @ sequential[b]
@@ -157,7 +157,7 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     e = se3.log(se3.inverse(graph.measurements[loops]) @ T_i_j[reduced.loop])
     C = C + np.linalg.pinv(graph.information[loops], hermitian=True)
     d = (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(1)
-    out[loops[same]] = d[same]
+    out[loops[connected]] = d[connected]
     return out[graph.loop]
 
 

@@ -36,17 +36,17 @@ class Problem:
         self.chart: Chart = CHARTS[rotation]()
         self._Z_inverse = se3.inverse(measurements)
         n = len(fixed)
-        joined, all_fixed = pairs, fixed
-        self._single: tuple[Float64, Float64] | None = None
+        all_pairs, all_fixed = pairs, fixed
+        self._unary: tuple[Float64, Float64] | None = None
         if gravity is not None:
             world = np.full(len(gravity.vertices), n)
-            joined = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
+            all_pairs = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
             all_fixed = np.append(fixed, gravity.world is not None)
             block = np.zeros((n + 1, 6, 6))
             block[n] = np.eye(6)
-            self._single = block, np.zeros((n + 1, 6))
-        self.joined = joined
-        self.system = PairSystem(len(all_fixed), joined, all_fixed, size=self.chart.size)
+            self._unary = block, np.zeros((n + 1, 6))
+        self.all_pairs = all_pairs
+        self.system = PairSystem(len(all_fixed), all_pairs, all_fixed, size=self.chart.size)
 
     def start(self, poses: Float64) -> Float64:
         """Return the initial poses, followed by that of the vertical if there is gravity."""
@@ -56,8 +56,8 @@ class Problem:
         down = self.gravity.world
         if down is None:
             R = poses[self.gravity.vertices, :3, :3]
-            seen = (R @ self.gravity.directions[..., None])[..., 0]
-            down = vertical(seen, self.gravity)
+            observed = (R @ self.gravity.directions[..., None])[..., 0]
+            down = vertical(observed, self.gravity)
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
         x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
@@ -72,9 +72,9 @@ class Problem:
         e = se3.log(self._Z_inverse @ (se3.inverse(poses[i]) @ poses[j]))
         if self.gravity is None:
             return e, np.zeros((0, 3))
-        return e, (self._seen_down(poses) - [0, 0, 1]) / self.gravity.sigma[:, None]
+        return e, (self._observed_down(poses) - [0, 0, 1]) / self.gravity.sigma[:, None]
 
-    def _seen_down(self, poses: Float64) -> Float64:
+    def _observed_down(self, poses: Float64) -> Float64:
         assert self.gravity is not None
         world, R = poses[-1, :3, :3], poses[self.gravity.vertices, :3, :3]
         return (world.T @ R @ self.gravity.directions[..., None])[..., 0]
@@ -93,7 +93,7 @@ class Problem:
         J = se3.jacobian_inverse(e)
         JtW = np.swapaxes(J, 1, 2) @ (weights[:, None, None] * self.information)
         H, g = JtW @ J, (JtW @ e[..., None])[..., 0]
-        i, j = self.joined.T
+        i, j = self.all_pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         if self.gravity is not None:
             J = np.zeros((len(down), 3, 6))
@@ -109,49 +109,49 @@ class Problem:
             g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
         basis = self.chart.basis(poses)
         if basis is None:
-            return self.system.relative(H, g, T_i_j, self._single)
+            return self.system.relative(H, g, T_i_j, self._unary)
         return self._in_chart(H, g, T_i_j, *basis)
 
     def _in_chart(
-        self, H: Float64, g: Float64, T_i_j: Float64, P: Float64, off: Float64
+        self, H: Float64, g: Float64, T_i_j: Float64, P: Float64, normal_projector: Float64
     ) -> tuple[Any, Float64]:
-        i, j = self.joined.T
+        i, j = self.all_pairs.T
         A = se3.adjoint(se3.inverse(T_i_j)) @ P[i]
         At, Pt = np.swapaxes(A, 1, 2), np.swapaxes(P, 1, 2)
         HA, HP = H @ A, H @ P[j]
         scale = float(np.mean(np.diagonal(H, axis1=1, axis2=2)))
-        block = scale * off
-        if self._single is not None:
-            block = block + Pt @ self._single[0] @ P
-        single = block, np.zeros(block.shape[:2])
+        block = scale * normal_projector
+        if self._unary is not None:
+            block = block + Pt @ self._unary[0] @ P
+        unary = block, np.zeros(block.shape[:2])
         column = g[..., None]
         return self.system.assemble(
-            At @ HA, -At @ HP, Pt[j] @ HP, -(At @ column)[..., 0], (Pt[j] @ column)[..., 0], single
+            At @ HA, -At @ HP, Pt[j] @ HP, -(At @ column)[..., 0], (Pt[j] @ column)[..., 0], unary
         )
 
     def factor(self, poses: Float64, weights: Float64) -> Factor | None:
         """Factorise the undamped normal equations in the tangent chart; None if singular."""
-        plain = self
+        in_tangent = self
         if self.chart.size != 6:
-            plain = Problem(
+            in_tangent = Problem(
                 self.pairs, se3.inverse(self._Z_inverse), self.information, self.fixed,
                 self.gravity, "tangent",
             )  # fmt: skip
-        everywhere = poses if len(poses) == len(plain.system.fixed) else plain.start(poses)
-        matrix, gradient = plain.linearised(everywhere, *plain.errors(everywhere), weights)
-        return plain.system.factor(matrix, gradient)
+        all_poses = poses if len(poses) == len(in_tangent.system.fixed) else in_tangent.start(poses)
+        matrix, gradient = in_tangent.linearised(all_poses, *in_tangent.errors(all_poses), weights)
+        return in_tangent.system.factor(matrix, gradient)
 
 
-def vertical(seen: Float64, gravity: Gravity) -> Float64:
-    """Return the (3,) robust mean of directions `seen` (g, 3) in the world, weighted by sigma."""
-    known = 1 / gravity.sigma**2
+def vertical(observed: Float64, gravity: Gravity) -> Float64:
+    """Return the (3,) robust mean of directions (g, 3) `observed` in the world, by their sigmas."""
+    weight = 1 / gravity.sigma**2
     if np.isinf(gravity.gate):
-        return np.asarray((seen * known[:, None]).sum(0), np.float64)
-    down = np.median(seen, axis=0)  # robust to outliers
+        return np.asarray((observed * weight[:, None]).sum(0), np.float64)
+    down = np.median(observed, axis=0)  # robust to outliers
     for _ in range(10):
         down = down / max(float(np.linalg.norm(down)), 1e-12)
-        x = ((seen - down) ** 2).sum(1) * known
-        down = (seen * (known * robust.weight("huber", x, 1.0))[:, None]).sum(0)
+        x = ((observed - down) ** 2).sum(1) * weight
+        down = (observed * (weight * robust.weight("huber", x, 1.0))[:, None]).sum(0)
     return np.asarray(down, np.float64)
 
 
@@ -165,10 +165,10 @@ class Descent:
         self.problem, self.poses = problem, poses
         self.damping = 1e-7
         self.log: list[tuple[Float64, float]] = []
-        self._see()
-        self._note()
+        self._evaluate()
+        self._record()
 
-    def _see(self) -> None:
+    def _evaluate(self) -> None:
         self.e, self.down = self.problem.errors(self.poses)
         self.chi2 = np.einsum("mi,mij,mj->m", self.e, self.problem.information, self.e)
 
@@ -179,9 +179,9 @@ class Descent:
     def restore(self, state: tuple[Float64, Float64, Float64, Float64]) -> None:
         """Restore a state, and log it."""
         self.poses, self.e, self.down, self.chi2 = state
-        self._note()
+        self._record()
 
-    def _note(self) -> None:
+    def _record(self) -> None:
         self.log.append((self.chi2, self.problem.gravity_cost(self.down)))
 
     def run(self, total: Cost, weights: Cost, tolerance: float, iterations: int) -> bool:
@@ -199,36 +199,36 @@ class Descent:
             matrix, gradient = problem.linearised(self.poses, self.e, self.down, weights(self.chi2))
             before = value
             while True:
-                found = self._try(matrix, gradient, total, value)
-                if found is not None:
+                lowered = self._try_step(matrix, gradient, total, value)
+                if lowered is not None:
                     break
                 self.damping = max(self.damping * 10, 1e-7)
                 if self.damping > 1e8:
                     # Not even the shortest step lowers the objective.
                     self.damping = 1e-7
                     return True
-            value = found
+            value = lowered
             self.damping = max(self.damping / 10, 1e-12)
-            self._note()
+            self._record()
             if before - value <= tolerance * before:
                 return True
         return False
 
-    def _try(self, matrix: Any, gradient: Float64, total: Cost, value: float) -> float | None:
+    def _try_step(self, matrix: Any, gradient: Float64, total: Cost, value: float) -> float | None:
         """Take a step if it lowers the objective; returns the new one, or None if rejected."""
         factor = self.problem.system.factor(matrix, gradient, self.damping)
         step = None if factor is None else factor.step()
         if step is None:
             return None
-        kept = self.state()
+        previous = self.state()
         fixed = self.problem.system.fixed
         stepped = self.problem.chart.retract(self.poses, step)
         self.poses = np.where(fixed[:, None, None], self.poses, stepped)
-        self._see()
-        new = self._value(total)
-        if new < value:
-            return new
-        self.poses, self.e, self.down, self.chi2 = kept
+        self._evaluate()
+        new_value = self._value(total)
+        if new_value < value:
+            return new_value
+        self.poses, self.e, self.down, self.chi2 = previous
         return None
 
     def _value(self, total: Cost) -> float:

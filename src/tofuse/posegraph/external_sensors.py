@@ -104,12 +104,12 @@ class SensorPriors:
 
     def joined(self, other: SensorPriors) -> SensorPriors:
         """Return the measurements of both; of gravity, those of the first that has any."""
-        mine = self if self.ids else other
+        with_gravity = self if self.ids else other
         return SensorPriors(
             (*self.steps, *other.steps),
-            mine.ids,
-            mine.gravity,
-            mine.gate,
+            with_gravity.ids,
+            with_gravity.gravity,
+            with_gravity.gate,
             (*self.records, *other.records),
             self.verified or other.verified,
         )
@@ -119,18 +119,18 @@ class SensorPriors:
         if self.gravity is None:
             return None
         row = {index: k for k, index in enumerate(self.ids)}
-        here = [(k, row[index]) for k, index in enumerate(ids) if index in row]
-        if not here:
+        matches = [(k, row[index]) for k, index in enumerate(ids) if index in row]
+        if not matches:
             return None
-        vertices, rows = np.array(here, np.intp).T
+        vertices, rows = np.array(matches, np.intp).T
         return Gravity(vertices, self.gravity[rows, :3], self.gravity[rows, 3], None, self.gate)
 
     def up(self, graph: PoseGraph) -> Float64 | None:
         """Return the unit vector (3,) opposite to gravity in the graph's world, or None."""
-        known = self.gravity_of(graph.ids.tolist())
-        if known is None:
+        gravity = self.gravity_of(graph.ids.tolist())
+        if gravity is None:
             return None
-        down = (graph.poses[known.vertices, :3, :3] @ known.directions[:, :, None])[..., 0]
+        down = (graph.poses[gravity.vertices, :3, :3] @ gravity.directions[:, :, None])[..., 0]
         # A median, since a shaken accelerometer measures more than gravity.
         up = -np.median(down, axis=0)
         length = float(np.linalg.norm(up))
@@ -138,15 +138,15 @@ class SensorPriors:
 
     def between(self, ids: Sequence[int]) -> list[Measured]:
         """Relative poses of successive frames of `ids` (ascending) without gaps between them."""
-        following = {step.i: step for step in self.steps}
+        step_from = {step.i: step for step in self.steps}
         out = []
         for i, j in pairwise(ids):
-            T, C, at = np.eye(4), np.zeros((6, 6)), i
-            while at in following and at < j:
-                step = following[at]
-                T, at = T @ step.T_i_j, step.j
+            T, C, frame = np.eye(4), np.zeros((6, 6)), i
+            while frame in step_from and frame < j:
+                step = step_from[frame]
+                T, frame = T @ step.T_i_j, step.j
                 C += np.linalg.inv(step.information)
-            if at == j:
+            if frame == j:
                 out.append(Measured(i, j, T, np.asarray(np.linalg.inv(C), np.float64)))
         return out
 
@@ -180,28 +180,28 @@ class GravityEdges(Bounded, ExternalSensor):
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """See `ExternalSensor.measure`."""
-        known = np.flatnonzero(np.isfinite(sensed.gravity).all(1))
-        count = len(known)
+        rows = np.flatnonzero(np.isfinite(sensed.gravity).all(1))
+        count = len(rows)
         if count == 0:
             return SensorPriors()
         if count < _MIN_FRAMES:
             text = f"only {count} frames measure gravity, {_MIN_FRAMES} are needed"
             return SensorPriors(records=(SensorRecord("gravity", count, 0, None, text),))
-        measured = sensed.gravity[known].copy()
+        measured = sensed.gravity[rows].copy()
         measured[:, 3] = np.hypot(measured[:, 3], self.shared_rad)
         # Factor on each variance, so that all measurements together have no more information than
         # a single one with the shared error alone.
-        less = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
-        seen = (graph.poses[known, :3, :3] @ measured[:, :3, None])[..., 0]
-        every = Gravity(known, measured[:, :3], measured[:, 3], None, self.gate)
-        down = vertical(seen, every)
-        away = ((seen - down / np.linalg.norm(down)) ** 2).sum(1) / measured[:, 3] ** 2
-        used = int((away <= self.gate).sum())
-        measured[:, 3] *= np.sqrt(less)
-        ids = tuple(int(index) for index in sensed.ids[known])
+        inflation = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
+        observed = (graph.poses[rows, :3, :3] @ measured[:, :3, None])[..., 0]
+        gravity = Gravity(rows, measured[:, :3], measured[:, 3], None, self.gate)
+        down = vertical(observed, gravity)
+        chi2 = ((observed - down / np.linalg.norm(down)) ** 2).sum(1) / measured[:, 3] ** 2
+        used = int((chi2 <= self.gate).sum())
+        measured[:, 3] *= np.sqrt(inflation)
+        ids = tuple(int(index) for index in sensed.ids[rows])
         text = f"{used} of {count} directions of gravity agree with the path"
         record = SensorRecord("gravity", count, used, None, text)
-        return SensorPriors((), ids, measured, self.gate / less, (record,))
+        return SensorPriors((), ids, measured, self.gate / inflation, (record,))
 
 
 @part("prior", "odometry")
@@ -234,9 +234,9 @@ class OdometryEdges(Bounded, ExternalSensor):
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """See `ExternalSensor.measure`."""
-        there = np.asarray(np.isfinite(sensed.odometry).all((1, 2)))
-        both = there[:-1] & there[1:] & (sensed.parts[:-1] == sensed.parts[1:])
-        first = np.flatnonzero(both)
+        valid = np.asarray(np.isfinite(sensed.odometry).all((1, 2)))
+        consecutive = valid[:-1] & valid[1:] & (sensed.parts[:-1] == sensed.parts[1:])
+        first = np.flatnonzero(consecutive)
         if not len(first):
             return SensorPriors()
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
@@ -251,9 +251,12 @@ class OdometryEdges(Bounded, ExternalSensor):
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
         C = C * scale**2
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
-        own = _covariance_to_reference(graph)
-        away = _squared(se3.log(se3.inverse(tracked) @ measured), C + own[first] + own[first + 1])
-        keep = np.flatnonzero(away <= self.gate)
+        tracking_covariance = _covariance_to_reference(graph)
+        chi2 = _squared(
+            se3.log(se3.inverse(tracked) @ measured),
+            C + tracking_covariance[first] + tracking_covariance[first + 1],
+        )
+        kept = np.flatnonzero(chi2 <= self.gate)
         steps = tuple(
             Measured(
                 int(sensed.ids[first[k]]),
@@ -261,12 +264,12 @@ class OdometryEdges(Bounded, ExternalSensor):
                 measured[k],
                 np.asarray(np.linalg.inv(C[k]), np.float64),
             )
-            for k in keep
+            for k in kept
         )
-        text = f"{len(keep)} of {len(first)} steps of the odometry are used, "
+        text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
         text += "with the stated errors" if scale == 1 else f"with {scale:.1f} times its errors"
         metric = compared is not None and compared.lengths_agree(scale)
-        record = SensorRecord("odometry", len(first), len(keep), scale, text, metric)
+        record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
         return SensorPriors(steps, records=(record,), verified=verified)
 
@@ -289,18 +292,18 @@ class OdometryEdges(Bounded, ExternalSensor):
         # Variances add up along the path; a step without odometry breaks it.
         step = np.full((len(sensed.ids), 6), np.inf)
         step[first + 1] = np.diagonal(C, axis1=1, axis2=2)
-        whole = [bool(np.isfinite(step[a + 1 : b + 1]).all()) for a, b in graph.edges]
-        known = np.array(whole, bool) & (i < j)
-        constrained = known & ~(sensed.degenerate[i] | sensed.degenerate[j])
+        unbroken = [bool(np.isfinite(step[a + 1 : b + 1]).all()) for a, b in graph.edges]
+        compared = np.array(unbroken, bool) & (i < j)
+        constrained = compared & ~(sensed.degenerate[i] | sensed.degenerate[j])
         verified = bool(constrained.sum() >= _MIN_COMPARED)
         if verified:
-            known = constrained
-        if not known.any():
+            compared = constrained
+        if not compared.any():
             return None
-        i, j = i[known], j[known]
+        i, j = i[compared], j[compared]
         return _Comparison(
-            graph.measurements[known],
-            np.asarray(np.linalg.inv(graph.information[known]), np.float64),
+            graph.measurements[compared],
+            np.asarray(np.linalg.inv(graph.information[compared]), np.float64),
             np.asarray(se3.inverse(sensed.odometry[i]) @ sensed.odometry[j], np.float64),
             np.stack([step[a + 1 : b + 1].sum(0) for a, b in zip(i, j, strict=True)]),
             verified,
@@ -377,10 +380,10 @@ def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:
     """Return the graph with the measurements: steps as further edges, and gravity."""
     if not measured:
         return graph
-    place = {int(index): k for k, index in enumerate(graph.ids)}
+    position = {int(index): k for k, index in enumerate(graph.ids)}
     steps = measured.steps
     m = len(steps)
-    pairs = np.array([(place[s.i], place[s.j]) for s in steps], np.intp).reshape(m, 2)
+    pairs = np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2)
     return replace(
         graph,
         edges=np.concatenate([graph.edges, pairs]),

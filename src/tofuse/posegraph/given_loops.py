@@ -18,7 +18,7 @@ _UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[GivenLoop]:
     """Read lines of ``i j`` or ``i j tx ty tz qx qy qz qw`` (frame indices; the measured T_i_j, m).
 
-    ``#`` starts a comment. `frames` are the indices that exist, if they are to be checked.
+    ``#`` starts a comment. `frames` are the existing indices, if they are to be checked.
 
     Raises
     ------

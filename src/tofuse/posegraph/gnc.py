@@ -5,7 +5,7 @@
    starts at the largest error and is halved at every step, so that the worst loops lose their
    weight first and the others fit better. Then loops are accepted or rejected by their errors
    until nothing changes.
-3. A false loop can hide where odometry is weak and bends to fit it (masking). So every loop is
+3. A false loop can be masked where odometry is weak and bends to fit it. So every loop is
    tested against all other edges, with the covariance that they leave. What accepting the loop
    adds to the sum of squared errors has a chi-square distribution if the loop is true::
 
@@ -34,7 +34,7 @@ from tofuse.posegraph.robust import Settings
 
 _QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom
 _MAX_ROUNDS = 20  # of accepting and rejecting loops
-_DENSE = 3.0  # edges per pose, above which no single loop can bend the others
+_MAX_EDGES_PER_POSE = 3.0  # edges per pose, above which no single loop can bend the others
 # Fraction of the objective that rejecting loops must save, otherwise all are accepted; and that
 # another start must save.
 _MIN_SAVING = 0.01
@@ -45,22 +45,22 @@ def truncated_least_squares(
 ) -> GraduatedNonConvexity:
     """Select among the loops (m,) and solve for the poses.
 
-    The given poses (n, 4, 4) are the first start. If they are better than anything found, they are
-    kept, without the loops that contradict them.
+    The given poses (n, 4, 4) are the first start. If no result is better, they are kept,
+    without the loops that contradict them.
     """
-    found = GraduatedNonConvexity(problem, poses, loop, settings)
-    if found.fits_all():
-        return found.select()
+    result = GraduatedNonConvexity(problem, poses, loop, settings)
+    if result.fits_all():
+        return result.select()
     chordal = _from_chordal(problem, poses, loop, settings)
     if chordal is not None and chordal.fits_all():
         return chordal.select()
-    found.select()
+    result.select()
     if chordal is not None:
         chordal.select()
-        if chordal.objective() < (1 - _MIN_SAVING) * found.objective():
-            found = chordal
-    given = GraduatedNonConvexity(problem, poses, loop, settings)
-    return given.keep_start() if given.objective() <= found.objective() else found
+        if chordal.objective() < (1 - _MIN_SAVING) * result.objective():
+            result = chordal
+    initial = GraduatedNonConvexity(problem, poses, loop, settings)
+    return initial.keep_start() if initial.objective() <= result.objective() else result
 
 
 def _from_chordal(
@@ -106,15 +106,15 @@ class GraduatedNonConvexity:
 
     def fits_all(self) -> bool:
         """Solve with all loops; whether each of them fits."""
-        self.converged = self._with(self.weights)
+        self.converged = self._solve_with(self.weights)
         x = self.descent.chi2[self.loop]
         return self.converged and bool((x <= self._gate(x)).all())
 
     def select(self) -> GraduatedNonConvexity:
         """Select loops and solve for the poses, after `fits_all`."""
         loop, descent = self.loop, self.descent
-        plain, everything = descent.state(), float(descent.chi2.sum())
-        if everything <= self.settings.gate:
+        all_loops, total_chi2 = descent.state(), float(descent.chi2.sum())
+        if total_chi2 <= self.settings.gate:
             return self  # no single loop can exceed the gate
         gate = self._gate(descent.chi2[loop])
         if not (descent.chi2[loop] <= gate).all():
@@ -122,20 +122,20 @@ class GraduatedNonConvexity:
             accepted = descent.chi2[loop] <= self.settings.gate * self.settings.max_inflation**2
             gate = self._gate(descent.chi2[loop][accepted])
             self.converged = self._iterate(gate)
-        if len(loop) <= _DENSE * len(self.problem.fixed):
+        if len(loop) <= _MAX_EDGES_PER_POSE * len(self.problem.fixed):
             self.converged = self._unmask(self.converged)
         if (self.weights == 1).all():
             return self
         limit = np.where(loop, gate, np.inf)
-        if np.minimum(descent.chi2, limit).sum() > (1 - _MIN_SAVING) * everything:
-            descent.restore(plain)
+        if np.minimum(descent.chi2, limit).sum() > (1 - _MIN_SAVING) * total_chi2:
+            descent.restore(all_loops)
             self.weights = np.ones(len(loop))
             self.converged = True
         else:
             self.limit = limit
         return self
 
-    def _with(self, weights: Float64) -> bool:
+    def _solve_with(self, weights: Float64) -> bool:
         settings = self.settings
         return self.descent.run(
             lambda x: weights * x, lambda x: weights, settings.tolerance, settings.max_iterations
@@ -165,41 +165,41 @@ class GraduatedNonConvexity:
         for _ in range(_MAX_ROUNDS):
             before = self.weights
             self.weights = np.where(self.loop & (self.descent.chi2 > gate), 0.0, 1.0)
-            converged = self._with(self.weights)
+            converged = self._solve_with(self.weights)
             if (self.weights == before).all():
                 return converged
         return False
 
     def _unmask(self, converged: bool) -> bool:
         """Accept and reject loops by their errors against all other edges."""
-        seen = set()
+        visited = set()
         for _ in range(_MAX_ROUNDS + int(self.loop.sum())):
-            d = self._against_the_others()
+            d = self._leave_one_out_errors()
             if d is None:
                 return converged
-            counts = self.loop & (self.weights > 0)
-            gate = self._gate(d[counts])
-            if (counts & (d > gate)).any():
+            accepted = self.loop & (self.weights > 0)
+            gate = self._gate(d[accepted])
+            if (accepted & (d > gate)).any():
                 # The worst first, as they raise the errors of others.
-                worst = counts & (d > max(gate, d[counts].max() / 2))
+                worst = accepted & (d > max(gate, d[accepted].max() / 2))
                 weights = np.where(worst, 0.0, self.weights)
             else:
-                weights = np.where(self.loop & ~counts & (d <= gate), 1.0, self.weights)
+                weights = np.where(self.loop & ~accepted & (d <= gate), 1.0, self.weights)
             key = weights.tobytes()
-            if (weights == self.weights).all() or key in seen:
+            if (weights == self.weights).all() or key in visited:
                 return converged
-            seen.add(key)
+            visited.add(key)
             self.weights = weights
-            converged = self._with(weights)
+            converged = self._solve_with(weights)
         return False
 
-    def _against_the_others(self) -> Float64 | None:
+    def _leave_one_out_errors(self) -> Float64 | None:
         """(m,) squared errors of loops against all other edges; None if the system is singular."""
         problem, descent = self.problem, self.descent
         factor = problem.factor(descent.poses, self.weights)
         if factor is None:
             return None
-        i, j = problem.joined.T
+        i, j = problem.all_pairs.T
         T_i_j = se3.inverse(descent.poses[i]) @ descent.poses[j]
         try:
             C = factor.relative_covariances(T_i_j)[: len(self.loop)][self.loop]

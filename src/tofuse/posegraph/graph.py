@@ -132,7 +132,7 @@ class PoseGraph:
         return replace(self, poses=poses)
 
     def subgraph(self, vertices: Intp, edges: Intp) -> PoseGraph:
-        """Return the graph of some vertices, and of some edges between them.
+        """Return the subgraph of vertices, and of edges between them.
 
         Parameters
         ----------
@@ -143,17 +143,17 @@ class PoseGraph:
         number[vertices] = np.arange(len(vertices))
         gravity, anchors = self.gravity, self.anchors
         if gravity is not None:
-            here = number[gravity.vertices] >= 0
+            kept = number[gravity.vertices] >= 0
             gravity = replace(
                 gravity,
-                vertices=number[gravity.vertices[here]],
-                directions=gravity.directions[here],
-                sigma=gravity.sigma[here],
+                vertices=number[gravity.vertices[kept]],
+                directions=gravity.directions[kept],
+                sigma=gravity.sigma[kept],
             )
         if anchors is not None:
-            here = number[anchors.vertices] >= 0
+            kept = number[anchors.vertices] >= 0
             anchors = Anchors(
-                number[anchors.vertices[here]], anchors.poses[here], anchors.information[here]
+                number[anchors.vertices[kept]], anchors.poses[kept], anchors.information[kept]
             )
         return PoseGraph(
             self.ids[vertices],
@@ -173,10 +173,10 @@ class PoseGraph:
         return se3.log(se3.inverse(self.measurements) @ T_i_j)
 
     def chi2(self, edges: Bool | None = None) -> float:
-        """Return the sum of squared errors weighted by the information, of some edges or all."""
+        """Return the sum of squared errors, weighted by the information, of all edges or some."""
         r = self.residuals()
-        each = np.einsum("mi,mij,mj->m", r, self.information, r)
-        return float(each.sum() if edges is None else each[edges].sum())
+        squared_errors = np.einsum("mi,mij,mj->m", r, self.information, r)
+        return float(squared_errors.sum() if edges is None else squared_errors[edges].sum())
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ class LoopRecord:
     accepted
         Whether it is in the pose graph.
     reason
-        Why it was rejected; may be empty.
+        Reason of the decision; may be empty.
     overlap
         Fraction of points with a correspondence, 0 to 1.
     rms_m

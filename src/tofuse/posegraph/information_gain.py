@@ -15,7 +15,7 @@ from tofuse.arrays import Float64, Intp
 
 # Approximate accuracy of a loop, m.
 _LOOP_SIGMA_M = 0.02
-# Maximum number of distinct positions: of more views, successive ones share one.
+# Maximum number of distinct positions: successive views share one if there are more.
 _MAX_POSITIONS = 1000
 
 
@@ -32,9 +32,9 @@ class InformationGain:
         n = len(variance)
         m = min(n, _MAX_POSITIONS)
         self._of_view = np.arange(n) * m // max(n, 1)
-        first = np.searchsorted(self._of_view, np.arange(m))
-        grown = np.maximum.accumulate(variance[first])
-        self._C = np.minimum.outer(grown, grown)
+        first_view = np.searchsorted(self._of_view, np.arange(m))
+        monotonic = np.maximum.accumulate(variance[first_view])
+        self._C = np.minimum.outer(monotonic, monotonic)
 
     def of(self, i: Intp | int, j: Intp | int) -> Float64:
         """Return the gain of loops between views i and j, in bits per direction.

@@ -7,7 +7,7 @@ itself. Those between the same two components are reduced to the largest pairwis
 free space; it must have no rival, and the camera must have been able to get there in time. This is
 decided after tracking: best first, each join together with those made before. A join that rests on
 a single link is then undone and searched for again, as more views have been joined to both sides
-since. A component that nothing joins stays separate.
+since. A component without a join stays separate.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from tofuse.registration.view_descriptor import (
 )
 from tofuse.registration.view_pair import register_pair
 
-# One search for so many frames, as long recordings have more places.
+# Frames for each additional search, as long recordings have more places.
 _FRAMES_PER_SEARCH = 50
 # View pairs that may confirm a join whose probability is not required.
-_CONFIRM = 4
+_MAX_CONFIRMING = 4
 # Largest weight of rival links, relative to the accepted ones.
-_RIVAL = 0.5
-_SHIFT = 0.35
+_MAX_RIVAL = 0.5
+_MAX_SHIFT = 0.35
 # Up to this many views, all pairs of descriptors are compared.
-_ALL = 512
+_MAX_EXHAUSTIVE = 512
 # Probabilities are not extrapolated beyond the data that their model was fitted to, a few hundred
 # poses.
 _MAX_PROBABILITY = 0.998
@@ -66,7 +66,7 @@ class Group:
     frames
         Number of their frames.
     bridged
-        Components that only motion over a gap connects to the first one, and how it is known.
+        Components that only motion over a gap connects to the first one, and its source.
     """
 
     T_group_component: Mapping[int, Float64]
@@ -107,7 +107,7 @@ class Joining(Bounded):
 
     def join(
         self,
-        stretches: Sequence[TrackedComponent],
+        components: Sequence[TrackedComponent],
         links: Sequence[Link],
         search: SearchOptions | None = None,
     ) -> list[Group]:
@@ -115,17 +115,17 @@ class Joining(Bounded):
 
         Parameters
         ----------
-        stretches
+        components
             The components.
         links
             Between frames of different components, from relocalization during tracking.
         search
             Range and effort of exhaustive searches for a pose; the default ones unless given.
         """
-        if len(stretches) == 1:
-            only = stretches[0]
-            return [Group({only.component: np.eye(4)}, (), len(only.frames))]
-        joiner = _Joiner(self, stretches, search or SearchOptions())
+        if len(components) == 1:
+            single = components[0]
+            return [Group({single.component: np.eye(4)}, (), len(single.frames))]
+        joiner = _Joiner(self, components, search or SearchOptions())
         for link in sorted(
             links, key=lambda link: (not link.certain, -(link.registration.probability or 0.0))
         ):
@@ -141,24 +141,24 @@ class Joining(Bounded):
 
 class _Joiner:
     def __init__(
-        self, options: Joining, stretches: Sequence[TrackedComponent], search: SearchOptions
+        self, options: Joining, components: Sequence[TrackedComponent], search: SearchOptions
     ) -> None:
         self._options, self._search = options, search
-        self._merged = MergedComponents(stretches)
+        self._merged = MergedComponents(components)
         self._checks = JoinChecks(self._merged)
         self._links: list[Link] = []
         self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
         self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
-        total = sum(len(s.frames) for s in stretches)
-        self._searches = options.searches + len(stretches) + total // _FRAMES_PER_SEARCH
+        total = sum(len(s.frames) for s in components)
+        self._searches = options.searches + len(components) + total // _FRAMES_PER_SEARCH
 
     def add(self, link: Link) -> None:
         """Add a link."""
         if {link.i, link.j} <= self._merged.component_of.keys():
             self._links.append(link)
             self._tried.add((link.i, link.j))
-            self._merged.remember_ends(link)
+            self._merged.add_path_nodes(link)
 
     def decide(self, *, single: bool = False) -> None:
         """Join merged components as long as links support it, those with the largest weight first.
@@ -170,20 +170,20 @@ class _Joiner:
         while True:
             proposals = []
             for (a, b), links in self._links_between().items():
-                found = self._proposal(self._merged.all[a], self._merged.all[b], links)
-                if found is not None:
-                    weight, chosen = found
+                proposal = self._proposal(self._merged.all[a], self._merged.all[b], links)
+                if proposal is not None:
+                    weight, chosen = proposal
                     proposals.append((-weight, a, b, chosen))
             for _, a, b, chosen in sorted(proposals, key=lambda p: p[:3]):
                 first, second = self._merged.all[a], self._merged.all[b]
-                if len(chosen) < 2 and not (single or self._need_not_wait(first, second, chosen)):
+                if len(chosen) < 2 and not (single or self._can_join_early(first, second, chosen)):
                     continue
                 if self._join(first, second, chosen):
                     break
             else:
                 return
 
-    def _need_not_wait(self, a: MergedComponent, b: MergedComponent, links: list[Link]) -> bool:
+    def _can_join_early(self, a: MergedComponent, b: MergedComponent, links: list[Link]) -> bool:
         """Whether a single link may join two merged components before all searches are done."""
         T_a_b = self._merged.T_a_b(a, b, _best(links))
         if np.isfinite(self._checks.speed).all():
@@ -194,13 +194,13 @@ class _Joiner:
 
     def _links_between(self) -> dict[tuple[int, int], list[Link]]:
         """Links by the positions (a, b), a < b, of the merged components that they connect."""
-        place = {c: k for k, merged in enumerate(self._merged.all) for c in merged.T}
-        found: dict[tuple[int, int], list[Link]] = {}
+        position = {c: k for k, merged in enumerate(self._merged.all) for c in merged.T}
+        links: dict[tuple[int, int], list[Link]] = {}
         for link in self._links:
-            a, b = sorted(place[self._merged.component_of[f]] for f in (link.i, link.j))
+            a, b = sorted(position[self._merged.component_of[f]] for f in (link.i, link.j))
             if a != b:
-                found.setdefault((a, b), []).append(link)
-        return found
+                links.setdefault((a, b), []).append(link)
+        return links
 
     def search_links(self) -> None:
         """Register views of different merged components, most similar first, within the budget."""
@@ -209,16 +209,16 @@ class _Joiner:
             return
         component = np.array([self._merged.component_of[v.index] for v in views])
         descriptors = np.stack([view_descriptor(v.view) for v in views])
-        if len(descriptors) <= _ALL:
+        if len(descriptors) <= _MAX_EXHAUSTIVE:
             i, j = np.nonzero(np.triu(component[:, None] != component))
-            far = mutual_dissimilarity(descriptors, _SHIFT)[i, j]
+            difference = mutual_dissimilarity(descriptors, _MAX_SHIFT)[i, j]
         else:  # by an index, as all pairs would be too many
-            i, j = similar_views(descriptors, _SHIFT)
-            across = component[i] != component[j]
-            i, j = i[across], j[across]
-            far = pairwise_dissimilarity(descriptors, i, j, _SHIFT)
-        order = np.lexsort((j, i, far))
-        between: dict[tuple[int, int], int] = {}
+            i, j = similar_views(descriptors, _MAX_SHIFT)
+            separate = component[i] != component[j]
+            i, j = i[separate], j[separate]
+            difference = pairwise_dissimilarity(descriptors, i, j, _MAX_SHIFT)
+        order = np.lexsort((j, i, difference))
+        tried: dict[tuple[int, int], int] = {}
         for k in order.tolist():
             if self._searches < 1 or len(self._merged.all) < 2:
                 return
@@ -226,12 +226,12 @@ class _Joiner:
             pair = first.index, second.index
             if pair in self._tried or self._merged.is_joined(first, second):
                 continue
-            ends = (int(component[i[k]]), int(component[j[k]]))
-            between[ends] = between.get(ends, 0) + 1
-            if between[ends] > self._options.tries:
+            components = (int(component[i[k]]), int(component[j[k]]))
+            tried[components] = tried.get(components, 0) + 1
+            if tried[components] > self._options.tries:
                 continue
             self._tried.add(pair)
-            link = self._registered(first, second)
+            link = self._register(first, second)
             if link is not None:
                 self.add(link)
                 self.decide()
@@ -256,7 +256,7 @@ class _Joiner:
 
     def bridge_gaps(self) -> None:
         """Connect components across gaps by odometry, or by the motion before and after."""
-        ordered = sorted(self._merged.stretches.values(), key=lambda s: int(s.frames[0]))
+        ordered = sorted(self._merged.tracked.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
             a, b = (
                 self._merged.of_component(before.component),
@@ -275,84 +275,88 @@ class _Joiner:
 
     def groups(self) -> list[Group]:
         """Return the joined groups, the main one first, then by decreasing size."""
-        stretches, found = self._merged.stretches, []
+        tracked, result = self._merged.tracked, []
         for merged in self._merged.all:
-            order = sorted(merged.T, key=lambda c: int(stretches[c].frames[0]))
+            order = sorted(merged.T, key=lambda c: int(tracked[c].frames[0]))
             first = order[0]
             to_first = se3.inverse(merged.T[first])
-            found.append(
+            result.append(
                 Group(
                     {c: to_first @ merged.T[c] for c in order},
                     tuple(merged.joins),
-                    sum(len(stretches[c].frames) for c in merged.T),
+                    sum(len(tracked[c].frames) for c in merged.T),
                     self._merged.bridged_from(merged, first),
                 )
             )
-        began = [int(stretches[next(iter(g.T_group_component))].frames[0]) for g in found]
-        lowest = min(stretches) if self._options.main == "first" else None
-        main = [lowest in g.T_group_component for g in found]
-        order = sorted(range(len(found)), key=lambda k: (not main[k], -found[k].frames, began[k]))
-        return [found[k] for k in order]
+        first_frames = [int(tracked[next(iter(g.T_group_component))].frames[0]) for g in result]
+        lowest = min(tracked) if self._options.main == "first" else None
+        is_main = [lowest in g.T_group_component for g in result]
+        order = sorted(
+            range(len(result)), key=lambda k: (not is_main[k], -result[k].frames, first_frames[k])
+        )
+        return [result[k] for k in order]
 
-    def _registered(self, first: View, second: View) -> Link | None:
+    def _register(self, first: View, second: View) -> Link | None:
         """Register two similar views; only an exhaustive search counts against the budget."""
-        found = register_pair(
+        registration = register_pair(
             second.view,
             first.view,
             usual=self._checks.usual,
             options=self._search,
             rival_m=DISTINCT_M,
         )
-        if found is None or found.margin is not None:
+        if registration is None or registration.margin is not None:
             self._searches -= 1
-        return link_of(first, second, found)
+        return link_of(first, second, registration)
 
     def _proposal(
-        self, a: MergedComponent, b: MergedComponent, between: list[Link]
+        self, a: MergedComponent, b: MergedComponent, links: list[Link]
     ) -> tuple[float, list[Link]] | None:
         """The consistent links between merged components, and their weight; None without one."""
-        key = _key(a, b, between)
+        key = _key(a, b, links)
         if key in self._refused:
             return None
         if key in self._proposals:
             return self._proposals[key]
-        T = [self._merged.T_a_b(a, b, link) for link in between]
-        n = len(between)
-        agree = np.ones((n, n), bool)
+        T = [self._merged.T_a_b(a, b, link) for link in links]
+        n = len(links)
+        consistent = np.ones((n, n), bool)
         for p in range(n):
             for q in range(p + 1, n):
-                agree[p, q] = agree[q, p] = self._merged.consistent(
-                    a, b, between[p], between[q], T[p], T[q]
+                consistent[p, q] = consistent[q, p] = self._merged.consistent(
+                    a, b, links[p], links[q], T[p], T[q]
                 )
-        weights = [_weight(link) for link in between]
-        chosen = maximum_consistent_set(agree, weights)
+        weights = [_weight(link) for link in links]
+        chosen = maximum_consistent_set(consistent, weights)
         weight = sum(weights[k] for k in chosen)
-        rest = [k for k in range(n) if not agree[k, chosen].all()]
-        rivals = maximum_consistent_set(agree[np.ix_(rest, rest)], [weights[k] for k in rest])
-        if sum(weights[rest[k]] for k in rivals) > _RIVAL * weight:
+        others = [k for k in range(n) if not consistent[k, chosen].all()]
+        rivals = maximum_consistent_set(
+            consistent[np.ix_(others, others)], [weights[k] for k in others]
+        )
+        if sum(weights[others[k]] for k in rivals) > _MAX_RIVAL * weight:
             self._refused.add(key)
             return None
-        self._proposals[key] = weight, [between[k] for k in chosen]
+        self._proposals[key] = weight, [links[k] for k in chosen]
         return self._proposals[key]
 
     def _join(self, a: MergedComponent, b: MergedComponent, links: list[Link]) -> bool:
         """Join two merged components if the pose of the links is verified."""
         best = _best(links)
         T_a_b = self._merged.T_a_b(a, b, best)
-        extra = self._confirming(a, b, T_a_b, links)
+        confirming = self._confirming(a, b, T_a_b, links)
         certain = any(link.certain for link in links)
-        minimum = self._options.min_probability
-        probability = self._probability(a, b, [*links, *extra]) if minimum else None
+        min_probability = self._options.min_probability
+        probability = self._probability(a, b, [*links, *confirming]) if min_probability else None
         if (
-            not (certain or len(links) + len(extra) > 1)
-            or (probability is not None and probability < minimum)
+            not (certain or len(links) + len(confirming) > 1)
+            or (probability is not None and probability < min_probability)
             or self._checks.contradicts(a, b, best)
             or not self._checks.reachable(a, b, T_a_b)
         ):
-            between = self._links_between()[self._merged.positions(a, b)]
-            self._refused.add(_key(a, b, between))
+            links_between = self._links_between()[self._merged.positions(a, b)]
+            self._refused.add(_key(a, b, links_between))
             return False
-        joins = [Join(link, "links", link is best, probability) for link in [*links, *extra]]
+        joins = [Join(link, "links", link is best, probability) for link in [*links, *confirming]]
         self._merged.merge(a, b, best, joins)
         return True
 
@@ -363,28 +367,29 @@ class _Joiner:
         pairs (Bonferroni).
         """
         counted: list[Link] = []
-        total = 0.0
+        log_odds = 0.0
         for link in sorted(links, key=lambda link: -(link.registration.probability or 0.0)):
             p = min(link.registration.probability or 0.0, _MAX_PROBABILITY)
             if p <= 0:
                 continue
-            new = min(
-                [1.0, *(self._merged.apart(a, b, link, other) / IN_SIGHT for other in counted)]
+            independence = min(
+                [1.0, *(self._merged.separation(a, b, link, other) / IN_SIGHT for other in counted)]
             )
-            total += new * float(np.log(p / (1 - p)))
+            log_odds += independence * float(np.log(p / (1 - p)))
             counted.append(link)
-        ours = {f for f, c in self._merged.component_of.items() if c in a.T}
-        theirs = {f for f, c in self._merged.component_of.items() if c in b.T}
+        frames_a = {f for f, c in self._merged.component_of.items() if c in a.T}
+        frames_b = {f for f, c in self._merged.component_of.items() if c in b.T}
         tried = sum(
-            (i in ours and j in theirs) or (i in theirs and j in ours) for i, j in self._tried
+            (i in frames_a and j in frames_b) or (i in frames_b and j in frames_a)
+            for i, j in self._tried
         )
-        return logistic(total - float(np.log(max(tried, 1))))
+        return logistic(log_odds - float(np.log(max(tried, 1))))
 
     def _confirming(
-        self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, known: list[Link]
+        self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, links: list[Link]
     ) -> list[Link]:
-        count = VERIFY if self._options.min_probability else _CONFIRM
-        return self._checks.confirming(a, b, T_a_b, known, count)
+        count = VERIFY if self._options.min_probability else _MAX_CONFIRMING
+        return self._checks.confirming(a, b, T_a_b, links, count)
 
 
 def _best(links: Sequence[Link]) -> Link:
@@ -392,9 +397,9 @@ def _best(links: Sequence[Link]) -> Link:
     return max(links, key=lambda link: (link.certain, _weight(link)))
 
 
-def _key(a: MergedComponent, b: MergedComponent, between: Sequence[Link]) -> tuple[int, ...]:
+def _key(a: MergedComponent, b: MergedComponent, links: Sequence[Link]) -> tuple[int, ...]:
     """Key of a decision: two merged components, and the number of links between them."""
-    return (*sorted(a.T), -1, *sorted(b.T), -1, len(between))
+    return (*sorted(a.T), -1, *sorted(b.T), -1, len(links))
 
 
 def _weight(link: Link) -> float:

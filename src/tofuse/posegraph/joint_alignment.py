@@ -2,7 +2,7 @@
 
 Every pair of overlapping views gives the normal equations of its relative pose. The adjoint turns
 them into equations in both poses, and one sparse system updates all poses. Correspondences are
-then found anew, until convergence: the iteration that chapter 8 of the thesis suggests, with
+then recomputed, until convergence: the iteration that chapter 8 of the thesis suggests, with
 planes and albedo in place of points. Errors of the camera that all views share can be unknowns of
 the same system.
 """
@@ -36,7 +36,7 @@ from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.view_store import SampledView, overlaps
 
 _ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
-# Overlaps are computed anew after a larger motion, in units of 1 cm and 1 degree.
+# Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.
 _MAX_MOTION = 2.0
 # Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
 # it has converged: small, as the errors of the pairs of a loop add up.
@@ -51,7 +51,7 @@ class Support:
     ----------
     target, source
         (P,) positions of the views.
-    good
+    score
         (P,) sum over its residuals, each from 1 (zero) to 0 (at the robust limit or beyond), minus
         twice the number of points in free space.
     terms
@@ -60,14 +60,14 @@ class Support:
 
     target: Intp
     source: Intp
-    good: Float64
+    score: Float64
     terms: Float64
 
-    def of_views(self, count: int) -> Float64:
-        """(N,) support of each of `count` views by all overlapping ones, 1 at most."""
-        total, terms = np.zeros(count), np.zeros(count)
+    def of_views(self, view_count: int) -> Float64:
+        """(N,) support of each of `view_count` views by all overlapping ones, 1 at most."""
+        total, terms = np.zeros(view_count), np.zeros(view_count)
         for ends in (self.target, self.source):
-            np.add.at(total, ends, self.good)
+            np.add.at(total, ends, self.score)
             np.add.at(terms, ends, self.terms)
         return total / np.maximum(terms, 1)
 
@@ -112,31 +112,31 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Rigid bodies of views, as those of a rig's cameras at one instant.
+    """Rigid bodies of views, such as those of a rig's cameras at one instant.
 
     Attributes
     ----------
-    of
+    body_of_view
         (N,) number of the body of each view; 0 is that of the first.
     T_body_view
         (N, 4, 4) pose of each view in its body.
     """
 
-    of: Intp
+    body_of_view: Intp
     T_body_view: Float64
 
-    def poses(self, views: Float64) -> Float64:
+    def body_poses(self, view_poses: Float64) -> Float64:
         """(M, 4, 4) T_world_body, by the poses (N, 4, 4) of their first views."""
-        _, first = np.unique(self.of, return_index=True)
-        return views[first] @ se3.inverse(self.T_body_view[first])
+        _, first = np.unique(self.body_of_view, return_index=True)
+        return view_poses[first] @ se3.inverse(self.T_body_view[first])
 
-    def views(self, bodies: Float64) -> Float64:
+    def view_poses(self, body_poses: Float64) -> Float64:
         """(N, 4, 4) T_world_view, by the poses (M, 4, 4) of their bodies."""
-        return np.asarray(bodies[self.of] @ self.T_body_view, np.float64)
+        return np.asarray(body_poses[self.body_of_view] @ self.T_body_view, np.float64)
 
     def across(self, pairs: Intp) -> Intp:
         """Those of the pairs (M, 2) of views that belong to different bodies."""
-        i, j = self.of[pairs].T
+        i, j = self.body_of_view[pairs].T
         return pairs[i != j]
 
 
@@ -165,15 +165,15 @@ def refine(
     priors
         Measurements by other sensors.
     pairs
-        (M, 2) positions of the views i < j to compare; by default those that overlap, computed
-        anew before a round if views have moved.
+        (M, 2) positions of the views i < j to compare; by default those that overlap, recomputed
+        before a round if views have moved.
     bodies
         Views that move rigidly together, if any. `priors` then refers to the bodies.
     """
     if bodies is not None:
-        poses = bodies.views(bodies.poses(poses))
+        poses = bodies.view_poses(bodies.body_poses(poses))
     start = poses
-    found = align_views(
+    aligned = align_views(
         views,
         poses,
         options,
@@ -182,18 +182,27 @@ def refine(
         pairs=pairs,
         bodies=bodies,
     )
-    poses, errors, state, known = found.poses, found.errors, found.state, found.known
-    half = len(state.target) // 2
-    pairs = np.stack([state.target[:half], state.source[:half]], 1)
-    last = options.rounds[-1]
+    poses, errors, state, fixed_errors = (
+        aligned.poses,
+        aligned.errors,
+        aligned.state,
+        aligned.fixed_errors,
+    )
+    count = len(state.target) // 2
+    pairs = np.stack([state.target[:count], state.source[:count]], 1)
+    final_round = options.rounds[-1]
     by_patch = not calibrate and depends_on_patches(state, options)
-    after = _support(views, poses, errors, known, state, last, options, by_patch=by_patch)
+    after = _support(
+        views, poses, errors, fixed_errors, state, final_round, options, by_patch=by_patch
+    )
     if by_patch:
         discount_shared(views, poses, state, options)
     measured = _pairwise_measurements(poses, pairs, state)
-    before = _support(views, start, np.zeros_like(errors), known, state, last, options)
+    before = _support(
+        views, start, np.zeros_like(errors), fixed_errors, state, final_round, options
+    )
     scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
-    return Refined(poses, start, errors, pairs, found.moved, before, after, *measured, scales)
+    return Refined(poses, start, errors, pairs, aligned.moved, before, after, *measured, scales)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +215,8 @@ class AlignedViews:
         (N, 4, 4) T_world_camera and (ERRORS,) errors of the camera.
     state
         Residuals and scales of the pairs.
-    known
-        (ERRORS,) 0 for the errors that were estimated, else 1.
+    fixed_errors
+        (ERRORS,) mask: 0 for the errors that were estimated, else 1.
     moved
         Largest motion of a view in each iteration, in units of 1 cm and 1 degree.
     """
@@ -215,7 +224,7 @@ class AlignedViews:
     poses: Float64
     errors: Float64
     state: DirectedPairs
-    known: Int64
+    fixed_errors: Int64
     moved: tuple[float, ...]
 
 
@@ -232,39 +241,39 @@ def align_views(
 ) -> AlignedViews:
     """Do as `refine` does, without measuring the support and the pairs of the result.
 
-    Gauss-Newton on all residuals, with correspondences found anew. The parameters are those of
-    `refine`.
+    Gauss-Newton on all residuals, with correspondences recomputed in each iteration. The parameters
+    are those of `refine`.
     """
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
-    known = np.ones(kernels.ERRORS, np.int64)
-    known[list(calibrate)] = 0
-    moved: list[float] = []
-    near = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    state = directed_pairs(views, near, options)
+    fixed_errors = np.ones(kernels.ERRORS, np.int64)
+    fixed_errors[list(calibrate)] = 0
+    motions: list[float] = []
+    overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
+    state = directed_pairs(views, overlapping, options)
     system = _system(state, len(views), priors, bodies)
-    since = 0.0
+    motion_since_overlaps = 0.0
     for stage in options.rounds:
-        if since >= _MAX_MOTION:
-            near = _overlapping(views, poses, options, bodies)
-            state = directed_pairs(views, near, options, state)
+        if motion_since_overlaps >= _MAX_MOTION:
+            overlapping = _overlapping(views, poses, options, bodies)
+            state = directed_pairs(views, overlapping, options, state)
             system = _system(state, len(views), priors, bodies)
-            since = 0.0
+            motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
-            last = stage is options.rounds[-1] and not calibrate
-            by_patch = last and depends_on_patches(state, options)
-            evaluate(views, poses, errors, known, state, stage, options, by_patch=by_patch)
+            is_last = stage is options.rounds[-1] and not calibrate
+            by_patch = is_last and depends_on_patches(state, options)
+            evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
             if by_patch:
                 discount_shared(views, poses, state, options)
-            step, change = _solve(poses, state, system, known, priors, bodies)
-            poses = _moved(poses, step, bodies)
-            errors = errors + change
+            step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
+            poses = _apply_step(poses, step, bodies)
+            errors = errors + error_step
             rescale(state, stage)
-            moved.append(float(np.abs(step / UNITS).max()))
-            since += moved[-1] if pairs is None else 0.0
-            if moved[-1] < options.convergence:
+            motions.append(float(np.abs(step / UNITS).max()))
+            motion_since_overlaps += motions[-1] if pairs is None else 0.0
+            if motions[-1] < options.convergence:
                 break
-    return AlignedViews(poses, errors, state, known, tuple(moved))
+    return AlignedViews(poses, errors, state, fixed_errors, tuple(motions))
 
 
 def support_of(
@@ -273,8 +282,8 @@ def support_of(
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     state = directed_pairs(views, refined.pairs, options)
     state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
-    known = (refined.errors == 0).astype(np.int64)
-    return _support(views, poses, refined.errors, known, state, options.rounds[-1], options)
+    fixed_errors = (refined.errors == 0).astype(np.int64)
+    return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
 
 
 def align_pairs(
@@ -284,7 +293,7 @@ def align_pairs(
     options: RefineOptions,
     errors: Float64,
 ) -> Float64:
-    """(M, 4, 4) relative poses T_i_j of pairs, each aligned by itself.
+    """(M, 4, 4) relative poses T_i_j of pairs, each aligned separately.
 
     Parameters
     ----------
@@ -303,18 +312,18 @@ def align_pairs(
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
     state = directed_pairs(views, ends, options)
-    known, stage = np.ones(len(errors), np.int64), options.rounds[-1]
+    fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
-        both = np.concatenate([active, active + count])
-        part = state.of(both)
-        evaluate(views, poses, errors, known, part, stage, options)
-        aligned, _ = _pairwise_measurements(poses, ends[active], part)
-        rescale(part, stage)
-        state.put(both, part)
-        at = 2 * active + 1
-        step = se3.log(se3.inverse(poses[at]) @ aligned) / UNITS
-        poses[at] = se3.orthonormalise(aligned)
+        directed = np.concatenate([active, active + count])
+        subset = state.subset(directed)
+        evaluate(views, poses, errors, fixed_errors, subset, stage, options)
+        aligned, _ = _pairwise_measurements(poses, ends[active], subset)
+        rescale(subset, stage)
+        state.put(directed, subset)
+        sources = 2 * active + 1
+        step = se3.log(se3.inverse(poses[sources]) @ aligned) / UNITS
+        poses[sources] = se3.orthonormalise(aligned)
         active = active[np.abs(step).max(1) >= _PAIR_CONVERGED]
         if not len(active):
             break
@@ -346,64 +355,64 @@ def _overlapping(
     return spread_evenly(pairs, options.neighbours)
 
 
-def _moved(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
+def _apply_step(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
     """Apply a step to the views, or to their bodies; the first stays."""
-    free = poses if bodies is None else bodies.poses(poses)
-    out = se3.orthonormalise(free @ se3.exp(step))
-    out[0] = free[0]
-    return out if bodies is None else bodies.views(out)
+    current = poses if bodies is None else bodies.body_poses(poses)
+    updated = se3.orthonormalise(current @ se3.exp(step))
+    updated[0] = current[0]
+    return updated if bodies is None else bodies.view_poses(updated)
 
 
 def _support(
     views: Sequence[SampledView],
     poses: Float64,
     errors: Float64,
-    known: Int64,
+    fixed_errors: Int64,
     state: DirectedPairs,
     stage: Round,
     options: RefineOptions,
     *,
     by_patch: bool = False,
 ) -> Support:
-    evaluate(views, poses, errors, known, state, stage, options, by_patch=by_patch)
-    good = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
+    evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
+    score = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
     # A copy, as a view would keep the equations of all pairs in memory.
-    return Support(state.target, state.source, good, state.rows[:, kernels.TERMS].copy())
+    return Support(state.target, state.source, score, state.rows[:, kernels.TERMS].copy())
 
 
 def _pairwise_measurements(
     poses: Float64, pairs: Intp, state: DirectedPairs
 ) -> tuple[Float64, Float64]:
-    """T_i_j that each pair alone measures, and its information."""
+    """Measurement T_i_j of each pair alone, and its information."""
     H, g = without_exposure(state)
     H, g = H[:, :6, :6], g[:, :6]
-    half = len(pairs)
+    count = len(pairs)
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
     # A perturbation of T_i_j is the opposite one of T_j_i, in the other frame.
     A = -se3.adjoint(T_i_j)
     At = np.swapaxes(A, 1, 2)
-    H = H[:half] + At @ H[half:] @ A
-    g = g[:half] + (At @ g[half:, :, None])[..., 0]
+    H = H[:count] + At @ H[count:] @ A
+    g = g[:count] + (At @ g[count:, :, None])[..., 0]
     scaled = H * np.outer(UNITS, UNITS) + WEAK * np.eye(6)
     step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
     return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
 
 def _system(
-    state: DirectedPairs, views: int, priors: Priors, bodies: Bodies | None = None
+    state: DirectedPairs, view_count: int, priors: Priors, bodies: Bodies | None = None
 ) -> PairSystem:
     """Return the sparse system of all views, or of their bodies."""
     ends = np.stack([state.target, state.source], 1)
     if bodies is None:
-        return priors.system(views, ends)
-    return priors.system(int(bodies.of.max()) + 1, bodies.of[ends])
+        return priors.system(view_count, ends)
+    return priors.system(int(bodies.body_of_view.max()) + 1, bodies.body_of_view[ends])
 
 
 def _solve(
     poses: Float64,
     state: DirectedPairs,
     system: PairSystem,
-    known: Int64,
+    fixed_errors: Int64,
     priors: Priors,
     bodies: Bodies | None = None,
 ) -> tuple[Float64, Float64]:
@@ -415,86 +424,89 @@ def _solve(
         A[:, :6, :6] = se3.adjoint(se3.inverse(bodies.T_body_view[state.source]))
         At = np.swapaxes(A, 1, 2)
         H, g = At @ H @ A, (At @ g[..., None])[..., 0]
-        poses = bodies.poses(poses)
-    free = 6 + np.flatnonzero(known == 0)
-    n, m = len(poses), len(priors.pairs)
+        poses = bodies.body_poses(poses)
+    error_columns = 6 + np.flatnonzero(fixed_errors == 0)
+    n, prior_count = len(poses), len(priors.pairs)
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
-    more_H, more_g = priors.equations(T_i_j[len(H) :])
-    prior = weak_prior(n)
-    shared = _Shared(
-        [system.gradient(np.concatenate([H[:, :6, k], np.zeros((m, 6))]), T_i_j) for k in free],
-        H[:, free[:, None], free].sum(0),
-        g[:, free].sum(0),
+    prior_H, prior_g = priors.equations(T_i_j[len(H) :])
+    unary = weak_prior(n)
+    shared = _SharedUnknowns(
+        [
+            system.gradient(np.concatenate([H[:, :6, k], np.zeros((prior_count, 6))]), T_i_j)
+            for k in error_columns
+        ],
+        H[:, error_columns[:, None], error_columns].sum(0),
+        g[:, error_columns].sum(0),
     )
-    damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.small.diagonal()
+    damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
     if priors.gravity is not None:
         damping = np.append(damping, np.zeros(2))
-        _add_gravity(poses, priors.gravity, prior, shared, system)
+        _add_gravity(poses, priors.gravity, unary, shared, system)
     matrix, gradient = system.relative(
-        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, prior
+        np.concatenate([H[:, :6, :6], prior_H]), np.concatenate([g[:, :6], prior_g]), T_i_j, unary
     )
     factor = system.factor(matrix, gradient, DAMPING)
     assert factor is not None, "every pose has a prior, so the system is not singular"
     # Schur complement: the shared unknowns have a small dense system.
-    columns, small, right = shared.columns, shared.small, shared.right
-    step = _finite(factor.step())
-    follow = np.zeros((len(columns), n, 6))
-    for k, column in enumerate(columns):
-        follow[k] = _finite(factor.solve(column))
-        right[k] += column.ravel() @ step[system.free].ravel()
-    for k, column in enumerate(columns):
-        small[k] += follow[:, system.free].reshape(len(columns), -1) @ column.ravel()
-    small[np.diag_indices(len(columns))] += damping
-    change = -np.linalg.solve(small, right)
+    coupling, schur, reduced_gradient = shared.coupling, shared.H, shared.g
+    step = _checked(factor.step())
+    response = np.zeros((len(coupling), n, 6))
+    for k, column in enumerate(coupling):
+        response[k] = _checked(factor.solve(column))
+        reduced_gradient[k] += column.ravel() @ step[system.free].ravel()
+    for k, column in enumerate(coupling):
+        schur[k] += response[:, system.free].reshape(len(coupling), -1) @ column.ravel()
+    schur[np.diag_indices(len(coupling))] += damping
+    shared_step = -np.linalg.solve(schur, reduced_gradient)
     errors = np.zeros(kernels.ERRORS)
-    errors[free - 6] = change[: len(free)]
-    return step + np.tensordot(change, follow, 1), errors
+    errors[error_columns - 6] = shared_step[: len(error_columns)]
+    return step + np.tensordot(shared_step, response, 1), errors
 
 
 @dataclass(eq=False)
-class _Shared:
-    """Normal equations of unknowns that all poses share: columns, own block, and gradient."""
+class _SharedUnknowns:
+    """Normal equations of unknowns that all poses share: coupling with poses, block, gradient."""
 
-    columns: list[Float64]
-    small: Float64
-    right: Float64
+    coupling: list[Float64]
+    H: Float64
+    g: Float64
 
 
 def _add_gravity(
     poses: Float64,
     gravity: Gravity,
-    single: tuple[Float64, Float64],
-    shared: _Shared,
+    unary: tuple[Float64, Float64],
+    shared: _SharedUnknowns,
     system: PairSystem,
 ) -> None:
     """Add gravity's equations of single poses, and of the world's vertical, which they share."""
-    at, d = gravity.vertices, gravity.directions
-    R = poses[at, :3, :3]
-    seen = (R @ d[..., None])[..., 0]
-    down = vertical(seen, gravity)
+    vertices, d = gravity.vertices, gravity.directions
+    R = poses[vertices, :3, :3]
+    observed = (R @ d[..., None])[..., 0]
+    down = vertical(observed, gravity)
     down /= np.linalg.norm(down)
-    across = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
-    e = seen - down
-    known = 1 / gravity.sigma**2
+    tangent = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
+    e = observed - down
+    weight = 1 / gravity.sigma**2
     if np.isfinite(gravity.gate):
-        known = known * robust.weight("geman-mcclure", (e * e).sum(1) * known, gravity.gate)
+        weight = weight * robust.weight("geman-mcclure", (e * e).sum(1) * weight, gravity.gate)
     J = -R @ se3.hat(d)
-    Jt = known[:, None, None] * np.swapaxes(J, 1, 2)
-    np.add.at(single[0][:, 3:, 3:], at, Jt @ J)
-    np.add.at(single[1][:, 3:], at, (Jt @ e[..., None])[..., 0])
-    cross = np.zeros((2, len(poses), 6))
+    Jt = weight[:, None, None] * np.swapaxes(J, 1, 2)
+    np.add.at(unary[0][:, 3:, 3:], vertices, Jt @ J)
+    np.add.at(unary[1][:, 3:], vertices, (Jt @ e[..., None])[..., 0])
+    coupling = np.zeros((2, len(poses), 6))
     for k in range(2):
-        np.add.at(cross[k][:, 3:], at, -Jt @ across[:, k])
-    shared.columns += [column[system.free] for column in cross]
-    own = len(shared.small)
-    small = np.zeros((own + 2, own + 2))
-    small[:own, :own] = shared.small
-    small[own:, own:] = known.sum() * np.eye(2)
-    shared.small = small
-    shared.right = np.append(shared.right, -across.T @ (known[:, None] * e).sum(0))
+        np.add.at(coupling[k][:, 3:], vertices, -Jt @ tangent[:, k])
+    shared.coupling += [column[system.free] for column in coupling]
+    count = len(shared.H)
+    H = np.zeros((count + 2, count + 2))
+    H[:count, :count] = shared.H
+    H[count:, count:] = weight.sum() * np.eye(2)
+    shared.H = H
+    shared.g = np.append(shared.g, -tangent.T @ (weight[:, None] * e).sum(0))
 
 
-def _finite(step: Float64 | None) -> Float64:
+def _checked(step: Float64 | None) -> Float64:
     assert step is not None, "the system is finite"
     return step

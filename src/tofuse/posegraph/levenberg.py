@@ -16,7 +16,7 @@ from tofuse.posegraph.branches import Branches
 from tofuse.posegraph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
-from tofuse.posegraph.sparse import bounded, parts_of
+from tofuse.posegraph.sparse import parts_of, sparsify
 
 _RIGID = 1e-3  # largest deviation of a rotation from orthonormal
 _MAX_POSITION_M = 1e9  # larger coordinates are corrupt
@@ -63,14 +63,14 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     poses = graph.poses.copy()
     weights = np.ones(len(graph.edges))
     parts, histories = [], []
-    found = pieces(graph)
+    components = connected_components(graph)
     first = np.zeros(len(graph.ids), np.bool_)
-    first[[vertices[0] for vertices, _ in found]] = True
+    first[[vertices[0] for vertices, _ in components]] = True
     branches = Branches(graph, first, eigenvalues)
     moved = np.zeros(len(graph.ids), np.bool_)
-    for vertices, edges in found:
+    for vertices, edges in components:
         core, kept = vertices[~branches.vertices[vertices]], edges[~branches.edges[edges]]
-        used = bounded(len(core), np.searchsorted(core, graph.edges[kept]))
+        used = sparsify(len(core), np.searchsorted(core, graph.edges[kept]))
         solution = _solve(graph.subgraph(core, kept[used]), settings)
         history = solution.history
         of_branches = float(branches.errors[edges].sum())
@@ -95,7 +95,7 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     branches.attach(poses, moved)
     return Optimisation(
         graph.with_poses(poses),
-        added_up(histories),
+        total_history(histories),
         all(p.converged for p in parts),
         weights,
         tuple(parts),
@@ -110,8 +110,8 @@ def _solve(graph: PoseGraph, settings: Settings) -> Solution:
         ends, Z = graph.anchors.vertices, graph.anchors.poses
         frame = poses[ends[0]] @ se3.inverse(Z[0])
         poses = np.concatenate([poses, frame[None]])
-        more = np.stack([np.full(len(ends), len(graph.ids)), ends], axis=1)
-        pairs = np.concatenate([pairs, more])
+        anchor_edges = np.stack([np.full(len(ends), len(graph.ids)), ends], axis=1)
+        pairs = np.concatenate([pairs, anchor_edges])
         measured = np.concatenate([measured, Z])
         information = np.concatenate([information, graph.anchors.information])
         loop = np.append(loop, np.zeros(len(ends), bool))
@@ -126,7 +126,7 @@ def _solve(graph: PoseGraph, settings: Settings) -> Solution:
 def _weights_of(
     graph: PoseGraph, edges: Intp, used: Bool, weights: Float64, settings: Settings
 ) -> Float64:
-    """Return the weights of the edges that were not used, see `bounded`, at the solution.
+    """Return the weights of the edges that were not used, see `sparsify`, at the solution.
 
     Loops that contradict the others more than those that were accepted have weight 0.
     """
@@ -140,7 +140,7 @@ def _weights_of(
     return np.where(graph.loop[left_out] & (chi2[left_out] > limit), 0.0, 1.0)
 
 
-def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
+def connected_components(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
     """Positions of the vertices and of the edges of each connected part.
 
     Anchors connect their vertices; gravity does not, as it leaves four of six directions free.
@@ -156,7 +156,7 @@ def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
     return [(np.flatnonzero(label == k), np.flatnonzero(of_edge == k)) for k in range(count)]
 
 
-def added_up(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
+def total_history(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
     """Objective of all parts together at every step; converged parts keep their last value."""
     length = max((len(h) for h in histories), default=1)
     padded = [[*h, *[h[-1]] * (length - len(h))] for h in histories]
@@ -190,8 +190,10 @@ def check_motions(graph: PoseGraph) -> None:
         if len(bad):
             raise InputError(f"{name} {bad[0]} is not finite", where="pose graph")
         R = np.clip(T[:, :3, :3], -10, 10)
-        off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2), initial=0)
-        far = np.abs(T[:, :3, 3]).max(1, initial=0)
-        bad = np.flatnonzero((off > _RIGID) | (far > _MAX_POSITION_M) | (np.linalg.det(R) < 0))
+        deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2), initial=0)
+        position = np.abs(T[:, :3, 3]).max(1, initial=0)
+        bad = np.flatnonzero(
+            (deviation > _RIGID) | (position > _MAX_POSITION_M) | (np.linalg.det(R) < 0)
+        )
         if len(bad):
             raise InputError(f"{name} {bad[0]} is not a rigid motion", where="pose graph")

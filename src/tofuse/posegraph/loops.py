@@ -28,7 +28,7 @@ GIVEN_INFORMATION = np.diag([1e4] * 6)
 
 @dataclass(frozen=True, eq=False)
 class GivenLoop:
-    """A loop given by the user, or closed before: frames i and j (indices, i < j) see one place.
+    """A loop given by the user, or closed before: frames i, j (indices, i < j) show one place.
 
     `T_i_j` is the (4, 4) relative pose, or None if it is to be registered. `by_user` is False if an
     earlier result closed it.
@@ -219,18 +219,20 @@ class Confirmation(Bounded):
             Of the run: the same pair and seed give the same result.
         """
         i, j = target.index, source.index
-        found: list[Registration] = []
+        registrations: list[Registration] = []
         failure = ""
         for start in (guess, np.eye(4)):
             try:
-                found.append(self._register(source, target, start, seed))
+                registrations.append(self._register(source, target, start, seed))
             except RegistrationError as error:
                 failure = failure or str(error)
-            if found and found[-1].believed is not None:
+            if registrations and registrations[-1].believed is not None:
                 break  # it searched for rival poses itself
-        if not found:
+        if not registrations:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
-        best = max(found, key=lambda r: (not self.rejection_reason(r), r.inlier_ratio, -r.error))
+        best = max(
+            registrations, key=lambda r: (not self.rejection_reason(r), r.inlier_ratio, -r.error)
+        )
         rejection_reason = self.rejection_reason(best)
         reason = rejection_reason or (
             f"{best.inlier_ratio:.0%} of the points correspond, with an error of "

@@ -1,4 +1,4 @@
-"""Merged components: those joined so far, in one frame each, and the paths through them."""
+"""Merged components: those joined so far, in a common frame, and the paths through them."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ class MergedComponents:
 
     Parameters
     ----------
-    stretches
+    tracked
         The components.
 
     Attributes
     ----------
     all
         The merged components.
-    stretches
+    tracked
         By component.
     component_of
         Component of each frame.
@@ -82,14 +82,14 @@ class MergedComponents:
         Stored views by frame.
     """
 
-    def __init__(self, stretches: Sequence[TrackedComponent]) -> None:
-        self.stretches = {s.component: s for s in stretches}
-        self.component_of = {int(f): s.component for s in stretches for f in s.frames}
-        self.views = {v.index: v for s in stretches for v in s.views}
-        self.all = [MergedComponent({s.component: np.eye(4)}) for s in stretches]
-        self._poses = {int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)}
+    def __init__(self, tracked: Sequence[TrackedComponent]) -> None:
+        self.tracked = {s.component: s for s in tracked}
+        self.component_of = {int(f): s.component for s in tracked for f in s.frames}
+        self.views = {v.index: v for s in tracked for v in s.views}
+        self.all = [MergedComponent({s.component: np.eye(4)}) for s in tracked]
+        self._poses = {int(f): T for s in tracked for f, T in zip(s.frames, s.poses, strict=True)}
         # Frames of each component that links or verification refer to.
-        self._nodes = {s.component: {v.index for v in s.views} for s in stretches}
+        self._nodes = {s.component: {v.index for v in s.views} for s in tracked}
         self._paths: dict[tuple[int, ...], dict[int, float]] = {}
 
     def of_component(self, component: int) -> MergedComponent:
@@ -106,7 +106,7 @@ class MergedComponents:
         return np.asarray(T, np.float64)
 
     def T_a_b(self, a: MergedComponent, b: MergedComponent, link: Link) -> Float64:
-        """Return the (4, 4) T_a_b implied by a link between merged components, either way."""
+        """Return the (4, 4) T_a_b implied by a link from a to b, or from b to a."""
         i, j, T = link.i, link.j, link.T_i_j
         if self.component_of[i] not in a.T:
             i, j, T = j, i, se3.inverse(T)
@@ -118,7 +118,7 @@ class MergedComponents:
 
     def depth_of(self, frame: int) -> float:
         """Return the typical depth of a frame's component, m."""
-        return self.stretches[self.component_of[frame]].depth
+        return self.tracked[self.component_of[frame]].depth
 
     def path(self, merged: MergedComponent, start: int) -> dict[int, float]:
         """Return the path lengths from a frame to those with stored views or joins.
@@ -146,12 +146,12 @@ class MergedComponents:
         if not edges:
             return {start: 0.0}
         i, j = np.array(edges).T
-        between = se3.inverse(T[i]) @ T[j]
+        motion = se3.inverse(T[i]) @ T[j]
         depth = np.array([self.depth_of(order[k]) for k in i])
-        far = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
-        graph = csr_array((far + 1e-9, (i, j)), shape=(len(order), len(order)))
-        away = dijkstra(graph, directed=False, indices=row[start])
-        return {f: float(away[k]) for f, k in row.items()}
+        lengths = np.linalg.norm(motion[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(motion))
+        graph = csr_array((lengths + 1e-9, (i, j)), shape=(len(order), len(order)))
+        distances = dijkstra(graph, directed=False, indices=row[start])
+        return {f: float(distances[k]) for f, k in row.items()}
 
     def consistent(
         self,
@@ -159,8 +159,8 @@ class MergedComponents:
         b: MergedComponent,
         first: Link,
         second: Link,
-        T: Float64,
-        other: Float64,
+        T_first: Float64,
+        T_second: Float64,
     ) -> bool:
         """Return whether the T_a_b of two links agree at the view of the first one.
 
@@ -169,29 +169,29 @@ class MergedComponents:
         i, j = self.ends(a, first)
         k, m = self.ends(a, second)
         drift = DRIFT * (self.path(a, i).get(k, np.inf) + self.path(b, j).get(m, np.inf))
-        at = self.T_merged(b, j)
-        between = se3.inverse(T @ at) @ other @ at
+        T_b_j = self.T_merged(b, j)
+        difference = se3.inverse(T_first @ T_b_j) @ T_second @ T_b_j
         depth = self.depth_of(j)
         return bool(
-            np.linalg.norm(between[:3, 3]) <= DISTINCT_M + drift * depth
-            and se3.angle(between) <= DISTINCT_RAD + drift
+            np.linalg.norm(difference[:3, 3]) <= DISTINCT_M + drift * depth
+            and se3.angle(difference) <= DISTINCT_RAD + drift
         )
 
-    def apart(self, a: MergedComponent, b: MergedComponent, link: Link, other: Link) -> float:
+    def separation(self, a: MergedComponent, b: MergedComponent, link: Link, other: Link) -> float:
         """Return the distance between the views of two links, on the side where it is larger.
 
         Translation as a fraction of the depth plus rotation in rad.
         """
-        far = []
+        distances = []
         for merged, i, k in zip((a, b), self.ends(a, link), self.ends(a, other), strict=True):
             T = se3.inverse(self.T_merged(merged, i)) @ self.T_merged(merged, k)
-            metres = float(np.linalg.norm(T[:3, 3]))
-            far.append(metres / self.depth_of(i) + float(se3.angle(T)))
-        return max(far)
+            distance_m = float(np.linalg.norm(T[:3, 3]))
+            distances.append(distance_m / self.depth_of(i) + float(se3.angle(T)))
+        return max(distances)
 
-    def in_time(self, c: int, d: int) -> tuple[TrackedComponent, TrackedComponent]:
+    def by_start_time(self, c: int, d: int) -> tuple[TrackedComponent, TrackedComponent]:
         """Return two components in the order in which they began."""
-        first, second = self.stretches[c], self.stretches[d]
+        first, second = self.tracked[c], self.tracked[d]
         return (first, second) if first.frames[0] < second.frames[0] else (second, first)
 
     def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
@@ -205,46 +205,46 @@ class MergedComponents:
         a.T.update(transformed(b.T, T_a_b))
         a.joins += [*b.joins, *joins]
         for join in joins:
-            self.remember_ends(join.link)
+            self.add_path_nodes(join.link)
         self.all.remove(b)
 
     def cut(self, join: Join) -> None:
         """Split a merged component at a join that alone connects its two sides."""
-        whole = self.of_component(self.components(join)[0])
-        self.all.remove(whole)
+        merged = self.of_component(self.components(join)[0])
+        self.all.remove(merged)
         self._paths.clear()
-        edges = [self.components(other) for other in whole.joins]
-        for side in sides_without(edges, whole.joins.index(join)):
-            T = {c: whole.T[c] for c in whole.T if c in side}
-            inside = [j for j in whole.joins if j is not join and self.components(j)[0] in side]
+        edges = [self.components(other) for other in merged.joins]
+        for side in sides_without(edges, merged.joins.index(join)):
+            T = {c: merged.T[c] for c in merged.T if c in side}
+            inside = [j for j in merged.joins if j is not join and self.components(j)[0] in side]
             self.all.append(MergedComponent(T, inside))
 
     def components(self, join: Join) -> tuple[int, int]:
         """Return the components that a join connects."""
         return self.component_of[join.link.i], self.component_of[join.link.j]
 
-    def remember_ends(self, link: Link) -> None:
+    def add_path_nodes(self, link: Link) -> None:
         """Add the frames of a link to those that paths are computed for."""
         for frame in (link.i, link.j):
             self._nodes[self.component_of[frame]].add(frame)
 
     def bridged_from(self, merged: MergedComponent, first: int) -> dict[int, How]:
-        """Return the components that no chain of links connects to the first one, and what does."""
+        """Return the components that only bridges connect to the first one, and their kind."""
 
-        def reached(*ways: How) -> set[int]:
-            out, changed = {first}, True
-            joined = [
+        def reachable(*kinds: How) -> set[int]:
+            nodes, changed = {first}, True
+            ends_of_joins = [
                 {self.component_of[j.link.i], self.component_of[j.link.j]}
                 for j in merged.joins
-                if j.how in ways
+                if j.how in kinds
             ]
             while changed:
-                more = {c for ends in joined if ends & out for c in ends}
-                changed = not more <= out
-                out |= more
-            return out
+                neighbours = {c for ends in ends_of_joins if ends & nodes for c in ends}
+                changed = not neighbours <= nodes
+                nodes |= neighbours
+            return nodes
 
-        by_links, by_odometry = reached("links"), reached("links", "odometry")
+        by_links, by_odometry = reachable("links"), reachable("links", "odometry")
         bridged: dict[int, How] = dict.fromkeys(merged.T.keys() - by_links, "motion")
         bridged.update(dict.fromkeys(by_odometry - by_links, "odometry"))
         return bridged

@@ -1,4 +1,4 @@
-"""Loops between cameras that are close together and look the same way (section 3.4)."""
+"""Loops between cameras that are close together and have similar headings (section 3.4)."""
 
 from __future__ import annotations
 
@@ -60,22 +60,24 @@ class Nearby(Bounded, LoopDetector):
         views: ViewStore[PreparedView],
         search: SearchOptions | None = None,
     ) -> Loops:
-        """See `LoopDetector.start`. What a person gives takes the place of what is found."""
+        """See `LoopDetector.start`. Given loops replace detected ones."""
         return _NearbyLoops(self, seed, given)
 
     def candidates(self, poses: Float64) -> Intp:
-        """Return the positions of the cameras that the newest may see again, best first.
+        """Return the positions of earlier cameras that may form a loop with the newest, best first.
 
         `poses` is (N, 4, 4) T_world_camera in the order of the frames; the newest comes last.
         """
-        old = poses[: max(0, len(poses) - self.min_gap)]
-        if len(old) == 0:
+        earlier = poses[: max(0, len(poses) - self.min_gap)]
+        if len(earlier) == 0:
             return np.zeros(0, np.intp)
-        distance = np.linalg.norm(old[:, :3, 3] - poses[-1, :3, 3], axis=1) / self.max_distance_m
-        angle = np.abs(yaw(se3.inverse(old) @ poses[-1])) / self.max_yaw_rad
-        near = np.flatnonzero((distance <= 1) & (angle <= 1))
-        order = np.argsort(distance[near] ** 2 + angle[near] ** 2, kind="stable")
-        return near[order[: self.per_frame]]
+        distance = (
+            np.linalg.norm(earlier[:, :3, 3] - poses[-1, :3, 3], axis=1) / self.max_distance_m
+        )
+        angle = np.abs(yaw(se3.inverse(earlier) @ poses[-1])) / self.max_yaw_rad
+        close = np.flatnonzero((distance <= 1) & (angle <= 1))
+        order = np.argsort(distance[close] ** 2 + angle[close] ** 2, kind="stable")
+        return close[order[: self.per_frame]]
 
 
 class _NearbyLoops(Loops):
@@ -96,10 +98,10 @@ class _NearbyLoops(Loops):
             self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
 
     def detection_job(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.detection_job`. They were found when the frame was added."""
+        """See `Loops.detection_job`. They were detected when the frame was added."""
         newest = next(reversed(self._poses))
-        found = [loop for (_, j), loop in self._closed.items() if j == newest]
-        return (lambda: found) if found else None
+        loops = [loop for (_, j), loop in self._closed.items() if j == newest]
+        return (lambda: loops) if loops else None
 
     def finish(
         self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]

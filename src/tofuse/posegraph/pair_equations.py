@@ -46,7 +46,7 @@ class RefineOptions:
     Attributes
     ----------
     rounds
-        From coarse to fine. Before each, overlaps are computed anew if any view has moved by more
+        From coarse to fine. Before each, overlaps are recomputed if any view has moved by more
         than about 2 cm or 2 degrees.
     overlap
         Smallest overlap of a pair, as a fraction of the views.
@@ -94,7 +94,7 @@ class DirectedPairs:
     rows
         (P, SIZE) sums of each pair, in the order of `kernels.pair_equations`.
     sums
-        (P, PATCHES, PATCH_SIZE) the same by patch of the target, or no patches.
+        (P, PATCHES, PATCH_SIZE) the same sums for each patch of the target; empty unless needed.
     """
 
     target: Intp
@@ -107,8 +107,8 @@ class DirectedPairs:
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
     sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
 
-    def of(self, which: Intp) -> DirectedPairs:
-        """Return some of the pairs, without their normal equations."""
+    def subset(self, which: Intp) -> DirectedPairs:
+        """Return a subset of the pairs, without their normal equations."""
         exposure, scale_g, scale_p = (column[which] for column in self._scales())
         return DirectedPairs(
             self.target[which],
@@ -120,10 +120,10 @@ class DirectedPairs:
             self.sources,
         )
 
-    def put(self, which: Intp, part: DirectedPairs) -> None:
-        """Take over the exposure and scales of some of the pairs."""
-        for mine, changed in zip(self._scales(), part._scales(), strict=True):
-            mine[which] = changed
+    def put(self, which: Intp, subset: DirectedPairs) -> None:
+        """Copy the exposure and scales of a subset into these pairs."""
+        for scale, updated in zip(self._scales(), subset._scales(), strict=True):
+            scale[which] = updated
 
     def _scales(self) -> tuple[Float64, Float64, Float64]:
         return self.exposure, self.scale_g, self.scale_p
@@ -133,9 +133,9 @@ def directed_pairs(
     views: Sequence[SampledView],
     pairs: Intp,
     options: RefineOptions,
-    before: DirectedPairs | None = None,
+    previous: DirectedPairs | None = None,
 ) -> DirectedPairs:
-    """Return both directions of each pair (M, 2), with their scales `before`, if any.
+    """Return both directions of each pair (M, 2), with the scales in `previous`, if any.
 
     `views` (N,) and `options` are as for `joint_alignment.refine`.
     """
@@ -143,33 +143,33 @@ def directed_pairs(
     source = np.concatenate([pairs[:, 1], pairs[:, 0]])
     n = len(target)
     max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
-    unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
+    initial = np.zeros(n), np.ones(n), np.full(n, 0.1)
     photometric = np.array([v.has_albedo for v in views]) & options.photometric
     sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
-    state = DirectedPairs(target, source, *unknown, max_scale[source], sources)
+    state = DirectedPairs(target, source, *initial, max_scale[source], sources)
     state.scale_p[~(photometric[target] & photometric[source])] = 0.0
-    if before is None:
+    if previous is None:
         return state
-    row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
-    old = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
+    row = {ts: k for k, ts in enumerate(zip(previous.target, previous.source, strict=True))}
+    old_row = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
     for name in ("exposure", "scale_g", "scale_p"):
-        getattr(state, name)[old >= 0] = getattr(before, name)[old[old >= 0]]
+        getattr(state, name)[old_row >= 0] = getattr(previous, name)[old_row[old_row >= 0]]
     return state
 
 
 def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourcePoints:
-    """Points of views; of those that occur several times only once."""
-    different = {id(v): v for v in views}
-    row = {key: k for k, key in enumerate(different)}
-    of = np.array([row[id(v)] for v in views], np.intp)
-    points = [np.zeros((0, POINT_SIZE), np.float32), *(v.points for v in different.values())]
-    patches = [v.patches for v in different.values()] if by_patch else []
-    ends = np.cumsum([len(p) for p in points])
+    """Concatenated points of all views; a view that occurs several times is stored once."""
+    unique = {id(v): v for v in views}
+    row = {key: k for k, key in enumerate(unique)}
+    row_of_view = np.array([row[id(v)] for v in views], np.intp)
+    points = [np.zeros((0, POINT_SIZE), np.float32), *(v.points for v in unique.values())]
+    patches = [v.patches for v in unique.values()] if by_patch else []
+    offsets = np.cumsum([len(p) for p in points])
     return kernels.SourcePoints(
         np.concatenate(points),
         np.concatenate([np.zeros(0, np.int64), *patches]),
-        ends[of],
-        ends[of + 1],
+        offsets[row_of_view],
+        offsets[row_of_view + 1],
         np.array([v.measures_range for v in views], np.bool_),
     )
 
@@ -178,7 +178,7 @@ def evaluate(
     views: Sequence[SampledView],
     poses: Float64,
     errors: Float64,
-    known: Int64,
+    fixed_errors: Int64,
     state: DirectedPairs,
     stage: Round,
     options: RefineOptions,
@@ -193,8 +193,8 @@ def evaluate(
         N views.
     poses
         (N, 4, 4) T_world_camera.
-    errors, known
-        (ERRORS,) errors of the camera, and 0 for those that are unknowns, else 1.
+    errors, fixed_errors
+        (ERRORS,) errors of the camera, and mask: 0 for those that are estimated, else 1.
     state
         Pairs and their scales; `rows` and `sums` are replaced.
     stage, options
@@ -215,8 +215,8 @@ def evaluate(
         for k in range(a, b):
             pairs = order[begin[k] : end[k]]
             target = views[targets[k]]
-            found = np.empty((len(pairs), kernels.SIZE))
-            of_patches = np.empty((len(pairs), *sums.shape[1:]))
+            pair_rows = np.empty((len(pairs), kernels.SIZE))
+            patch_sums = np.empty((len(pairs), *sums.shape[1:]))
             kernels.target_equations(
                 state.sources,
                 state.source[pairs],
@@ -231,21 +231,21 @@ def evaluate(
                     cosine,
                 ),
                 errors,
-                known,
+                fixed_errors,
                 target.measures_range,
-                found,
-                of_patches,
+                pair_rows,
+                patch_sums,
             )
-            rows[pairs], sums[pairs] = found, of_patches
+            rows[pairs], sums[pairs] = pair_rows, patch_sums
 
     run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
     state.rows, state.sums = rows, sums
 
 
 def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
-    """Return whether errors that patches share are allowed for.
+    """Return whether errors that patches share are modelled.
 
-    Only where there are photometric residuals: without them nothing more accurate is left.
+    Only if there are photometric residuals: without them no more accurate residuals remain.
     """
     return options.shared > 0 and bool((state.scale_p > 0).any())
 
@@ -253,7 +253,7 @@ def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
 def discount_shared(
     views: Sequence[SampledView], poses: Float64, state: DirectedPairs, options: RefineOptions
 ) -> None:
-    """Remove from the normal equations what depth errors shared by patches could explain.
+    """Remove the contribution of depth errors that patches share from the normal equations.
 
     `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
     """
@@ -263,10 +263,10 @@ def discount_shared(
     growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
     # Views of one recording come from one camera: their patches are correlated in the same way.
     correlation = shared_error.patch_correlation(views[0].shape)
-    some = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
-    sampled = photometric[some]
-    found = shared_error.disagreement(state.sums[sampled], state.rows[sampled], correlation)
-    variance = options.shared**2 * found.variance(growth[some]) * growth
+    sampled_rows = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
+    sampled = photometric[sampled_rows]
+    disagreement = shared_error.disagreement(state.sums[sampled], state.rows[sampled], correlation)
+    variance = options.shared**2 * disagreement.variance(growth[sampled_rows]) * growth
     if not variance.any():
         return
 
@@ -291,11 +291,11 @@ def without_exposure(state: DirectedPairs) -> tuple[Float64, Float64]:
     g = state.rows[:, kernels.G : kernels.G + kernels.UNKNOWNS]
     pivot = np.maximum(H[:, e, e], 1e-9)
     state.exposure -= np.clip(g[:, e] / pivot, -0.3, 0.3)
-    rest = np.delete(np.arange(kernels.UNKNOWNS), e)
-    lever = H[:, rest, e] / pivot[:, None]
+    kept = np.delete(np.arange(kernels.UNKNOWNS), e)
+    ratio = H[:, kept, e] / pivot[:, None]
     return (
-        H[:, rest[:, None], rest] - lever[:, :, None] * H[:, None, e, rest],
-        g[:, rest] - lever * g[:, [e]],
+        H[:, kept[:, None], kept] - ratio[:, :, None] * H[:, None, e, kept],
+        g[:, kept] - ratio * g[:, [e]],
     )
 
 
@@ -303,10 +303,10 @@ def rescale(state: DirectedPairs, stage: Round) -> None:
     """Estimate the sigmas of each pair from its residuals, as the tracker does."""
     counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
     enough = counts.sum(1) >= _MIN_COMPARED
-    seen = np.array([steps.scale_of_distances(row) for row in counts[enough]])
-    state.scale_g[enough] = np.clip(seen, 0.7, state.max_scale[enough])
+    distance_scale = np.array([steps.scale_of_distances(row) for row in counts[enough]])
+    state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale[enough])
     weight = state.rows[:, kernels.WEIGHT_P]
-    seen = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
+    albedo_scale = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
     used = (weight > 0) & (state.scale_p > 0)
-    scale = np.clip(np.hypot(seen, stage.photometric_inflation), 0.005, 0.5)
+    scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
     state.scale_p[used] = scale[used]

@@ -46,27 +46,29 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64, Float64]]:
-        found = []
+        results = []
         for (i, j), T in zip(pairs[start:stop].tolist(), T_i_j[start:stop], strict=True):
             target = [Target(surfaces[i], np.eye(4))]
             aligned = align(surfaces[j], target, T, _ALIGNMENT)
             C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
-            found.append((aligned.T_world_source, C, aligned.unobservable * UNITS))
-        return found
+            results.append((aligned.T_world_source, C, aligned.unobservable * UNITS))
+        return results
 
-    found = [one for chunk in run_chunks(work, len(pairs), 64) for one in chunk]
+    results = [result for chunk in run_chunks(work, len(pairs), 64) for result in chunk]
     ids = [view.index for view in views]
     edges = [
         Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
-        for (i, j), (T, C, _) in zip(pairs.tolist(), found, strict=True)
+        for (i, j), (T, C, _) in zip(pairs.tolist(), results, strict=True)
     ]
-    return without_degenerate(build_graph(ids, poses, edges), [weak for _, _, weak in found])
+    return without_degenerate(
+        build_graph(ids, poses, edges), [degenerate for _, _, degenerate in results]
+    )
 
 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
     """Return (M, 2) positions i < j of the views that are compared."""
-    kept = [SampledView.of(view.view, _PAIRS.points) for view in views]
-    pairs = spread_evenly(overlaps(kept, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
-    after = np.arange(1, len(views))
-    row = np.stack([after - 1, after], 1)
-    return np.unique(np.concatenate([pairs, row]), axis=0)
+    sampled = [SampledView.of(view.view, _PAIRS.points) for view in views]
+    pairs = spread_evenly(overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
+    later = np.arange(1, len(views))
+    consecutive = np.stack([later - 1, later], 1)
+    return np.unique(np.concatenate([pairs, consecutive]), axis=0)

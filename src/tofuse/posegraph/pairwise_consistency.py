@@ -1,8 +1,7 @@
-"""The largest set of measurements that agree pairwise (Mangelson et al., ICRA 2018).
+"""The largest set of pairwise consistent measurements (Mangelson et al., ICRA 2018).
 
-Measurements between two maps that are right all say the same; those that are wrong seldom agree
-with each other. Each is a vertex, each pair that agrees an edge: the maximum clique is the set to
-believe.
+Correct measurements between two maps are all consistent; wrong ones are rarely consistent with each
+other. Each is a vertex, each consistent pair an edge: the maximum clique is accepted.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ def maximum_consistent_set(consistent: Bool, weights: Sequence[float] | None = N
         nonlocal best, best_weight
         if total > best_weight:
             best, best_weight = list(chosen), total
-        left = float(sum(weight[c] for c in candidates))
+        remaining = float(sum(weight[c] for c in candidates))
         for k, c in enumerate(candidates):
-            if total + left <= best_weight:
+            if total + remaining <= best_weight:
                 return
-            left -= float(weight[c])
-            agreeing = [d for d in candidates[k + 1 :] if consistent[c, d]]
-            grow([*chosen, c], total + float(weight[c]), agreeing)
+            remaining -= float(weight[c])
+            compatible = [d for d in candidates[k + 1 :] if consistent[c, d]]
+            grow([*chosen, c], total + float(weight[c]), compatible)
 
     grow([], 0.0, [int(k) for k in order])
     return sorted(best)

@@ -13,7 +13,7 @@ from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
+from tofuse.posegraph.common_planes import SUPPORT_NOISE, Aligned, PlaneOptions, refine_clouds
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.refinement import (
     MAX_LOSS,
@@ -34,8 +34,8 @@ class Planes(Bounded, RefinementMethod):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
     See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
-    them. The outcome is accepted only if the views support each other about as well as before, and
-    views that lose support stay where their neighbours had them.
+    them. The result is accepted only if the views support each other about as well as before, and
+    views that lose support keep their pose relative to their neighbours.
 
     Attributes
     ----------
@@ -55,16 +55,16 @@ class Planes(Bounded, RefinementMethod):
 
 @dataclass(frozen=True, eq=False)
 class SampledPoints:
-    """What is kept of a view: some (n, 3) of its points in its frame, and their median range, m."""
+    """Sampled points (n, 3) of a view in its frame, and their median range, m."""
 
     index: int
     depth: float
     points: Float64
 
     @classmethod
-    def of(cls, view: Frame, most: int) -> SampledPoints:
-        """Keep at most so many points, at an even stride."""
-        points = view.points[:: max(1, -(-len(view) // most))].astype(np.float64)
+    def of(cls, view: Frame, max_points: int) -> SampledPoints:
+        """Sample at most `max_points` points, at an even stride."""
+        points = view.points[:: max(1, -(-len(view) // max_points))].astype(np.float64)
         depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
         return cls(view.index, depth, points)
 
@@ -88,24 +88,24 @@ class _Planes(Refiner):
         views = [posed.view for posed in self._store.of(row)]
         if len(views) < 2:
             return Refinement(poses, views=len(views))
-        at = np.array([row[view.index] for view in views], np.intp)
-        before = poses[at]
-        found = refine_clouds([view.points for view in views], before, PlaneOptions())
-        mean = float(found.before.mean()), float(found.after.mean())
-        unchanged = Refinement(poses, False, len(views), len(found.pairs), support=mean)
-        if not len(found.pairs) or mean[1] < mean[0] - CHANCE:
+        positions = np.array([row[view.index] for view in views], np.intp)
+        before = poses[positions]
+        aligned = refine_clouds([view.points for view in views], before, PlaneOptions())
+        mean = float(aligned.before.mean()), float(aligned.after.mean())
+        unchanged = Refinement(poses, False, len(views), len(aligned.pairs), support=mean)
+        if not len(aligned.pairs) or mean[1] < mean[0] - SUPPORT_NOISE:
             return unchanged
-        lost = found.after < found.before - MAX_LOSS
-        after = with_unsupported_views_fixed(before, found.poses, lost)
-        edges = tuple(_edges(found, [view.index for view in views], lost))
-        return replace(moved_to(unchanged, at, after), edges=edges)
+        lost = aligned.after < aligned.before - MAX_LOSS
+        after = with_unsupported_views_fixed(before, aligned.poses, lost)
+        edges = tuple(_edges(aligned, [view.index for view in views], lost))
+        return replace(moved_to(unchanged, positions, after), edges=edges)
 
 
-def _edges(found: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
-    """Joint measurements of neighbouring views; those of all pairs would be counted many times."""
+def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
+    """Joint measurements of neighbouring views; those of all pairs would count them repeatedly."""
     out = []
-    for (i, j), C in zip(found.pairs, found.covariance, strict=True):
+    for (i, j), C in zip(aligned.pairs, aligned.covariance, strict=True):
         if j == i + 1 and not (lost[i] or lost[j]):
-            T = se3.inverse(found.poses[i]) @ found.poses[j]
+            T = se3.inverse(aligned.poses[i]) @ aligned.poses[j]
             out.append(Measured(ids[i], ids[j], T, np.linalg.inv(C)))
     return out

@@ -19,15 +19,15 @@ from tofuse.posegraph.build import Measured
 from tofuse.posegraph.calibration_check import (
     CalibrationCheck,
     check_calibration,
+    combine_checks,
     loop_gap,
-    of_submaps,
 )
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.joint_alignment import Refined, refine
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors
-from tofuse.posegraph.submaps import RefinedSubmap, fell, refine_submaps
+from tofuse.posegraph.submaps import RefinedSubmap, refine_submaps, support_fell
 from tofuse.posegraph.view_store import (
     CoarseView,
     PosedView,
@@ -42,11 +42,11 @@ from tofuse.registration.prepared_view import PreparedView
 
 CameraError = Literal["offset", "scale", "focal"]
 
-# Neighbouring pixels have correlated noise: this many count as one.
-_SHARED_NOISE = 5.0
+# Neighbouring pixels have correlated noise: this many have the information of one.
+_CORRELATED_PIXELS = 5.0
 # Maximum decrease of the support of a view that keeps its refined pose: about that by chance.
 MAX_LOSS = 0.03
-_ERRORS: dict[CameraError, int] = {
+_ERROR_INDEX: dict[CameraError, int] = {
     "offset": kernels.OFFSET,
     "scale": kernels.SCALE,
     "focal": kernels.FOCAL,
@@ -74,7 +74,7 @@ class Refinement:
         Estimated errors of the camera by name: corrections of the range (m), of the depth
         (fraction) and of the width of the rays (fraction).
     edges
-        Measurement of each pair by itself, by frame indices; none unless kept.
+        Measurement of each pair alone, by frame indices; none unless kept.
     calibration_check
         Evidence for errors of the camera, if it was computed.
     stated
@@ -154,7 +154,7 @@ class _Idle(Refiner):
     points: ClassVar[bool] = False
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """Keep nothing."""
+        """See `Refiner.push`: views are not needed."""
 
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
@@ -182,20 +182,20 @@ class AlreadyRefined(RefinementMethod):
 
 
 class _AlreadyRefined(_Idle):
-    def __init__(self, known: AlreadyRefined) -> None:
-        self._known = known
+    def __init__(self, previous: AlreadyRefined) -> None:
+        self._previous = previous
 
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
     ) -> Refinement:
         """See `Refiner.finish`."""
-        there = set(ids)
-        edges = (*self._known.measured, *self._known.stated)
+        posed = set(ids)
+        edges = (*self._previous.measured, *self._previous.stated)
         return Refinement(
             poses,
             kept=True,
-            edges=tuple(e for e in edges if {e.i, e.j} <= there),
-            stated=tuple((e.i, e.j) for e in self._known.stated),
+            edges=tuple(e for e in edges if {e.i, e.j} <= posed),
+            stated=tuple((e.i, e.j) for e in self._previous.stated),
         )
 
 
@@ -249,46 +249,46 @@ class _Joint(Refiner):
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
         posed = self._store.of(row)
-        at = np.array([row[p.index] for p in posed], np.intp)
+        positions = np.array([row[p.index] for p in posed], np.intp)
         if len(posed) < 2:
             return Refinement(poses, views=len(posed))
-        before = poses[at]
-        together = _together if len(posed) <= options.submap else _in_submaps
-        refined, evidence = together(
+        before = poses[positions]
+        refine_views = _refine_jointly if len(posed) <= options.submap else _refine_in_submaps
+        refined, evidence = refine_views(
             options, posed, before, measured or SensorPriors(), self._store
         )
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
-        gained = support[1] - support[0]
+        gain = support[1] - support[0]
         if not len(refined.pairs):
             return unchanged
-        if fell(gained):  # the camera may be the cause
+        if support_fell(gain):  # the camera may be the cause
             return replace(unchanged, calibration_check=evidence.calibration())
-        after = with_unsupported_views_fixed(before, refined.poses, gained < -MAX_LOSS)
+        after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
         if mean[1] < mean[0]:
-            # The poses were at the optimum already; the measurements give their covariances.
+            # The poses were already at the optimum; the measurements give their covariances.
             after = before
         split_m, split_rad = evidence.split()
         return replace(
-            moved_to(unchanged, at, after),
+            moved_to(unchanged, positions, after),
             calibration_check=evidence.calibration(),
             split_m=split_m,
             split_rad=split_rad,
-            errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
+            errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What refined views show: errors of the camera, and (m, rad) of the poses by halves."""
+    """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
 
     calibration: Callable[[], CalibrationCheck]
     split: Callable[[], tuple[float, float]]
 
 
-def _together(
+def _refine_jointly(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
@@ -298,15 +298,16 @@ def _together(
     """Refine all views at once."""
     views = [_sampled(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
-    numbers = [_ERRORS[name] for name in options.calibrate]
-    refined = refine(views, poses, options.alignment, calibrate=numbers, priors=priors)
-    whole = RefinedSubmap(views, np.arange(len(views)), refined, priors)
+    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
+    refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
+    all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
     return refined, _Evidence(
-        lambda: _calibration_check(whole, options), lambda: _split_half_errors(whole, options)
+        lambda: _calibration_check(all_views, options),
+        lambda: _split_half_errors(all_views, options),
     )
 
 
-def _in_submaps(
+def _refine_in_submaps(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
@@ -320,25 +321,27 @@ def _in_submaps(
         poses,
         options.alignment,
         options.submap,
-        lambda some: [_sampled(posed[k], options) for k in some],
-        lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
-        partial(_evaluated, options=options),
-        [_ERRORS[name] for name in options.calibrate],
+        lambda subset: [_sampled(posed[k], options) for k in subset],
+        lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
+        partial(_evaluate, options=options),
+        [_ERROR_INDEX[name] for name in options.calibrate],
     )
     checks, splits = [check for check, _ in parts], [split for _, split in parts]
-    return refined, _Evidence(lambda: of_submaps(checks), lambda: _mean_errors(splits))
+    return refined, _Evidence(lambda: combine_checks(checks), lambda: _mean_errors(splits))
 
 
-def _evaluated(
+def _evaluate(
     submap: RefinedSubmap, options: Joint
 ) -> tuple[CalibrationCheck, tuple[float, float]]:
     """Evaluate a submap while its views are in memory."""
     return _calibration_check(submap, options), _split_half_errors(submap, options)
 
 
-def _split_half_errors(one: RefinedSubmap, options: Joint) -> tuple[float, float]:
-    numbers = [_ERRORS[name] for name in options.calibrate]
-    return split_half_errors(one.views, one.refined, options.alignment, one.priors, numbers)
+def _split_half_errors(submap: RefinedSubmap, options: Joint) -> tuple[float, float]:
+    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
+    return split_half_errors(
+        submap.views, submap.refined, options.alignment, submap.priors, error_indices
+    )
 
 
 def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -352,7 +355,7 @@ def _coarse(
 ) -> SpilledCoarseView:
     surface = _surface(posed)
     coarse = CoarseView.of(surface, sampled_points(surface, options.alignment.points))
-    return SpilledCoarseView(coarse.middle, Spilled(coarse, spill))
+    return SpilledCoarseView(coarse.centroid, Spilled(coarse, spill))
 
 
 def _surface(posed: PosedView[PreparedView]) -> PreparedView:
@@ -363,12 +366,12 @@ def _sampled(posed: PosedView[PreparedView], options: Joint) -> SampledView:
     return SampledView.of(_surface(posed), options.alignment.points)
 
 
-def _calibration_check(one: RefinedSubmap, options: Joint) -> CalibrationCheck:
+def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationCheck:
     """Check the calibration by refined views; with estimated errors only the loop's gap."""
-    refined = one.refined
+    refined = submap.refined
     if not options.calibrate:
-        return check_calibration(one.views, refined, options.alignment, one.priors)
-    gap = loop_gap(one.views, refined, refined.poses, refined.errors, options.alignment)
+        return check_calibration(submap.views, refined, options.alignment, submap.priors)
+    gap = loop_gap(submap.views, refined, refined.poses, refined.errors, options.alignment)
     return CalibrationCheck(gap=gap)
 
 
@@ -386,31 +389,31 @@ def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measure
     """
     pairs = refined.pairs
     partners = np.bincount(pairs.ravel(), minlength=len(ids))
-    shared = _SHARED_NOISE * 0.5 * partners[pairs].sum(1)
+    divisors = _CORRELATED_PIXELS * 0.5 * partners[pairs].sum(1)
     return tuple(
-        Measured(ids[i], ids[j], T, H / less)
-        for (i, j), T, H, less in zip(
-            pairs, refined.measured, refined.information, shared, strict=True
+        Measured(ids[i], ids[j], T, H / divisor)
+        for (i, j), T, H, divisor in zip(
+            pairs, refined.measured, refined.information, divisors, strict=True
         )
     )
 
 
 def _priors(ids: Sequence[int], measured: SensorPriors) -> Priors:
     """Measurements of external sensors as priors on the views, scaled to the pixels' noise."""
-    place = {index: k for k, index in enumerate(ids)}
+    position = {index: k for k, index in enumerate(ids)}
     steps = measured.between(ids)
     m = len(steps)
     gravity = measured.gravity_of(ids)
     if gravity is not None:
         gravity = replace(
             gravity,
-            sigma=gravity.sigma / np.sqrt(_SHARED_NOISE),
-            gate=gravity.gate * _SHARED_NOISE,
+            sigma=gravity.sigma / np.sqrt(_CORRELATED_PIXELS),
+            gate=gravity.gate * _CORRELATED_PIXELS,
         )
     return Priors(
-        np.array([(place[s.i], place[s.j]) for s in steps], np.intp).reshape(m, 2),
+        np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2),
         np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
-        np.array([s.information * _SHARED_NOISE for s in steps]).reshape(m, 6, 6),
+        np.array([s.information * _CORRELATED_PIXELS for s in steps]).reshape(m, 6, 6),
         gravity,
     )
 
@@ -426,10 +429,10 @@ def with_unsupported_views_fixed(before: Float64, after: Float64, lost: Bool) ->
         (N,) mask of the views that lost support.
     """
     out = after.copy()
-    good = np.flatnonzero(~lost)
-    for k in np.flatnonzero(lost) if len(good) else ():
-        near = good[np.argmin(np.abs(good - k))]
-        out[k] = out[near] @ se3.inverse(before[near]) @ before[k]
+    supported = np.flatnonzero(~lost)
+    for k in np.flatnonzero(lost) if len(supported) else ():
+        nearest = supported[np.argmin(np.abs(supported - k))]
+        out[k] = out[nearest] @ se3.inverse(before[nearest]) @ before[k]
     return se3.inverse(out[0]) @ out if lost[0] else out
 
 
@@ -445,37 +448,37 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     """
     p = points.astype(np.float64)
     length = np.linalg.norm(p, axis=1, keepdims=True)
-    moved = p * (
+    corrected = p * (
         1 + errors.get("offset", 0.0) / np.maximum(length, 1e-9) + errors.get("scale", 0.0)
     )
-    moved[:, :2] += errors.get("focal", 0.0) * p[:, :2]
-    return moved.astype(np.float32)
+    corrected[:, :2] += errors.get("focal", 0.0) * p[:, :2]
+    return corrected.astype(np.float32)
 
 
-def moved_to(unchanged: Refinement, at: Intp, after: Float64) -> Refinement:
-    """Return the accepted refinement in which the poses at positions `at` become `after`.
+def moved_to(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
+    """Return the accepted refinement in which the poses at `positions` become `after`.
 
     Parameters
     ----------
     unchanged
         The refinement as if it were rejected.
-    at
+    positions
         (M,) ascending positions of the refined views.
     after
         (M, 4, 4) T_world_camera.
     """
-    motion = se3.log(se3.inverse(unchanged.poses[at]) @ after)
+    motion = se3.log(se3.inverse(unchanged.poses[positions]) @ after)
     return replace(
         unchanged,
-        poses=followed(unchanged.poses, at, after),
+        poses=followed(unchanged.poses, positions, after),
         kept=True,
         moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
         moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
     )
 
 
-def followed(poses: Float64, at: Intp, after: Float64) -> Float64:
-    """Move all poses along with some that were refined.
+def followed(poses: Float64, positions: Intp, after: Float64) -> Float64:
+    """Propagate refined poses to all frames.
 
     Each frame keeps its motion relative to the views before and after it, interpolated between the
     two by its position between them.
@@ -484,15 +487,15 @@ def followed(poses: Float64, at: Intp, after: Float64) -> Float64:
     ----------
     poses
         (N, 4, 4) of all frames, before.
-    at
+    positions
         (M,) ascending positions of the refined poses.
     after
         (M, 4, 4) refined poses.
     """
-    every = np.arange(len(poses))
-    right = np.clip(np.searchsorted(at, every), 0, len(at) - 1)
-    left = np.clip(np.searchsorted(at, every, side="right") - 1, 0, len(at) - 1)
-    relative = [after[k] @ se3.inverse(poses[at[k]]) @ poses for k in (left, right)]
-    gap = at[right] - at[left]
-    fraction = np.where(gap > 0, (every - at[left]) / np.maximum(gap, 1), 0.0)
+    frames = np.arange(len(poses))
+    following = np.clip(np.searchsorted(positions, frames), 0, len(positions) - 1)
+    preceding = np.clip(np.searchsorted(positions, frames, side="right") - 1, 0, len(positions) - 1)
+    relative = [after[k] @ se3.inverse(poses[positions[k]]) @ poses for k in (preceding, following)]
+    gap = positions[following] - positions[preceding]
+    fraction = np.where(gap > 0, (frames - positions[preceding]) / np.maximum(gap, 1), 0.0)
     return se3.interpolate(relative[0], relative[1], fraction)

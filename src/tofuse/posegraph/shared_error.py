@@ -25,13 +25,13 @@ from tofuse.registration.projection import Projection
 # image's width, as in the tracker's covariance.
 ACROSS, DOWN = 6, 4
 PATCHES = ACROSS * DOWN
-_REACH = 0.31
+_CORRELATION_LENGTH = 0.31
 # Minimum weight of a patch, as a fraction of the median.
 _MIN_WEIGHT = 0.1
 # Smaller changes of the viewpoint, in rad, count as this one.
 _MIN_CHANGE = 0.02
 # Prior sigma of the pose of a single pair, in units of 1 cm and 1 degree (and 1 of the exposure).
-_LOOSEST = 1.8
+_PRIOR_SIGMA = 1.8
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
@@ -50,7 +50,7 @@ def patches_of(points: Float32 | Float64, projection: Projection) -> Int64:
 def _correlation(aspect: float) -> Float64:
     v, u = np.mgrid[:DOWN, :ACROSS]
     x, y = u.ravel() / ACROSS, v.ravel() * aspect / DOWN
-    return np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / _REACH)
+    return np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / _CORRELATION_LENGTH)
 
 
 def patch_correlation(shape: tuple[int, int]) -> Float64:
@@ -65,24 +65,24 @@ class Disagreement:
 
     Attributes
     ----------
-    seen, noise
+    observed, noise
         (P,) weighted mean squares of the patches' residuals, and their expectation by noise, m^2.
     expected
         (P,) their expectation by shared errors of variance 1.
     """
 
-    seen: Float64
+    observed: Float64
     noise: Float64
     expected: Float64
 
     def variance(self, growth: Float64) -> float:
         """Return the variance of shared errors at growth 1; pairs have `growth` (P,) times it."""
         explained = float(self.expected @ growth)
-        return max(float((self.seen - self.noise).sum()), 0.0) / max(explained, 1e-12)
+        return max(float((self.observed - self.noise).sum()), 0.0) / max(explained, 1e-12)
 
 
 def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagreement:
-    """Compare the residuals of pairs by patch, less what a change of their poses would absorb.
+    """Compare the residuals of pairs by patch, without the part that their poses would absorb.
 
     Parameters
     ----------
@@ -96,35 +96,35 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     count = len(sums)
     weight = sums[..., kernels.PATCH_WEIGHT]
     per_weight = 1 / np.maximum(weight, 1e-12)
-    known = weight > _MIN_WEIGHT * np.median(weight, axis=1, keepdims=True)
+    valid = weight > _MIN_WEIGHT * np.median(weight, axis=1, keepdims=True)
     A = np.zeros((count, kernels.UNKNOWNS, kernels.UNKNOWNS))
     A[:, _UPPER[0], _UPPER[1]] = rows[:, kernels.H : kernels.G]
     A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.H : kernels.G]
-    normal = A[:, :7, :7] * np.outer(_UNITS, _UNITS) + np.eye(7) / _LOOSEST**2
+    normal = A[:, :7, :7] * np.outer(_UNITS, _UNITS) + np.eye(7) / _PRIOR_SIGMA**2
     J = np.zeros((count, PATCHES, 7))
     J[..., :6] = sums[..., kernels.PATCH_RESPONSE :]
     J *= _UNITS
-    taken = per_weight[..., None] * J @ np.linalg.inv(normal) @ np.swapaxes(J, 1, 2)
-    left = (np.eye(PATCHES) - taken) * known[:, :, None] * known[:, None, :]
-    normalised = np.where(known, weight, 0.0)
+    absorbed = per_weight[..., None] * J @ np.linalg.inv(normal) @ np.swapaxes(J, 1, 2)
+    projector = (np.eye(PATCHES) - absorbed) * valid[:, :, None] * valid[:, None, :]
+    normalised = np.where(valid, weight, 0.0)
     normalised /= np.maximum(normalised.sum(1, keepdims=True), 1e-12)
     means = sums[..., kernels.PATCH_RESIDUAL] * per_weight
     return Disagreement(
         (normalised * means**2).sum(1),
-        (normalised * (left**2 * np.where(known, per_weight, 0.0)[:, None]).sum(2)).sum(1),
-        (normalised * ((left @ correlation) * left).sum(2)).sum(1),
+        (normalised * (projector**2 * np.where(valid, per_weight, 0.0)[:, None]).sum(2)).sum(1),
+        (normalised * ((projector @ correlation) * projector).sum(2)).sum(1),
     )
 
 
-def growth(depth: Float64, turned: Float64, moved: Float64) -> Float64:
+def growth(depth: Float64, rotation: Float64, translation: Float64) -> Float64:
     """Return the (P,) growth of the errors' variance with the change of viewpoint of a pair.
 
     Parameters
     ----------
     depth
         (P,) median depth of the targets, m.
-    turned, moved
+    rotation, translation
         (P,) rotation in rad and translation in m from one view to the other.
     """
-    change = np.maximum(turned + moved / depth, _MIN_CHANGE)
+    change = np.maximum(rotation + translation / depth, _MIN_CHANGE)
     return np.asarray((depth * change) ** 2, np.float64)

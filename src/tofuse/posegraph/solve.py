@@ -92,10 +92,12 @@ def solve(
     fixed = first_of_parts(len(poses), pairs) if fixed is None else np.asarray(fixed, bool)
     problem = Problem(pairs, measurements, information, fixed, gravity, settings.rotation)
     if settings.robust == "truncated" and loop.any():
-        found = truncated_least_squares(problem, poses, loop, settings)
-        log = found.descent.log
-        history = tuple(float(np.minimum(x, found.limit).sum()) + extra for x, extra in log)
-        return _solution(problem, found.descent, found.weights, history, found.converged)
+        selection = truncated_least_squares(problem, poses, loop, settings)
+        log = selection.descent.log
+        history = tuple(float(np.minimum(x, selection.limit).sum()) + extra for x, extra in log)
+        return _solution(
+            problem, selection.descent, selection.weights, history, selection.converged
+        )
     kernel = settings.robust if settings.robust != "truncated" else "none"
 
     def total(x: Float64) -> Float64:

@@ -26,10 +26,10 @@ from tofuse.kernels import supernodes as kernels
 from tofuse.kernels.blas import one_blas_thread
 
 # Maximum size of a dense right-hand side, in numbers.
-_AT_ONCE = 4_000_000
-# Maximum size of a factor, in numbers (160 MB), see `bounded`.
+_MAX_RHS = 4_000_000
+# Maximum size of a factor, in numbers (160 MB), see `sparsify`.
 MAX_FACTOR = 20_000_000
-_FLAT = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
+_MIN_SCALE = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
 
 
 class Blocks(NamedTuple):
@@ -68,32 +68,34 @@ class PairSystem:
         self.fixed = first_of_parts(n, self.pairs) if fixed is None else np.asarray(fixed, bool)
         i, j = self.pairs.T
         self.free = np.flatnonzero(~self.fixed)
-        both = np.flatnonzero(~(self.fixed[i] | self.fixed[j]))
-        number = np.full(n, -1)
-        number[self.free] = np.arange(len(self.free))
-        order = _elimination_order(len(self.free), number[i[both]], number[j[both]])
+        both_free = np.flatnonzero(~(self.fixed[i] | self.fixed[j]))
+        block_of_pose = np.full(n, -1)
+        block_of_pose[self.free] = np.arange(len(self.free))
+        order = _elimination_order(
+            len(self.free), block_of_pose[i[both_free]], block_of_pose[j[both_free]]
+        )
         # `free` in the order of elimination: block k of the system is pose free[k].
         self.free = self.free[order]
-        number[self.free] = np.arange(len(self.free))
-        self.number = number
-        self._sums(i, j, both)
+        block_of_pose[self.free] = np.arange(len(self.free))
+        self.block_of_pose = block_of_pose
+        self._build_sums(i, j, both_free)
 
-    def _sums(self, i: Intp, j: Intp, both: Intp) -> None:
-        """Make the matrices that sum the contributions of pairs to each block."""
+    def _build_sums(self, i: Intp, j: Intp, both_free: Intp) -> None:
+        """Build the matrices that sum the contributions of pairs to each block."""
         n, m = len(self.free), len(self.pairs)
-        self._sum_i = _indicator(self.number[i], n, m)
-        self._sum_j = _indicator(self.number[j], n, m)
-        a, b = self.number[i[both]], self.number[j[both]]
-        self.both, self.swapped = both, a > b
+        self._sum_i = _indicator(self.block_of_pose[i], n, m)
+        self._sum_j = _indicator(self.block_of_pose[j], n, m)
+        a, b = self.block_of_pose[i[both_free]], self.block_of_pose[j[both_free]]
+        self.both_free, self.swapped = both_free, a > b
         lower, upper = np.maximum(a, b), np.minimum(a, b)
-        keys, where = np.unique(upper * max(n, 1) + lower, return_inverse=True)
+        keys, block_of_pair = np.unique(upper * max(n, 1) + lower, return_inverse=True)
         self.columns, self.rows = np.divmod(keys, max(n, 1))
-        self.block_of_both = where
-        self._sum_off = _indicator(where, len(keys), len(both))
+        self.block_of_pair = block_of_pair
+        self._sum_below = _indicator(block_of_pair, len(keys), len(both_free))
 
     @cached_property
     def panels(self) -> tuple[kernels.Panels, Intp]:
-        """Layout of the factor, and where the entries of the matrix's blocks are in it."""
+        """Layout of the factor, and positions of the entries of the matrix's blocks in it."""
         n = len(self.free)
         rows = np.concatenate([np.arange(n), self.rows])
         columns = np.concatenate([np.arange(n), self.columns])
@@ -107,7 +109,7 @@ class PairSystem:
         jj: Float64,
         g_i: Float64,
         g_j: Float64,
-        single: tuple[Float64, Float64] | None = None,
+        unary: tuple[Float64, Float64] | None = None,
     ) -> tuple[Blocks, Float64]:
         """Return the matrix and the gradient (free poses x size) of the whole system.
 
@@ -117,20 +119,20 @@ class PairSystem:
             (m, k, k) blocks of each pair, rows by the first index.
         g_i, g_j
             (m, k) gradients of each pair.
-        single
+        unary
             (n, k, k) blocks and (n, k) gradients of unary terms.
         """
         n, k = len(self.free), self.size
         diagonal = self._sum_i @ ii.reshape(-1, k * k) + self._sum_j @ jj.reshape(-1, k * k)
         diagonal = diagonal.reshape(n, k, k)
         gradient = self._sum_i @ g_i + self._sum_j @ g_j
-        if single is not None:
-            diagonal = diagonal + single[0][self.free]
-            gradient = gradient + single[1][self.free]
+        if unary is not None:
+            diagonal = diagonal + unary[0][self.free]
+            gradient = gradient + unary[1][self.free]
         # Blocks below the diagonal: rows belong to the pose that is eliminated later.
-        blocks = ij[self.both]
-        low = np.where(self.swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
-        below = (self._sum_off @ low.reshape(-1, k * k)).reshape(-1, k, k)
+        blocks = ij[self.both_free]
+        below_blocks = np.where(self.swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
+        below = (self._sum_below @ below_blocks.reshape(-1, k * k)).reshape(-1, k, k)
         return Blocks(diagonal, below), gradient
 
     def relative(
@@ -138,13 +140,13 @@ class PairSystem:
         H: Float64,
         g: Float64,
         T_i_j: Float64,
-        single: tuple[Float64, Float64] | None = None,
+        unary: tuple[Float64, Float64] | None = None,
     ) -> tuple[Blocks, Float64]:
         """Assemble from (m, 6, 6) H and (m, 6) g of the right perturbations of (m, 4, 4) T_i_j."""
         A = se3.adjoint(se3.inverse(T_i_j))
         At = np.swapaxes(A, 1, 2)
         AtH = At @ H
-        return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, single)
+        return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, unary)
 
     def gradient(self, g: Float64, T_i_j: Float64) -> Float64:
         """Return only the gradient (free poses x 6) of (m, 6) g, as in `relative`."""
@@ -158,7 +160,7 @@ class PairSystem:
         g: Float64,
         T_i_j: Float64,
         damping: float = 0.0,
-        single: tuple[Float64, Float64] | None = None,
+        unary: tuple[Float64, Float64] | None = None,
     ) -> Float64 | None:
         """Compute a damped Gauss-Newton step.
 
@@ -171,7 +173,7 @@ class PairSystem:
             (m, 4, 4) relative poses at the linearisation point.
         damping
             Fraction of the diagonal that is added to it (Levenberg-Marquardt).
-        single
+        unary
             Blocks and gradients of unary terms, see `assemble`.
 
         Returns
@@ -179,14 +181,14 @@ class PairSystem:
         (n, 6) steps d, to be applied as ``T_k exp(d_k)``; zero for fixed poses. None where the
         system is singular.
         """
-        factor = self.factor(*self.relative(H, g, T_i_j, single), damping)
+        factor = self.factor(*self.relative(H, g, T_i_j, unary), damping)
         return None if factor is None else factor.step()
 
     def factor(self, matrix: Blocks, gradient: Float64, damping: float = 0.0) -> Factor | None:
         """Factorise an assembled system; None where it is singular."""
         if len(matrix.diagonal) and damping:
             entries = np.diagonal(matrix.diagonal, axis1=1, axis2=2)
-            added = damping * np.maximum(entries, _FLAT * entries.max())
+            added = damping * np.maximum(entries, _MIN_SCALE * entries.max())
             diagonal = matrix.diagonal + added[..., None] * np.eye(self.size)
             matrix = matrix._replace(diagonal=diagonal)
         try:
@@ -224,17 +226,17 @@ class Factor:
         """As `step`, with another gradient (free poses x k)."""
         system = self.system
         out = np.zeros((system.n, system.size))
-        x = self._solved(-gradient.reshape(-1, 1))
+        x = self._solve(-gradient.reshape(-1, 1))
         if not np.isfinite(x).all():
             return None
         out[system.free] = x.reshape(-1, system.size)
         return out
 
-    def _solved(self, right: Float64) -> Float64:
+    def _solve(self, rhs: Float64) -> Float64:
         """Return the solutions of the system for right-hand sides (free poses * k, q)."""
         if self._values is None:
             self._values = self._factorised()
-        x = np.array(right, order="C")
+        x = np.array(rhs, order="C")
         with one_blas_thread():
             kernels.solve(self.system.panels[0], self._values, self._signs, x)
         return x
@@ -244,19 +246,19 @@ class Factor:
         system, k = self.system, self.system.size
         vertices = np.asarray(vertices, np.intp)
         out = np.zeros((len(vertices), k, len(vertices), k))
-        moving = np.flatnonzero(~system.fixed[vertices])
-        if not len(moving):
+        free = np.flatnonzero(~system.fixed[vertices])
+        if not len(free):
             return out.reshape(len(vertices) * k, -1)
-        at = (k * system.number[vertices[moving]][:, None] + np.arange(k)).ravel()
+        rows = (k * system.block_of_pose[vertices[free]][:, None] + np.arange(k)).ravel()
         # In batches, so that memory does not grow with the graph.
-        some = max(1, min(64, _AT_ONCE // (k * k * len(system.free))))
-        for start in range(0, len(moving), some):
-            these = moving[start : start + some]
-            columns = at[k * start : k * (start + some)]
+        batch_size = max(1, min(64, _MAX_RHS // (k * k * len(system.free))))
+        for start in range(0, len(free), batch_size):
+            batch = free[start : start + batch_size]
+            columns = rows[k * start : k * (start + batch_size)]
             unit = np.zeros((k * len(system.free), len(columns)))
             unit[columns, np.arange(len(columns))] = 1
-            found = self._solved(unit)[at].reshape(len(moving), k, len(these), k)
-            out[moving[:, None], :, these, :] = np.swapaxes(found, 1, 2)
+            covariances = self._solve(unit)[rows].reshape(len(free), k, len(batch), k)
+            out[free[:, None], :, batch, :] = np.swapaxes(covariances, 1, 2)
         C = out.reshape(len(vertices) * k, -1)
         return (C + C.T) / 2
 
@@ -277,18 +279,18 @@ class Factor:
         their right perturbations.
         """
         system = self.system
-        diagonal, low = self._inverse()
+        diagonal, below = self._inverse()
         i, j = system.pairs.T
         blocks = np.concatenate([diagonal, np.zeros((1, 6, 6))])  # the last for fixed poses
         A = se3.adjoint(se3.inverse(T_i_j))
         At = np.swapaxes(A, 1, 2)
-        C = blocks[system.number[j]] + A @ blocks[system.number[i]] @ At
-        both = system.both
-        cross = low[system.block_of_both]
+        C = blocks[system.block_of_pose[j]] + A @ blocks[system.block_of_pose[i]] @ At
+        both_free = system.both_free
+        pair_blocks = below[system.block_of_pair]
         # Blocks lie below the diagonal: (j, i) where i is eliminated first.
-        ji = np.where(system.swapped[:, None, None], np.swapaxes(cross, 1, 2), cross)
-        AC = A[both] @ np.swapaxes(ji, 1, 2)
-        C[both] -= AC + np.swapaxes(AC, 1, 2)
+        C_j_i = np.where(system.swapped[:, None, None], np.swapaxes(pair_blocks, 1, 2), pair_blocks)
+        AC = A[both_free] @ np.swapaxes(C_j_i, 1, 2)
+        C[both_free] -= AC + np.swapaxes(AC, 1, 2)
         return C
 
     def _inverse(self) -> tuple[Float64, Float64]:
@@ -310,8 +312,8 @@ def parts_of(n: int, pairs: Intp) -> Intp:
     i, j = np.asarray(pairs, np.intp).reshape(-1, 2).T
     adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     _, label = connected_components(adjacency, directed=False)
-    _, first, where = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[where]
+    _, first, part = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[part]
 
 
 def first_of_parts(n: int, pairs: Intp) -> Bool:
@@ -347,10 +349,10 @@ def factor_size(n: int, pairs: Intp) -> int:
     return int(_panels(n, rows, columns, 6).value_start[-1])
 
 
-def bounded(n: int, pairs: Intp) -> Bool:
-    """Choose pairs (m, 2) of n poses so that their factor is not larger than `MAX_FACTOR`.
+def sparsify(n: int, pairs: Intp) -> Bool:
+    """Select pairs (m, 2) of n poses so that their factor is not larger than `MAX_FACTOR`.
 
-    The factor of a camera that visits the same places again and again grows with the square of
+    The factor of a camera that visits the same places repeatedly grows with the square of
     time, but few of its loops matter. If all pairs are too many, those within a band of poses are
     chosen, a tree that spans the graph, and as many of the others as fit: those of the most linked
     poses first. Removing these poses splits the graph into parts that are eliminated independently.
@@ -365,21 +367,21 @@ def bounded(n: int, pairs: Intp) -> Bool:
     low, high = np.sort(pairs, axis=1).T
     edges, of_pair = np.unique(low * n + high, return_inverse=True)
     low, high = np.divmod(edges, n)
-    # Poses with a single link cost nothing.
+    # Poses with a single edge cause no fill-in.
     degree = np.bincount(np.concatenate([low, high]), minlength=n)
     core = degree > 1
     rank = np.cumsum(core)
     band = max_blocks // (2 * max(int(core.sum()), 1))
-    far = np.greater(rank[high] - rank[low], band) & core[low] & core[high]
-    # The tree prefers near links.
-    cost = sparse.coo_matrix((1.0 + far, (low, high)), shape=(n, n))
+    long_range = np.greater(rank[high] - rank[low], band) & core[low] & core[high]
+    # The tree prefers short-range edges.
+    cost = sparse.coo_matrix((1.0 + long_range, (low, high)), shape=(n, n))
     tree = minimum_spanning_tree(cost.tocsr()).tocoo()
-    chosen = ~far | np.isin(edges, tree.row.astype(np.int64) * n + tree.col)
+    chosen = ~long_range | np.isin(edges, tree.row.astype(np.int64) * n + tree.col)
     others = np.flatnonzero(~chosen)
     if not len(others):
         return np.ones(len(pairs), np.bool_)
-    most = np.maximum(degree[low], degree[high])[others]
-    others = others[np.lexsort((low[others], -most))]
+    max_degree = np.maximum(degree[low], degree[high])[others]
+    others = others[np.lexsort((low[others], -max_degree))]
 
     def fits(count: int) -> bool:
         kept = chosen.copy()
@@ -417,5 +419,5 @@ def _elimination_order(n: int, i: Intp, j: Intp) -> Intp:
     degree = np.asarray(links.sum(axis=1)).ravel()
     laplacian = (sparse.diags(degree + 1) - links).tocsc()
     options = {"SymmetricMode": True}
-    found = splu(laplacian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return np.argsort(found.perm_c)
+    factor = splu(laplacian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.argsort(factor.perm_c)

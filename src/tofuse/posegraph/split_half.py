@@ -1,4 +1,4 @@
-"""Errors of refined poses, from halves of the images that are refined apart.
+"""Errors of refined poses, from halves of the images that are refined separately.
 
 The covariance of the poses assumes that errors are independent between pairs of views, and that
 those within a view have a given correlation length. Errors that depend on the position in the image
@@ -29,8 +29,8 @@ from tofuse.posegraph.view_store import SampledView
 
 # The poses are near the solution of each half.
 _ROUNDS = (Round(5, 0.0, 0.0),)
-# Every n-th point of a half: what matters is errors that they share.
-_EVERY = 2
+# Every n-th point of a half is enough for the errors that they share.
+_POINT_STRIDE = 2
 
 
 def split_half_errors(
@@ -40,7 +40,7 @@ def split_half_errors(
     priors: Priors,
     calibrate: Sequence[int] = (),
 ) -> tuple[float, float]:
-    """Rms errors (m, rad) of refined poses, after alignment, as halves of the images show them.
+    """Rms errors (m, rad) of refined poses, after alignment, estimated from halves of the images.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ def split_half_errors(
     """
     variances = np.zeros(2)
     for poses in refined_by_halves(views, refined, options, priors, calibrate):
-        one, other = (aligned_motion(refined.poses, alone) for alone in poses)
-        product = [-(a * b).sum(1).mean() for a, b in zip(one, other, strict=True)]
+        first, second = (aligned_motion(refined.poses, half_poses) for half_poses in poses)
+        product = [-(a * b).sum(1).mean() for a, b in zip(first, second, strict=True)]
         variances += np.maximum(product, 0.0)
     position, rotation = np.sqrt(variances).tolist()
     return position, rotation
@@ -70,17 +70,17 @@ def refined_by_halves(
     views, options, priors, calibrate
         As for `refine`, which returned `refined`.
     """
-    quick = replace(options, rounds=_ROUNDS)
+    single_round = replace(options, rounds=_ROUNDS)
 
-    def by_half(first: bool, halves: Sequence[Bool]) -> Float64:
-        part = [
-            v.with_points(np.flatnonzero(half == first)[::_EVERY])
+    def by_half(first_half: bool, halves: Sequence[Bool]) -> Float64:
+        half_views = [
+            v.with_points(np.flatnonzero(half == first_half)[::_POINT_STRIDE])
             for v, half in zip(views, halves, strict=True)
         ]
         return align_views(
-            part,
+            half_views,
             refined.poses,
-            quick,
+            single_round,
             calibrate=calibrate,
             errors=refined.errors,
             priors=priors,
@@ -102,9 +102,13 @@ def aligned_motion(before: Float64, after: Float64) -> tuple[Float64, Float64]:
         (N, 4, 4) T_world_camera; motions are in the world, m and rad.
     """
     p = before[:, :3, 3]
-    moved = after[:, :3, 3] - p
-    turned = np.einsum("nij,nj->ni", before[:, :3, :3], se3.log(se3.inverse(before) @ after)[:, 3:])
+    translation = after[:, :3, 3] - p
+    rotation = np.einsum(
+        "nij,nj->ni", before[:, :3, :3], se3.log(se3.inverse(before) @ after)[:, 3:]
+    )
     motion = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), -se3.hat(p - p.mean(0))], 2)
     motion = motion.reshape(-1, 6)
-    moved = moved - (motion @ (np.linalg.pinv(motion) @ moved.ravel())).reshape(-1, 3)
-    return moved, turned - turned.mean(0)
+    translation = translation - (motion @ (np.linalg.pinv(motion) @ translation.ravel())).reshape(
+        -1, 3
+    )
+    return translation, rotation - rotation.mean(0)

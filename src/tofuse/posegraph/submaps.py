@@ -1,10 +1,10 @@
 """Joint alignment of more views than fit into memory: in submaps, and by a graph of their pairs.
 
-Views are divided into submaps by the place that they see, so that all visits of a place are in one
-submap. Each is refined by itself (`refine`), together with overlapping views of its neighbours. The
-measurements of all pairs then make one sparse graph of all views, whose least squares are those of
-all pairs, linearised at the result of each submap. If the views of a submap come to support each
-other less, their relative poses are kept as they were.
+Views are divided into submaps by the place that they show, so that all visits of a place are in
+one submap. Each is refined separately (`refine`), together with overlapping views of its
+neighbours. The measurements of all pairs then make one sparse graph of all views, whose least
+squares are those of all pairs, linearised at the result of each submap. If the support between the
+views of a submap falls, their relative poses are left unchanged.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_ev
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import UNITS, Priors
-from tofuse.posegraph.view_store import HasCoarseView, SampledView, looked_at, overlaps
+from tofuse.posegraph.view_store import HasCoarseView, SampledView, overlaps, world_centroids
 
 A = TypeVar("A")
 
-# Largest number of views of its neighbours in a submap, as a fraction of its own.
+# Largest number of neighbouring views in a submap, as a fraction of its core views.
 _BORDER = 0.25
 # Information of a weak prior on the motion between views, in units of 1 cm and 1 degree.
 _WEAK_PRIOR = 1e-3
@@ -41,7 +41,7 @@ class Submap:
     Attributes
     ----------
     views
-        (N,) positions of its own views and of those of its neighbours, ascending.
+        (N,) positions of its core views and of neighbouring ones, ascending.
     pairs
         (M, 2) positions i < j of the views, among all, that are compared in this submap.
     """
@@ -60,7 +60,7 @@ class RefinedSubmap:
     priors: Priors
 
 
-def cut(places: Float64, max_size: int) -> Intp:
+def partition(places: Float64, max_size: int) -> Intp:
     """(N,) part of each of the places (N, 3), with at most `max_size` places in each part.
 
     By recursive bisection, as evenly as possible, across the longest axis.
@@ -78,32 +78,34 @@ def cut(places: Float64, max_size: int) -> Intp:
         axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         order = rows[np.argsort(centred @ axis, kind="stable")]
-        first = parts // 2
-        at = len(rows) * first // parts
-        split(np.sort(order[:at]), first)
-        split(np.sort(order[at:]), parts - first)
+        first_parts = parts // 2
+        middle = len(rows) * first_parts // parts
+        split(np.sort(order[:middle]), first_parts)
+        split(np.sort(order[middle:]), parts - first_parts)
 
     split(np.arange(len(places)), max(1, -(-len(places) // max_size)))
     return label
 
 
 def submaps(places: Float64, pairs: Intp, max_size: int) -> list[Submap]:
-    """Divide views that see places (N, 3), and overlap in pairs (M, 2), into submaps.
+    """Divide views of places (N, 3), which overlap in pairs (M, 2), into submaps.
 
     A pair is compared in the submap of its later view, if the other view belongs to it or is among
-    the views of neighbours with most pairs there.
+    the neighbouring views with most pairs in it.
     """
-    label = cut(places, max_size)
-    found = []
+    label = partition(places, max_size)
+    result = []
     for part in range(label.max() + 1):
-        mine = label[pairs[:, 1]] == part
-        inside = mine & (label[pairs[:, 0]] == part)
-        asked, times = np.unique(pairs[mine & ~inside, 0], return_counts=True)
-        own = np.flatnonzero(label == part)
-        border = asked[np.argsort(-times, kind="stable")[: int(_BORDER * len(own))]]
-        kept = inside | (mine & np.isin(pairs[:, 0], border))
-        found.append(Submap(np.union1d(own, border), pairs[kept]))
-    return found
+        of_later_view = label[pairs[:, 1]] == part
+        of_both_views = of_later_view & (label[pairs[:, 0]] == part)
+        outside, pair_counts = np.unique(
+            pairs[of_later_view & ~of_both_views, 0], return_counts=True
+        )
+        core = np.flatnonzero(label == part)
+        border = outside[np.argsort(-pair_counts, kind="stable")[: int(_BORDER * len(core))]]
+        kept = of_both_views | (of_later_view & np.isin(pairs[:, 0], border))
+        result.append(Submap(np.union1d(core, border), pairs[kept]))
+    return result
 
 
 def refine_submaps(
@@ -135,10 +137,10 @@ def refine_submaps(
     evaluate
         Called with each refined submap, possibly in another process.
     calibrate
-        Errors of the camera to estimate: in each submap by itself, of which the median is taken.
+        Errors of the camera to estimate: separately in each submap; the result is their median.
     """
     pairs = spread_evenly(overlaps(coarse, poses, options.overlap)[0], options.neighbours)
-    parts = [s for s in submaps(looked_at(coarse, poses), pairs, max_size) if len(s.pairs)]
+    parts = [s for s in submaps(world_centroids(coarse, poses), pairs, max_size) if len(s.pairs)]
 
     def arguments(k: int) -> tuple[Any, ...]:
         # Only one submap's views are in memory at a time.
@@ -153,48 +155,48 @@ def refine_submaps(
             evaluate,
         )
 
-    made = executor().map(_refined_alone, len(parts), arguments, large=True)
-    found = [(part, refined) for part, (refined, _) in zip(parts, made, strict=True)]
-    if not found:
-        none = np.zeros(0)
-        nobody = Support(none.astype(np.intp), none.astype(np.intp), none, none)
+    results = executor().map(_refine_submap, len(parts), arguments, large=True)
+    refined_submaps = [(part, refined) for part, (refined, _) in zip(parts, results, strict=True)]
+    if not refined_submaps:
+        empty = np.zeros(0)
+        no_support = Support(empty.astype(np.intp), empty.astype(np.intp), empty, empty)
         measured = np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
         errors = np.zeros(kernels.ERRORS)
-        still = Refined(
-            poses, poses, errors, pairs, (), nobody, nobody, *measured, np.zeros((0, 3))
+        unmoved = Refined(
+            poses, poses, errors, pairs, (), no_support, no_support, *measured, np.zeros((0, 3))
         )
-        return still, []
-    errors = np.median([r.errors for _, r in found], axis=0)
-    asked = np.concatenate([part.pairs for part, _ in found])
-    T_i_j = np.concatenate([r.measured for _, r in found])
-    information = np.concatenate([r.information for _, r in found])
-    solved = _solved(poses, asked, T_i_j, information, priors(None))
+        return unmoved, []
+    errors = np.median([r.errors for _, r in refined_submaps], axis=0)
+    compared = np.concatenate([part.pairs for part, _ in refined_submaps])
+    T_i_j = np.concatenate([r.measured for _, r in refined_submaps])
+    information = np.concatenate([r.information for _, r in refined_submaps])
+    optimised = _optimised_poses(poses, compared, T_i_j, information, priors(None))
     after = [
-        support_of(load(part.views), solved[part.views], refined, options)
-        for part, refined in found
+        support_of(load(part.views), optimised[part.views], refined, options)
+        for part, refined in refined_submaps
     ]
-    whole = Refined(
-        solved,
+    combined = Refined(
+        optimised,
         poses,
         errors,
-        asked,
-        max((r.moved for _, r in found), key=len, default=()),
-        _all([(part, r.before) for part, r in found]),
-        _all([(part, s) for (part, _), s in zip(found, after, strict=True)]),
+        compared,
+        max((r.moved for _, r in refined_submaps), key=len, default=()),
+        _combined_support([(part, r.before) for part, r in refined_submaps]),
+        _combined_support([(part, s) for (part, _), s in zip(refined_submaps, after, strict=True)]),
         T_i_j,
         information,
-        np.concatenate([r.scales for _, r in found]),
+        np.concatenate([r.scales for _, r in refined_submaps]),
     )
-    return whole, [answer for _, answer in made]
+    return combined, [evaluation for _, evaluation in results]
 
 
-def fell(gained: Float64) -> bool:
+def support_fell(gain: Float64) -> bool:
     """Whether gains (N,) of the views' support are significantly negative on average."""
-    error = float(gained.std(ddof=1)) / np.sqrt(len(gained))
-    return float(gained.mean()) < -error
+    standard_error = float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    return float(gain.mean()) < -standard_error
 
 
-def _refined_alone(
+def _refine_submap(
     views: Sequence[SampledView],
     part: Submap,
     poses: Float64,
@@ -203,33 +205,33 @@ def _refined_alone(
     priors: Priors,
     evaluate: Callable[[RefinedSubmap], A],
 ) -> tuple[Refined, A]:
-    """Refine one submap by itself, from poses (N, 4, 4), and evaluate it."""
+    """Refine one submap separately, from poses (N, 4, 4), and evaluate it."""
     local = np.searchsorted(part.views, part.pairs)
     start = se3.inverse(poses[0]) @ poses
     refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
-    answer = evaluate(RefinedSubmap(views, part.views, refined, priors))
-    return _or_unchanged(refined, start), answer
+    evaluation = evaluate(RefinedSubmap(views, part.views, refined, priors))
+    return _or_unchanged(refined, start), evaluation
 
 
 def _or_unchanged(refined: Refined, start: Float64) -> Refined:
     """The result of a submap; its initial poses if the support of its views fell."""
     n = len(start)
-    if not fell(refined.after.of_views(n) - refined.before.of_views(n)):
+    if not support_fell(refined.after.of_views(n) - refined.before.of_views(n)):
         return refined
     i, j = refined.pairs.T
-    stays = se3.inverse(start[i]) @ start[j]
+    T_i_j = se3.inverse(start[i]) @ start[j]
     return Refined(
         start, start, np.zeros_like(refined.errors), refined.pairs, refined.moved, refined.before,
-        refined.before, stays, refined.information, refined.scales,
+        refined.before, T_i_j, refined.information, refined.scales,
     )  # fmt: skip
 
 
-def _solved(
+def _optimised_poses(
     poses: Float64, pairs: Intp, measured: Float64, information: Float64, priors: Priors
 ) -> Float64:
     """Least-squares poses (N, 4, 4) of all pairs; the first stays."""
-    before = np.arange(len(poses) - 1)
-    steps = np.stack([before, before + 1], 1)
+    previous = np.arange(len(poses) - 1)
+    steps = np.stack([previous, previous + 1], 1)
     # Parts of the path that no pair connects keep their relative pose.
     weak = np.tile(np.diag(_WEAK_PRIOR / UNITS**2), (len(steps), 1, 1))
     edges = np.concatenate([pairs, priors.pairs, steps])
@@ -247,11 +249,11 @@ def _solved(
     return LevenbergMarquardt().optimise(graph).graph.poses
 
 
-def _all(supports: Sequence[tuple[Submap, Support]]) -> Support:
+def _combined_support(supports: Sequence[tuple[Submap, Support]]) -> Support:
     """The support of all submaps, by positions among all views."""
     return Support(
         np.concatenate([part.views[s.target] for part, s in supports]),
         np.concatenate([part.views[s.source] for part, s in supports]),
-        np.concatenate([s.good for _, s in supports]),
+        np.concatenate([s.score for _, s in supports]),
         np.concatenate([s.terms for _, s in supports]),
     )

@@ -1,4 +1,4 @@
-"""Views that the global stages work on: their storage, and which of them overlap."""
+"""Views for the global stages: storage, and selection of overlapping ones."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _OVERLAP_POINTS = 150
 _OVERLAP_COLUMNS = 40
 # A point is on a surface of another view within this distance, as a fraction of its z, and above
 # this cosine between the normals.
-_NEAR = 0.1
-_FACING = 0.5
-# Up to this many views, all pairs are compared; of more, each view with those that see the nearest
-# places, and with those just before it, so that the work is linear in the length of the path.
-_ALL, _NEAREST, _JUST_BEFORE = 512, 192, 64
+_MAX_DISTANCE = 0.1
+_MIN_COSINE = 0.5
+# Up to this many views, all pairs are compared; of more, each view with those of the nearest
+# places, and with those just before it, so that the cost is linear in the length of the path.
+_MAX_EXHAUSTIVE, _NEAREST, _PREVIOUS = 512, 192, 64
 # Fraction of the memory for views that is reserved for coarse ones: small, but all in use.
-_FOR_COARSE = 0.25
+_COARSE_FRACTION = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,11 @@ class CoarseView:
     Attributes
     ----------
     points
-        (N, POINT_SIZE) of some pixels, see `points_of`.
+        (N, POINT_SIZE) of sampled pixels, see `points_of`.
     target
-        (H, W, PIXEL_SIZE) what points of others are compared with, few pixels.
+        (H, W, PIXEL_SIZE) low-resolution target image for the points of other views.
     projection
-        Where they land there.
+        Projection of points into it.
     """
 
     points: Float32
@@ -58,12 +58,12 @@ class CoarseView:
     @classmethod
     def of(cls, surface: PreparedView, points: Float32) -> CoarseView:
         """Subsample a view and its points (N, POINT_SIZE)."""
-        some = points[:: max(1, len(points) // _OVERLAP_POINTS)].copy()
+        sampled = points[:: max(1, len(points) // _OVERLAP_POINTS)].copy()
         coarse = surface.subsampled(_OVERLAP_COLUMNS)
-        return cls(some, coarse.target, coarse.projection)
+        return cls(sampled, coarse.target, coarse.projection)
 
     @property
-    def middle(self) -> Float64:
+    def centroid(self) -> Float64:
         """(3,) centroid of the points, in the camera's frame."""
         p = self.points[:, POINT : POINT + 3]
         return np.asarray(p.mean(0, dtype=float) if len(p) else np.zeros(3), np.float64)
@@ -73,7 +73,7 @@ class HasCoarseView(Protocol):
     """A view of which the overlap with others can be estimated."""
 
     @property
-    def middle(self) -> Float64:
+    def centroid(self) -> Float64:
         """(3,) centroid of its points, in its camera's frame."""
         ...
 
@@ -85,7 +85,7 @@ class HasCoarseView(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SampledView:
-    """What the alignment of a prepared view with others needs, in half of its memory.
+    """The data of a prepared view that its alignment with others needs, half of its memory.
 
     Attributes
     ----------
@@ -144,9 +144,9 @@ class SampledView:
         return self.target.shape[0], self.target.shape[1]
 
     @property
-    def middle(self) -> Float64:
-        """(3,) centroid of what it sees, in the camera's frame."""
-        return self.coarse.middle
+    def centroid(self) -> Float64:
+        """(3,) centroid of its points, in the camera's frame."""
+        return self.coarse.centroid
 
     @cached_property
     def patches(self) -> Int64:
@@ -180,8 +180,8 @@ class Spacing:
         Largest factor on the required motion, so that the views of a place suffice however long the
         path is.
     enough
-        Once the factor is the largest, the views of a place that is visited again and again are
-        thinned after this many, see `PlaceCounts`.
+        At the largest factor, the views of a place that is visited repeatedly are thinned after
+        this many, see `PlaceCounts`.
     """
 
     angle: float = 0.03
@@ -198,7 +198,7 @@ class Spacing:
 
 
 class Storable(Protocol):
-    """What is kept of a view."""
+    """Data of a view that a `ViewStore` can store."""
 
     @property
     def index(self) -> int:
@@ -207,7 +207,7 @@ class Storable(Protocol):
 
     @property
     def depth(self) -> float:
-        """Median distance of what it sees, m."""
+        """Median distance of its surfaces, m."""
         ...
 
 
@@ -239,19 +239,19 @@ class SpilledCoarseView:
 
     Attributes
     ----------
-    middle
+    centroid
         (3,) centroid of its points, in its camera's frame, m.
-    kept
-        Where it is.
+    spilled
+        Handle of the stored view.
     """
 
-    middle: Float64
-    kept: Spilled[CoarseView]
+    centroid: Float64
+    spilled: Spilled[CoarseView]
 
     @property
     def coarse(self) -> CoarseView:
         """The coarse view; read from disk if it is not in memory."""
-        return self.kept.get()
+        return self.spilled.get()
 
 
 class PosedView(Generic[V]):
@@ -262,14 +262,14 @@ class PosedView(Generic[V]):
     T_component_camera
         (4, 4) pose in the frame of its component.
     spill
-        Where it is kept; in memory unless given.
+        Storage; in memory unless given.
 
     Attributes
     ----------
     index
         Of the frame in its recording.
     depth
-        Median distance of what it sees, m.
+        Median distance of its surfaces, m.
     """
 
     def __init__(
@@ -290,7 +290,7 @@ class PosedView(Generic[V]):
 
 
 class ViewStore(Generic[V]):
-    """The views that global stages work on: spaced by motion.
+    """The views for the global stages: spaced by motion.
 
     Parameters
     ----------
@@ -316,12 +316,12 @@ class ViewStore(Generic[V]):
         scratch: Scratch = Scratch(),  # noqa: B008 - immutable
     ) -> None:
         self.views: list[PosedView[V]] = []
-        self.coarse: Spill[CoarseView] = scratch.part(_FOR_COARSE)
+        self.coarse: Spill[CoarseView] = scratch.part(_COARSE_FRACTION)
         self._spacing, self._always = spacing, frozenset(always)
-        self._spill: Spill[V] = scratch.part(1 - _FOR_COARSE)
+        self._spill: Spill[V] = scratch.part(1 - _COARSE_FRACTION)
         self._stretch = 1.0
         self._places = spacing.places()
-        # Where the last view would be if places were not thinned.
+        # Pose and component of the last view, as if places were not thinned.
         self._last: tuple[Float64, int] | None = None
 
     def push(
@@ -331,16 +331,16 @@ class ViewStore(Generic[V]):
         component: int = 0,
         reduced: Callable[[V], V] = lambda view: view,
     ) -> None:
-        """Add the next view, or what `reduced` makes of it, if it is wanted."""
-        if self._wants(view, T_component_camera, component):
+        """Add the next view, after `reduced`, if it is selected."""
+        if self._is_selected(view, T_component_camera, component):
             self._add(PosedView(reduced(view), T_component_camera, component, self._spill))
 
     def push_posed(self, posed: PosedView[V]) -> None:
-        """Add the next view of another store, if it is wanted."""
-        if self._wants(posed, posed.T_component_camera, posed.component):
+        """Add the next view of another store, if it is selected."""
+        if self._is_selected(posed, posed.T_component_camera, posed.component):
             self._add(posed)
 
-    def _wants(self, view: Storable, T_component_camera: Float64, component: int) -> bool:
+    def _is_selected(self, view: Storable, T_component_camera: Float64, component: int) -> bool:
         """Whether the camera has moved enough to a place with few views, or a view is required."""
         s, last = self._spacing, self._last
         if view.index in self._always or last is None or last[1] != component:
@@ -357,7 +357,7 @@ class ViewStore(Generic[V]):
         return not max_stretch or self._places.keeps(view.depth, T_component_camera, component)
 
     def of(self, frames: Collection[int]) -> list[PosedView[V]]:
-        """Views of some frames."""
+        """Stored views of these frames."""
         return [view for view in self.views if view.index in frames]
 
     def _add(self, posed: PosedView[V]) -> None:
@@ -377,18 +377,18 @@ class ViewStore(Generic[V]):
             if count % 2 == 0 or view.index in self._always:
                 kept.append(view)
             count += 1
-        # Where nearly every view is a component of its own, some of these have to go.
+        # If nearly every view is a separate component, some of these have to be dropped.
         self.views = kept if len(kept) < self._spacing.most else self.views[::2]
 
 
 def overlaps(
-    views: Sequence[HasCoarseView], poses: Float64, least: float, *, first: int = 0
+    views: Sequence[HasCoarseView], poses: Float64, min_overlap: float, *, first: int = 0
 ) -> tuple[Intp, Float64]:
     """Return the pairs of views that overlap, and their overlaps.
 
-    The overlap is the smaller of both directions: the fraction of points that are near a surface of
-    the other view with a similar normal, so that some drift is tolerated. Of many views only pairs
-    that may overlap are compared, see `nearby`.
+    The overlap is the smaller of both directions: the fraction of points close to a surface of the
+    other view with a similar normal, so that some drift is tolerated. Of many views only pairs
+    that may overlap are compared, see `candidate_pairs`.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ def overlaps(
         N views.
     poses
         (N, 4, 4) T_world_camera.
-    least
+    min_overlap
         Smallest overlap.
     first
         Pairs with j before this view are left out.
@@ -405,89 +405,91 @@ def overlaps(
     -------
     pairs (M, 2), i < j, in the order of j, then i; overlaps (M,).
     """
-    target, source = nearby(looked_at(views, poses), first)
+    target, source = candidate_pairs(world_centroids(views, poses), first)
     axes = poses[:, :3, 2]
-    facing = np.einsum("ni,ni->n", axes[target], axes[source]) > 0
-    target, source = target[facing], source[facing]
-    overlap = _seen_fractions(views, poses, target, source, least)
-    near = overlap >= least
-    target, source = target[near], source[near]
-    overlap = np.minimum(overlap[near], _seen_fractions(views, poses, source, target, least))
+    similar_direction = np.einsum("ni,ni->n", axes[target], axes[source]) > 0
+    target, source = target[similar_direction], source[similar_direction]
+    overlap = _visible_fractions(views, poses, target, source, min_overlap)
+    overlapping = overlap >= min_overlap
+    target, source = target[overlapping], source[overlapping]
+    overlap = np.minimum(
+        overlap[overlapping], _visible_fractions(views, poses, source, target, min_overlap)
+    )
     order = np.lexsort((target, source))
-    order = order[overlap[order] >= least]
+    order = order[overlap[order] >= min_overlap]
     return np.stack([target[order], source[order]], 1), overlap[order]
 
 
-def looked_at(views: Sequence[HasCoarseView], poses: Float64) -> Float64:
+def world_centroids(views: Sequence[HasCoarseView], poses: Float64) -> Float64:
     """(N, 3) centroids of the points of views, in the world of their poses (N, 4, 4)."""
-    middles = np.array([view.middle for view in views]).reshape(-1, 3)
-    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], middles) + poses[:, :3, 3])
+    centroids = np.array([view.centroid for view in views]).reshape(-1, 3)
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], centroids) + poses[:, :3, 3])
 
 
-def nearby(middles: Float64, first: int = 0) -> tuple[Intp, Intp]:
+def candidate_pairs(centroids: Float64, first: int = 0) -> tuple[Intp, Intp]:
     """Return pairs of views that may overlap, by the centroids (N, 3) of their points.
 
     All pairs, if there are few views; otherwise each view with those of the nearest centroids and
     with those just before it. Returns the positions i < j of all pairs with j >= first.
     """
-    n = len(middles)
-    if n <= _ALL:
+    n = len(centroids)
+    if n <= _MAX_EXHAUSTIVE:
         i, j = np.triu_indices(n, 1)
     elif first == n - 1:  # for the newest view alone, brute force is cheaper than a tree
-        away = np.linalg.norm(middles[:-1] - middles[-1], axis=1)
-        nearest = np.argpartition(away, _NEAREST)[:_NEAREST]
-        i = np.union1d(nearest, np.arange(max(0, n - 1 - _JUST_BEFORE), n - 1))
+        distances = np.linalg.norm(centroids[:-1] - centroids[-1], axis=1)
+        nearest = np.argpartition(distances, _NEAREST)[:_NEAREST]
+        i = np.union1d(nearest, np.arange(max(0, n - 1 - _PREVIOUS), n - 1))
         j = np.full(len(i), n - 1)
     else:
-        _, near = cKDTree(middles).query(middles, k=_NEAREST)
-        here = np.repeat(np.arange(n), _NEAREST)
-        before = np.arange(n)[:, None] - np.arange(1, _JUST_BEFORE + 1)
-        there = np.concatenate([near.ravel(), before.ravel()])
-        here = np.concatenate([here, np.repeat(np.arange(n), _JUST_BEFORE)])
-        known = (there >= 0) & (there != here)
-        low, high = np.minimum(here, there)[known], np.maximum(here, there)[known]
+        _, neighbours = cKDTree(centroids).query(centroids, k=_NEAREST)
+        views = np.repeat(np.arange(n), _NEAREST)
+        before = np.arange(n)[:, None] - np.arange(1, _PREVIOUS + 1)
+        others = np.concatenate([neighbours.ravel(), before.ravel()])
+        views = np.concatenate([views, np.repeat(np.arange(n), _PREVIOUS)])
+        valid = (others >= 0) & (others != views)
+        low, high = np.minimum(views, others)[valid], np.maximum(views, others)[valid]
         i, j = np.divmod(np.unique(low.astype(np.int64) * n + high), n)
-    late = j >= first
-    return np.asarray(i[late], np.intp), np.asarray(j[late], np.intp)
+    selected = j >= first
+    return np.asarray(i[selected], np.intp), np.asarray(j[selected], np.intp)
 
 
-def _seen_fractions(
+def _visible_fractions(
     views: Sequence[HasCoarseView],
     poses: Float64,
     target: Intp,
     source: Intp,
-    least: float,
+    min_overlap: float,
 ) -> Float64:
-    """Fraction of each source's points that its target sees; 0 if that is below `least`."""
+    """Fraction of each source's points that its target observes; 0 if below `min_overlap`."""
     used, row = np.unique(source, return_inverse=True)
-    some = [views[k].coarse.points for k in used]
-    starts = np.concatenate([[0], np.cumsum([len(points) for points in some])])
-    points = np.concatenate(some) if some else np.zeros((0, POINT_SIZE), np.float32)
-    inverse, at = se3.inverse(poses), np.ascontiguousarray(poses[used])
+    point_sets = [views[k].coarse.points for k in used]
+    starts = np.concatenate([[0], np.cumsum([len(points) for points in point_sets])])
+    points = np.concatenate(point_sets) if point_sets else np.zeros((0, POINT_SIZE), np.float32)
+    inverse, used_poses = se3.inverse(poses), np.ascontiguousarray(poses[used])
     # All sources of a target in succession, so that it stays in the cache.
     order = np.argsort(target, kind="stable")
-    different, begin = np.unique(target[order], return_index=True)
+    targets, begin = np.unique(target[order], return_index=True)
     end = np.append(begin[1:], len(order))
     out = np.zeros(len(target))
 
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             rows = order[begin[k] : end[k]]
-            view = views[different[k]].coarse
-            found = np.empty(len(rows))
+            view = views[targets[k]].coarse
+            fractions = np.empty(len(rows))
             kernels.overlaps(
                 points,
                 starts,
                 row[rows],
                 TargetImage(view.target, view.projection.lookup, view.projection.frame),
-                inverse[different[k]],
-                at,
-                _NEAR,
-                _FACING,
-                least,
-                found,
+                inverse[targets[k]],
+                used_poses,
+                _MAX_DISTANCE,
+                _MIN_COSINE,
+                min_overlap,
+                fractions,
             )
-            out[rows] = found
+            out[rows] = fractions
 
-    run_chunks(work, len(different), 32)
+    run_chunks(work, len(targets), 32)
     return out

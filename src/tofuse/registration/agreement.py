@@ -20,11 +20,11 @@ from tofuse.registration.view_points import sampled_points
 # Smallest difference between the scores of different poses, as a fraction of the points.
 MIN_LEAD = 0.03
 _CHUNK_POINTS = 6000
-_CLASH = 2.0  # times the difference that counts neither way
+_CLASH_RATIO = 2.0  # relative to the neutral difference in log albedo
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 # Prior standard deviation of an unknown exponent of the falloff (natural vignetting is the fourth
 # power), number of points that share an albedo error, and trimmed least-squares iterations.
-_FALLOFF, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
+_FALLOFF_SIGMA, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Agreement:
     clash
         Fraction of the points on the surface with another albedo: no support.
     rms_m
-        RMS distance from the surface of the points that lie on it, m; inf without any.
+        RMS distance of the points on the surface from it, m; inf without any.
     points
         Number of compared points of both images.
     score
@@ -124,18 +124,20 @@ class Comparison:
 
     Attributes
     ----------
-    ways
+    directions
         Points of one view, the view that they are projected into and its `nearest_depth`: from
         source to target, and from target to source.
     """
 
-    ways: tuple[tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]]
+    directions: tuple[
+        tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]
+    ]
     options: AgreementOptions
 
     @property
     def unknown_falloff(self) -> bool:
         """Whether both views' amplitude falls off towards the corners by an unknown exponent."""
-        return all(view.unknown_falloff for _, view, _ in self.ways)
+        return all(view.unknown_falloff for _, view, _ in self.directions)
 
     @classmethod
     def of(
@@ -143,9 +145,9 @@ class Comparison:
     ) -> Comparison:
         """Prepare two views."""
         options = AgreementOptions() if options is None else options
-        there = sampled_points(source, options.points), target, nearest_depth(target)
-        back = sampled_points(target, options.points), source, nearest_depth(source)
-        return cls((there, back), options)
+        forward = sampled_points(source, options.points), target, nearest_depth(target)
+        backward = sampled_points(target, options.points), source, nearest_depth(source)
+        return cls((forward, backward), options)
 
     def at(self, T_target_source: Float64) -> Agreement:
         """Return the agreement at a pose (4, 4); see `agreement`."""
@@ -153,29 +155,31 @@ class Comparison:
         T = np.ascontiguousarray(T_target_source, np.float64)
         total = np.zeros(kernels.AGREEMENT_SIZE)
         count = 0
-        compared = []
+        differences = []
         # The signs of the differences change with the direction.
-        for (points, by, nearest), pose, sign in zip(
-            self.ways, (T, se3.inverse(T)), (1, -1), strict=True
+        for (points, view, nearest), pose, sign in zip(
+            self.directions, (T, se3.inverse(T)), (1, -1), strict=True
         ):
             count += len(points.points)
             log_albedos = np.empty((2, len(points.points)), np.float32)
             pose = np.ascontiguousarray(pose)
-            total += _one_way(points, by, nearest, pose, options, log_albedos)
-            compared.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
+            total += _one_direction(points, view, nearest, pose, options, log_albedos)
+            differences.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
-        albedo_ratio, slants = np.hstack(compared)
-        clash, alike, falloff = 0, float(on_surface), 0.0
+        albedo_ratio, slants = np.hstack(differences)
+        clash, consistent, falloff = 0, float(on_surface), 0.0
         if len(albedo_ratio):
             if self.unknown_falloff:
                 falloff = _falloff(albedo_ratio, slants, options.albedo)
                 albedo_ratio = albedo_ratio + np.float32(falloff) * slants
             # Exposure is the median difference.
-            apart = np.abs(albedo_ratio - np.float32(median(albedo_ratio))) / np.float32(
+            ratio = np.abs(albedo_ratio - np.float32(median(albedo_ratio))) / np.float32(
                 options.albedo
             )
-            clash = int(np.count_nonzero(apart > _CLASH))
-            alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
+            clash = int(np.count_nonzero(ratio > _CLASH_RATIO))
+            consistent -= float(
+                np.minimum(ratio**2, 1 + options.clash_weight).sum(dtype=np.float64)
+            )
         per_point = 1 / max(count, 1)
         return Agreement(
             overlap=float(total[kernels.COMPARED] * per_point),
@@ -184,7 +188,7 @@ class Comparison:
             clash=float(clash * per_point),
             rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
             points=count,
-            score=float(per_point * (alike - options.violation_weight * violation)),
+            score=float(per_point * (consistent - options.violation_weight * violation)),
             falloff=falloff,
         )
 
@@ -194,14 +198,14 @@ def nearest_depth(view: PreparedView) -> Float32:
 
     It allows for mixed pixels, which are common among pixels without a plane.
     """
-    least = cv2.erode(np.where(view.z > 0, view.z, np.float32(np.inf)), _NEIGHBOURS)
-    return np.where(view.z > 0, least, np.float32(0)).astype(np.float32)
+    nearest = cv2.erode(np.where(view.z > 0, view.z, np.float32(np.inf)), _NEIGHBOURS)
+    return np.where(view.z > 0, nearest, np.float32(0)).astype(np.float32)
 
 
 def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
     """Return the exponent at which differences in log albedo (n,) have the least spread.
 
-    It is estimated by trimmed least squares, like the exposure at every pose anew: otherwise the
+    Like the exposure, it is estimated anew at every pose, by trimmed least squares: otherwise the
     falloff, a pattern that is fixed to the camera, contradicts every motion.
 
     Parameters
@@ -212,19 +216,19 @@ def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
         Tolerance of the differences.
     """
     exponent = 0.0
-    ridge = _CORRELATED_POINTS * (albedo / _FALLOFF) ** 2
-    keep = np.ones(len(albedo_ratio), bool)
+    ridge = _CORRELATED_POINTS * (albedo / _FALLOFF_SIGMA) ** 2
+    inliers = np.ones(len(albedo_ratio), bool)
     for _ in range(_ITERATIONS):
-        x, y = slants[keep].astype(np.float64), albedo_ratio[keep].astype(np.float64)
+        x, y = slants[inliers].astype(np.float64), albedo_ratio[inliers].astype(np.float64)
         x -= x.mean()
         exponent = -float(x @ (y - y.mean())) / (float(x @ x) + ridge)
-        off = albedo_ratio + np.float32(exponent) * slants
-        off = np.abs(off - np.float32(median(off[keep])))
-        keep = off <= 3 / MEDIAN_OF_NORMAL * np.float32(median(off[keep]))
+        residual = albedo_ratio + np.float32(exponent) * slants
+        residual = np.abs(residual - np.float32(median(residual[inliers])))
+        inliers = residual <= 3 / MEDIAN_OF_NORMAL * np.float32(median(residual[inliers]))
     return exponent
 
 
-def _one_way(
+def _one_direction(
     points: ViewPoints,
     view: PreparedView,
     nearest: Float32,

@@ -15,7 +15,7 @@ from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.cloud_pair import follow_clouds, measured_as_clouds, register_clouds
+from tofuse.registration.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
@@ -24,12 +24,12 @@ from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
 
-FEWEST_POINTS = 10
+MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.
 # docs/uncertainty.md describes the calibration.
-_AS_RECORDED = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
+_RECORDED_VIEWS = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
 # Maximum number of poses proposed by feature matching, and of described points of a view.
-_PROPOSALS, _DESCRIBED = 8, 1500
+_PROPOSALS, _DESCRIBED_POINTS = 8, 1500
 
 
 @part("registration", "any-pair")
@@ -59,29 +59,31 @@ class AnyPair(Registrar):
         Of ambiguous poses the one at the guess is returned.
         """
         for view in (source, target):
-            if len(view) < FEWEST_POINTS:
+            if len(view) < MIN_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
         # Other clouds are matched by features below.
-        proposals = partial(_alike, source, target, rng) if are_images else None
-        seen = _registered_as_images(source, target, guess, proposals, search=searches)
-        if seen is not None and are_images:
-            return seen
-        if seen is not None and seen.believed:
-            return measured_as_clouds(source, target, seen, rng)
+        proposals = partial(_feature_proposals, source, target, rng) if are_images else None
+        image_registration = _registered_as_images(
+            source, target, guess, proposals, search=searches
+        )
+        if image_registration is not None and are_images:
+            return image_registration
+        if image_registration is not None and image_registration.believed:
+            return with_cloud_information(source, target, image_registration, rng)
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)
-        return register_clouds(source, target, guess, rng, seen)
+        return register_clouds(source, target, guess, rng, image_registration)
 
 
-def _alike(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
+def _feature_proposals(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
     """Return the poses (N, 4, 4) proposed by feature matching, under any rotation."""
     try:
-        found = Fpfh(points=_DESCRIBED, signed=True).candidates(source, target, rng)
+        candidates = Fpfh(points=_DESCRIBED_POINTS, signed=True).candidates(source, target, rng)
     except RegistrationError:
         return np.zeros((0, 4, 4))
-    return np.stack([pose.T_target_source for pose in found.poses[:_PROPOSALS]])
+    return np.stack([pose.T_target_source for pose in candidates.poses[:_PROPOSALS]])
 
 
 def _registered_as_images(
@@ -99,10 +101,10 @@ def _registered_as_images(
     RegistrationError
         If two range images are of different scale.
     """
-    first, second = _as_image(source), _as_image(target)
-    if first is None or second is None:
+    source_image, target_image = _as_image(source), _as_image(target)
+    if source_image is None or target_image is None:
         return None
-    (data, T_source_camera), (model, T_target_camera) = first, second
+    (data, T_source_camera), (model, T_target_camera) = source_image, target_image
     T_camera_source, T_camera_target = se3.inverse(T_source_camera), se3.inverse(T_target_camera)
     # Views of one recording are mostly close to each other: of ambiguous poses the one at the
     # identity is returned, unless a guess is given.
@@ -117,10 +119,12 @@ def _registered_as_images(
             )
         return None  # registration as clouds may detect a wrong unit
     if search:
-        found = register_pair(data, model, start, proposals=proposals, uncertainty=_AS_RECORDED)
+        registration = register_pair(
+            data, model, start, proposals=proposals, uncertainty=_RECORDED_VIEWS
+        )
     else:
-        found = follow(data, model, start, uncertainty=_AS_RECORDED)
-    return None if found is None else found.between(T_target_camera, T_camera_source)
+        registration = follow(data, model, start, uncertainty=_RECORDED_VIEWS)
+    return None if registration is None else registration.between(T_target_camera, T_camera_source)
 
 
 def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
@@ -131,5 +135,5 @@ def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
     image = None if viewpoint is None else as_image(view, viewpoint)
     if image is None:
         return None
-    # The axis of such an image is not that of a lens.
+    # The optical axis of such an image is not that of a lens.
     return prepare_view(image[0], SurfaceOptions(falloff=0.0)), image[1]

@@ -89,10 +89,10 @@ class Registration:
     confirmed: bool = False
 
     def __repr__(self) -> str:
-        decided = {True: "accepted", False: "rejected", None: "not verified"}[self.believed]
+        decision = {True: "accepted", False: "rejected", None: "not verified"}[self.believed]
         t, w = self.T_target_source[:3, 3], se3.so3_log(self.T_target_source[:3, :3])
         return (
-            f"Registration: {decided}, translation {np.linalg.norm(t):.4f} m, "
+            f"Registration: {decision}, translation {np.linalg.norm(t):.4f} m, "
             f"rotation {np.degrees(np.linalg.norm(w)):.3f} degrees, "
             f"{self.inlier_ratio:.0%} inliers, rms {1000 * self.rms_m:.2f} mm"
         )
@@ -117,7 +117,7 @@ class Registration:
 
     @property
     def how(self) -> str:
-        """How the pose was found, in words."""
+        """How the pose was estimated, in words."""
         if self.margin is None:
             return "followed from a guess"
         return f"found by a search, margin {max(self.margin, 0.0):.0%}"
@@ -132,16 +132,16 @@ class Registration:
         T_source_b
             Maps b into the source's frame.
         """
-        inward, outward = se3.adjoint(T_source_b), se3.adjoint(se3.inverse(T_source_b))
-        free = self.unobservable @ outward.T
-        lengths = np.linalg.norm(free, axis=1, keepdims=True)
-        other = self.runner_up
+        adjoint, inverse_adjoint = se3.adjoint(T_source_b), se3.adjoint(se3.inverse(T_source_b))
+        unobservable = self.unobservable @ inverse_adjoint.T
+        lengths = np.linalg.norm(unobservable, axis=1, keepdims=True)
+        runner_up = self.runner_up
         return replace(
             self,
             T_target_source=T_a_target @ self.T_target_source @ T_source_b,
-            information=inward.T @ self.information @ inward,
-            unobservable=free / np.maximum(lengths, 1e-12),
-            runner_up=None if other is None else T_a_target @ other @ T_source_b,
+            information=adjoint.T @ self.information @ adjoint,
+            unobservable=unobservable / np.maximum(lengths, 1e-12),
+            runner_up=None if runner_up is None else T_a_target @ runner_up @ T_source_b,
         )
 
 

@@ -23,21 +23,21 @@ from tofuse.registration.viewpoint import RangeSphere, Viewpoint, viewpoint_of
 # Points of each plane fit.
 NEIGHBOURS = 12
 # Maximum numbers of points of each view that are compared, and tested for free-space violations.
-_COMPARED, _CONTRADICTING = 2500, 5000
+_COMPARED_POINTS, _FREE_SPACE_POINTS = 2500, 5000
 # Cosine of the incidence angle below which a surface is at grazing incidence.
-_GRAZED = 0.25
-# Surfaces coincide within this many standard deviations of their points, plus a fraction of the
+_MIN_INCIDENCE_COSINE = 0.25
+# Surfaces coincide within a number of standard deviations of their points, plus a fraction of the
 # resolution for the error of plane fits at curved surfaces.
-_SIGMAS, _BENT = 3.0, 0.25
+_SIGMAS, _CURVATURE_TOLERANCE = 3.0, 0.25
 # Maximum distance of corresponding points, in resolutions.
-_NEAR = 2.0
+_MAX_DISTANCE = 2.0
 # Cosine of the largest angle between normals of surfaces that support each other.
-_ALIKE = 0.75
+_MIN_NORMAL_COSINE = 0.75
 # A point is in free space if it lies in front of the surface by more than this fraction of the
 # range plus the tolerance.
 _IN_FRONT = 0.02
-# Weight of a point in free space relative to a supporting one: at a wrong pose most points lie on
-# some surface, as walls are similar, but at the right pose hardly any lies in free space.
+# Weight of a point in free space relative to a supporting one: at a wrong pose most points may lie
+# on surfaces, as walls are similar, but at the right pose hardly any lies in free space.
 _VIOLATION_WEIGHT = 20.0
 
 
@@ -55,7 +55,7 @@ class CloudMap:
         Typical distance of points from their planes, m.
     size
         Resolution, m.
-    clear
+    tested
         (m, 3) points that are tested for free-space violations, m; m = 0 without a viewpoint.
         Mixed pixels at edges and at grazing incidence are excluded, as they violate free space
         even at the right pose (2 % of the points of a torso).
@@ -67,20 +67,22 @@ class CloudMap:
     normals: Float64
     sigma: float
     size: float
-    clear: Float64
+    tested: Float64
     viewpoint: Viewpoint | None
     sphere: RangeSphere | None
 
     @classmethod
-    def of(cls, view: CloudFrame, size: float, whole: Frame) -> CloudMap:
-        """Prepare a view that was averaged from the `whole` one."""
+    def of(cls, view: CloudFrame, size: float, full_view: Frame) -> CloudMap:
+        """Prepare a view that was averaged from `full_view`."""
         shape = shape_at(view, np.arange(len(view)), NEIGHBOURS)
-        rough = shape.roughness[np.isfinite(shape.roughness)]
-        sigma = float(np.median(rough)) * size if len(rough) else size
-        viewpoint = viewpoint_of(whole)
-        sphere = None if viewpoint is None else RangeSphere.of(whole, viewpoint)
-        clear = np.zeros((0, 3)) if viewpoint is None else _clear(view, shape, viewpoint.origin)
-        return cls(view, shape.normals, sigma, size, clear, viewpoint, sphere)
+        roughness = shape.roughness[np.isfinite(shape.roughness)]
+        sigma = float(np.median(roughness)) * size if len(roughness) else size
+        viewpoint = viewpoint_of(full_view)
+        sphere = None if viewpoint is None else RangeSphere.of(full_view, viewpoint)
+        tested = (
+            np.zeros((0, 3)) if viewpoint is None else _tested_points(view, shape, viewpoint.origin)
+        )
+        return cls(view, shape.normals, sigma, size, tested, viewpoint, sphere)
 
     @property
     def tree(self) -> KdTree:
@@ -90,24 +92,26 @@ class CloudMap:
     @cached_property
     def compared(self) -> tuple[Float64, Float64]:
         """Evenly chosen points (n, 3) on surfaces, and their normals (n, 3)."""
-        known = np.flatnonzero(np.isfinite(self.normals).all(1))
-        known = known[:: max(1, -(-len(known) // _COMPARED))]
-        return self.view.points[known].astype(np.float64), self.normals[known]
+        valid = np.flatnonzero(np.isfinite(self.normals).all(1))
+        valid = valid[:: max(1, -(-len(valid) // _COMPARED_POINTS))]
+        return self.view.points[valid].astype(np.float64), self.normals[valid]
 
 
-def _clear(view: CloudFrame, shape: Shape, viewpoint: Float64) -> Float64:
+def _tested_points(view: CloudFrame, shape: Shape, viewpoint: Float64) -> Float64:
     """Return points (m, 3) on surfaces, except at edges and grazing incidence."""
     points = view.points.astype(np.float64)
     rays = points - viewpoint
-    facing = np.abs((shape.normals * rays).sum(1)) > _GRAZED * np.linalg.norm(rays, axis=1)
-    chosen = np.flatnonzero(facing & ~shape.boundary)  # a nan faces nothing
-    return points[chosen[:: max(1, -(-len(chosen) // _CONTRADICTING))]]
+    facing = np.abs((shape.normals * rays).sum(1)) > _MIN_INCIDENCE_COSINE * np.linalg.norm(
+        rays, axis=1
+    )
+    selected = np.flatnonzero(facing & ~shape.boundary)  # a nan faces nothing
+    return points[selected[:: max(1, -(-len(selected) // _FREE_SPACE_POINTS))]]
 
 
 def tolerance(source: CloudMap, target: CloudMap) -> float:
     """Return the distance in m within which surfaces of two views coincide."""
     noise = float(np.hypot(source.sigma, target.sigma))
-    return _SIGMAS * noise + _BENT * max(source.size, target.size)
+    return _SIGMAS * noise + _CURVATURE_TOLERANCE * max(source.size, target.size)
 
 
 def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Agreement:
@@ -116,57 +120,66 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
     `overlap` counts points that are near a surface or in free space. Without a known viewpoint
     there are no violations.
     """
-    within = tolerance(source, target)
-    ways = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
-    found = [_one_way(seen, by, T, within) for seen, by, T in ways]
-    near, on_surface, free, squares = np.mean(found, axis=0)
+    max_distance = tolerance(source, target)
+    directions = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
+    statistics = [_one_direction(a, b, T, max_distance) for a, b, T in directions]
+    near_fraction, on_surface, violation, squares = np.mean(statistics, axis=0)
     return Agreement(
-        overlap=float(near + free),
+        overlap=float(near_fraction + violation),
         support=float(on_surface),
-        violation=float(free),
+        violation=float(violation),
         clash=0.0,
         rms_m=float(np.sqrt(squares / on_surface)) if on_surface else np.inf,
         points=sum(len(view.compared[0]) for view in (source, target)),
-        score=float(on_surface - _VIOLATION_WEIGHT * free),
+        score=float(on_surface - _VIOLATION_WEIGHT * violation),
     )
 
 
-def _one_way(
-    seen: CloudMap, by: CloudMap, T: Float64, within: float
+def _one_direction(
+    view: CloudMap, other: CloudMap, T: Float64, max_distance: float
 ) -> tuple[float, float, float, float]:
     """Return fractions near a surface, on one, in free space; and mean square distance, m^2."""
-    points, normals = seen.compared
+    points, normals = view.compared
     if not len(points):
         return 0.0, 0.0, 0.0, 0.0
     points, normals = se3.transform(T, points), normals @ T[:3, :3].T
-    near, off, alike = _surface_at(by, points, normals, max(seen.size, by.size))
-    on = near & alike & (off < within)
-    free = _in_free_space(seen, by, T, within)
-    return float(np.mean(near)), float(np.mean(on)), free, float((off[on] ** 2).sum() / len(off))
+    is_near, distance, same_normal = _surface_at(other, points, normals, max(view.size, other.size))
+    on_surface = is_near & same_normal & (distance < max_distance)
+    violation = _in_free_space(view, other, T, max_distance)
+    return (
+        float(np.mean(is_near)),
+        float(np.mean(on_surface)),
+        violation,
+        float((distance[on_surface] ** 2).sum() / len(distance)),
+    )
 
 
-def _in_free_space(seen: CloudMap, by: CloudMap, T: Float64, within: float) -> float:
+def _in_free_space(view: CloudMap, other: CloudMap, T: Float64, max_distance: float) -> float:
     """Return the fraction of the clear points in the other view's free space."""
-    if by.sphere is None or not len(seen.clear):
+    if other.sphere is None or not len(view.tested):
         return 0.0
-    points = se3.transform(T, seen.clear)
-    ranges = np.linalg.norm(points - by.sphere.origin, axis=1)
-    points = points[by.sphere.before(points) > within + _IN_FRONT * ranges]
-    close, gap, _ = _surface_at(by, points, None, max(seen.size, by.size))
-    return float(np.count_nonzero(~(close & (gap < within))) / len(seen.clear))
+    points = se3.transform(T, view.tested)
+    ranges = np.linalg.norm(points - other.sphere.origin, axis=1)
+    points = points[other.sphere.distance_in_front(points) > max_distance + _IN_FRONT * ranges]
+    is_near, distance, _ = _surface_at(other, points, None, max(view.size, other.size))
+    return float(np.count_nonzero(~(is_near & (distance < max_distance))) / len(view.tested))
 
 
 def _surface_at(
-    view: CloudMap, points: Float64, normals: Float64 | None, size: float
+    view: CloudMap, points: Float64, normals: Float64 | None, resolution: float
 ) -> tuple[Bool, Float64, Bool]:
     """Return whether points (n, 3) are near a surface, and their distance (n,) from its plane.
 
     The third result is whether their normals (n, 3), if given, agree with those of the surface.
     """
-    nearest, _ = view.tree.nearest(points, _NEAR * size)
-    near = nearest >= 0
-    other = view.normals[np.maximum(nearest, 0)]
-    surface = view.view.points[np.maximum(nearest, 0)].astype(np.float64)
-    off = np.abs(((points - surface) * other).sum(1))
-    alike = near if normals is None else np.abs((normals * other).sum(1)) > _ALIKE
-    return near, off, alike
+    nearest, _ = view.tree.nearest(points, _MAX_DISTANCE * resolution)
+    is_near = nearest >= 0
+    surface_normals = view.normals[np.maximum(nearest, 0)]
+    surface_points = view.view.points[np.maximum(nearest, 0)].astype(np.float64)
+    distance = np.abs(((points - surface_points) * surface_normals).sum(1))
+    same_normal = (
+        is_near
+        if normals is None
+        else np.abs((normals * surface_normals).sum(1)) > _MIN_NORMAL_COSINE
+    )
+    return is_near, distance, same_normal

@@ -36,19 +36,19 @@ from tofuse.registration.surface_metrics import PointToPlane
 # Maximum number of points of each averaged view.
 _POINTS = 10_000
 # Number of proposals that are aligned at full resolution.
-_POLISHED = 8
+_MAX_REFINED = 8
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
-# A pose near the guess is preferred to one that leads by less than this fraction of the points.
-_LEAD = 0.02
+# A pose near the guess is preferred to one with a lead below this fraction of the points.
+_MIN_LEAD = 0.02
 # Support below which the views are also aligned from the guess from coarse to fine.
 _MIN_SUPPORT = 1 / 3
 # Loss of score by noise when a pose is aligned again.
-_GIVEN_UP = 0.02
+_MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
 _RIVAL_POINTS = 2500
 # Finest resolution, in spacings of this number of points.
-_FINER, _SPACED = 0.5, 5000
+_MIN_SPACING_RATIO, _SPACING_POINTS = 0.5, 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class _Pose:
     guess: Float64 | None = None
 
 
-# Placeholder for the rival of a pose without one; nothing fits there.
-_NOWHERE = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
+# Placeholder for the rival of a pose without one; it has no support.
+_NO_RIVAL = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +71,8 @@ class _Views:
 
     source: Frame
     target: Frame
-    there: CloudMap
-    here: CloudMap
+    source_map: CloudMap
+    target_map: CloudMap
     rng: np.random.Generator
 
     @classmethod
@@ -84,45 +84,50 @@ class _Views:
 
     @property
     def size(self) -> float:
-        return self.here.size
+        return self.target_map.size
 
     @property
-    def knows_free_space(self) -> bool:
+    def has_free_space(self) -> bool:
         """Whether the viewpoint, and so the free space, is known for both views."""
-        return self.there.viewpoint is not None and self.here.viewpoint is not None
+        return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
 
-    def judged(self, T: Float64) -> _Pose:
-        return _Pose(T, cloud_agreement(self.there, self.here, T))
+    def evaluated(self, T: Float64) -> _Pose:
+        return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
 
-    def polished(self, T: Float64) -> _Pose:
+    def refined(self, T: Float64) -> _Pose:
         """Align with a subset of the averaged source's points; T (4, 4) if that scores lower."""
-        before = self.judged(T)
+        initial = self.evaluated(T)
         try:
-            for icp in _polish(self.size):
-                T = icp.register(self.there.view, self.here.view, T, self.rng).T_target_source
+            for icp in _refinement_stages(self.size):
+                T = icp.register(
+                    self.source_map.view, self.target_map.view, T, self.rng
+                ).T_target_source
         except RegistrationError:
-            return before
-        after = self.judged(T)
-        return after if after.agreement.score >= before.agreement.score else before
+            return initial
+        aligned = self.evaluated(T)
+        return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
     def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> Evidence:
         return Evidence.of(pose.agreement, lead, degenerate, CLOUDS)
 
-    def measured(self, found: Registration) -> Registration:
+    def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
-        T, free = found.T_target_source, found.unobservable
-        return replace(found, information=cloud_information(self.there, self.here, T, free))
+        T, unobservable = registration.T_target_source, registration.unobservable
+        return replace(
+            registration,
+            information=cloud_information(self.source_map, self.target_map, T, unobservable),
+        )
 
     def differ(self, a: Float64, b: Float64) -> bool:
         """Whether two poses (4, 4) are distinct hypotheses."""
-        points = self.there.view.points.astype(np.float64)
+        points = self.source_map.view.points.astype(np.float64)
         return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
 
 
 def _finest(view: Frame) -> float:
     """Return a view's point spacing in m, bounded below by that of some thousand points."""
-    fraction = min(1.0, _SPACED / max(len(view), 1))
-    return spacing(view) * max(_FINER, float(np.sqrt(fraction)))
+    fraction = min(1.0, _SPACING_POINTS / max(len(view), 1))
+    return spacing(view) * max(_MIN_SPACING_RATIO, float(np.sqrt(fraction)))
 
 
 def register_clouds(
@@ -130,7 +135,7 @@ def register_clouds(
     target: Frame,
     guess: Float64 | None,
     rng: np.random.Generator,
-    seen: Registration | None = None,
+    image_registration: Registration | None = None,
     *,
     always_search: bool = False,
 ) -> Registration:
@@ -144,8 +149,8 @@ def register_clouds(
         (4, 4) T_target_source; the identity unless given.
     rng
         Source of the random samples.
-    seen
-        Result of the registration as images, if any: one more proposal.
+    image_registration
+        Result of the registration as images, if any: an additional proposal.
     always_search
         Whether to search even if the pose aligned from the guess is practically certain.
 
@@ -159,15 +164,17 @@ def register_clouds(
     RegistrationError
         If there are too few points, or no pose has enough correspondences.
     """
-    power = _power_of_scale(source, target)
+    power = _scale_exponent(source, target)
     if power and not always_search:
         scale = 10.0**power
-        found = _registered_scaled(source, target, scale, rng)
-        if found is not None:
+        registration = _registered_scaled(source, target, scale, rng)
+        if registration is not None:
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
-            return replace(found, believed=False, reason=reason)
+            return replace(registration, believed=False, reason=reason)
     try:
-        return _registered(source, target, guess, rng, seen, always_search=always_search)
+        return _registered(
+            source, target, guess, rng, image_registration, always_search=always_search
+        )
     except RegistrationError as error:
         if not power:
             raise
@@ -183,42 +190,48 @@ def _registered(
     target: Frame,
     guess: Float64 | None,
     rng: np.random.Generator,
-    seen: Registration | None = None,
+    image_registration: Registration | None = None,
     *,
     always_search: bool = False,
 ) -> Registration:
     views = _Views.of(source, target, rng)
     start = np.eye(4) if guess is None else guess
-    near = replace(views.polished(start), guess=start)
-    if views.evidence(near).probability >= CERTAIN and not always_search:
-        found = _registration(views, near)
-        if (found.probability or 0.0) >= CERTAIN and not len(found.unobservable):
-            return views.measured(found)
-    poses = [near] if seen is None else [near, views.judged(seen.T_target_source)]
+    local = replace(views.refined(start), guess=start)
+    if views.evidence(local).probability >= CERTAIN and not always_search:
+        registration = _registration(views, local)
+        if (registration.probability or 0.0) >= CERTAIN and not len(registration.unobservable):
+            return views.with_information(registration)
+    poses = (
+        [local]
+        if image_registration is None
+        else [local, views.evaluated(image_registration.T_target_source)]
+    )
     poses += _proposed(views, start)
     poses.sort(key=lambda pose: -pose.agreement.score)
     best = poses[0]
     if guess is not None:
-        alike = [p for p in poses if p.agreement.score >= best.agreement.score - _LEAD]
-        best = min(alike, key=lambda p: _apart(p.T_target_source, guess))
-    found = _registration(views, best, poses)
-    if guess is None or best.guess is not None or not len(found.unobservable):
-        return views.measured(found)
-    # Poses that differ along degenerate directions only: keep the guess there.
-    remapping = Remapping.of(found.unobservable, views.there.view.points.astype(np.float64))
-    across = remapping.across(se3.inverse(near.T_target_source) @ found.T_target_source)
-    if views.differ(near.T_target_source, near.T_target_source @ across):
-        return views.measured(found)
-    return views.measured(_registration(views, near, [best]))
+        tied = [p for p in poses if p.agreement.score >= best.agreement.score - _MIN_LEAD]
+        best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
+    registration = _registration(views, best, poses)
+    if guess is None or best.guess is not None or not len(registration.unobservable):
+        return views.with_information(registration)
+    # If the poses differ along degenerate directions only, these keep the guess.
+    remapping = Remapping.of(
+        registration.unobservable, views.source_map.view.points.astype(np.float64)
+    )
+    across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
+    if views.differ(local.T_target_source, local.T_target_source @ across):
+        return views.with_information(registration)
+    return views.with_information(_registration(views, local, [best]))
 
 
-def _power_of_scale(source: Frame, target: Frame) -> int:
-    """Power of ten (-3 to 3) of the ratio of the target's extent to the source's, else 0."""
-    there, here = extent(source.points), extent(target.points)
-    if there == 0 or here == 0:
+def _scale_exponent(source: Frame, target: Frame) -> int:
+    """Return log10 of the ratio of the target's extent to the source's, rounded; 0 beyond +-3."""
+    source_extent, target_extent = extent(source.points), extent(target.points)
+    if source_extent == 0 or target_extent == 0:
         return 0
-    power = round(float(np.log10(here / there)))
-    return power if abs(power) <= 3 else 0
+    exponent = round(float(np.log10(target_extent / source_extent)))
+    return exponent if abs(exponent) <= 3 else 0
 
 
 def _registered_scaled(
@@ -228,22 +241,24 @@ def _registered_scaled(
     points = source.points * np.float32(scale)
     scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
     try:
-        found = _registered(scaled, target, None, rng)
+        registration = _registered(scaled, target, None, rng)
     except RegistrationError:
         return None
-    return found if found.believed else None
+    return registration if registration.believed else None
 
 
-def measured_as_clouds(
-    source: Frame, target: Frame, found: Registration, rng: np.random.Generator
+def with_cloud_information(
+    source: Frame, target: Frame, registration: Registration, rng: np.random.Generator
 ) -> Registration:
     """Return a registration of two clouds' images with the information matrix of the clouds.
 
     Images of clouds have holes, and their noise is unknown.
     """
     views = _Views.of(source, target, rng)
-    free = cloud_unobservable(views.there, views.here, found.T_target_source)
-    return views.measured(replace(found, unobservable=free))
+    unobservable = cloud_unobservable(
+        views.source_map, views.target_map, registration.T_target_source
+    )
+    return views.with_information(replace(registration, unobservable=unobservable))
 
 
 def follow_clouds(
@@ -251,12 +266,12 @@ def follow_clouds(
 ) -> Registration:
     """Register two clouds from a guess (4, 4) without a search; see `register_clouds`."""
     views = _Views.of(source, target, rng)
-    near = replace(views.polished(guess), guess=guess)
-    if views.evidence(near).probability < CERTAIN:
-        far = CoarseToFine().register(source, target, guess, rng)
-        other = replace(views.judged(far.T_target_source), guess=guess)
-        near = max(near, other, key=lambda pose: pose.agreement.score)
-    return views.measured(_registration(views, near))
+    local = replace(views.refined(guess), guess=guess)
+    if views.evidence(local).probability < CERTAIN:
+        coarse = CoarseToFine().register(source, target, guess, rng)
+        alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
+        local = max(local, alternative, key=lambda pose: pose.agreement.score)
+    return views.with_information(_registration(views, local))
 
 
 def _proposed(views: _Views, start: Float64) -> list[_Pose]:
@@ -267,35 +282,35 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
     RegistrationError
         If there is no pose.
     """
-    found, failure = [], None
+    poses, failure = [], None
     try:
         candidates = (
-            Fpfh(signed=views.knows_free_space)
+            Fpfh(signed=views.has_free_space)
             .candidates(views.source, views.target, views.rng)
             .poses
         )
-        found += [views.polished(c.T_target_source) for c in candidates[:_POLISHED]]
+        poses += [views.refined(c.T_target_source) for c in candidates[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
-    if any(pose.agreement.support > _MIN_SUPPORT for pose in found):
-        return found
+    if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):
+        return poses
     try:
-        near = CoarseToFine().register(views.source, views.target, start, views.rng)
-        found.append(replace(views.judged(near.T_target_source), guess=start))
+        registration = CoarseToFine().register(views.source, views.target, start, views.rng)
+        poses.append(replace(views.evaluated(registration.T_target_source), guess=start))
     except RegistrationError as error:
         failure = error
-    if not found and failure is not None:
+    if not poses and failure is not None:
         raise failure
-    return found
+    return poses
 
 
-def _apart(a: Float64, b: Float64) -> float:
+def _pose_distance(a: Float64, b: Float64) -> float:
     return float(np.linalg.norm(se3.log(se3.inverse(a) @ b)))
 
 
-def _polish(size: float) -> tuple[Icp, ...]:
-    """Return ICP with few iterations at a wide reach, then at a narrow one, in resolutions."""
-    plain = Icp(
+def _refinement_stages(size: float) -> tuple[Icp, ...]:
+    """Return ICP with few iterations, first with a wide reach, then with a narrow one."""
+    wide = Icp(
         size,
         source=Uniform(800),
         target=All(),
@@ -304,55 +319,57 @@ def _polish(size: float) -> tuple[Icp, ...]:
         stopping=SmallStep(1e-2, 8),
         neighbours=NEIGHBOURS,
     )
-    return plain, replace(plain, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
+    return wide, replace(wide, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
 
 
 def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
     """Return the first pose distinct from the best one, whose alignment is T (4, 4).
 
-    With large noise, subsets of the points converge to different poses where all points converge to
-    the same one, so rivals are aligned with more points before they are compared.
+    With large noise, subsets of the points may converge to different poses, but all points to the
+    same one; so rivals are aligned with more points before they are compared.
     """
-    averaged = views.there.view, views.here.view
+    averaged = views.source_map.view, views.target_map.view
     for pose in poses:
         start = pose.T_target_source
         if not views.differ(start, best.T_target_source):
             continue
         try:
-            end = CoarseToFine().roughly(views.size, *averaged, start, _RIVAL_POINTS)
+            converged = CoarseToFine().approximate_pose(views.size, *averaged, start, _RIVAL_POINTS)
         except RegistrationError:
-            end = start
-        if views.differ(end, T):
+            converged = start
+        if views.differ(converged, T):
             return pose
-    return _NOWHERE
+    return _NO_RIVAL
 
 
 def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = None) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 
-    The rival is one of `poses`, the best first; None if the pose was not compared with others.
+    The rival is one of `poses`, the best first; None if the pose is not compared with others.
     """
     T = best.T_target_source
-    averaged = views.there.view, views.here.view
-    found = CoarseToFine().at(views.size, *averaged, T, T if best.guess is None else best.guess)
-    after = views.judged(found.T_target_source)
-    if after.agreement.score < best.agreement.score - _GIVEN_UP:
-        found = replace(found, T_target_source=T)
-        after = best
-    agreement = after.agreement
-    rival = None if poses is None else _rival(views, poses, best, after.T_target_source)
+    averaged = views.source_map.view, views.target_map.view
+    registration = CoarseToFine().at(
+        views.size, *averaged, T, T if best.guess is None else best.guess
+    )
+    pose = views.evaluated(registration.T_target_source)
+    if pose.agreement.score < best.agreement.score - _MAX_SCORE_LOSS:
+        registration = replace(registration, T_target_source=T)
+        pose = best
+    agreement = pose.agreement
+    rival = None if poses is None else _rival(views, poses, best, pose.T_target_source)
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
-    if lead is not None and len(found.unobservable):
+    if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    evidence = views.evidence(after, lead, len(found.unobservable))
+    evidence = views.evidence(pose, lead, len(registration.unobservable))
     reason = evidence.rejection_reason()
     return replace(
-        found,
+        registration,
         margin=lead,
         believed=not reason,
         probability=evidence.probability,
         reason=reason,
-        runner_up=None if rival is None or rival is _NOWHERE else rival.T_target_source,
+        runner_up=None if rival is None or rival is _NO_RIVAL else rival.T_target_source,
         overlap=agreement.overlap,
         support=agreement.support,
         contradiction=agreement.contradiction,

@@ -24,7 +24,7 @@ from tofuse.geometry import se3
 from tofuse.normal import robust_sigma
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap
 from tofuse.registration.pairs import (
-    FEWEST_PAIRS,
+    MIN_PAIRS,
     SurfacePairs,
     loss_weights,
     unobservable_directions,
@@ -32,19 +32,19 @@ from tofuse.registration.pairs import (
 
 # Maximum distance of corresponding points, in resolutions, and minimum cosine between their
 # normals.
-_NEAR, _ALIKE = 3.0, 0.75
+_MAX_DISTANCE, _MIN_NORMAL_COSINE = 3.0, 0.75
 # Patches: minimum edge in resolutions and its growth factor; maximum number, and minimum number for
 # an estimate of the field.
-_EDGE, _LARGER = 2.0, 1.05
+_MIN_EDGE, _EDGE_GROWTH = 2.0, 1.05
 _MAX_PATCHES, _MIN_PATCHES = 120, 12
 # Grid of variances of the field, relative to that of the noise of a patch.
 _RATIOS = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
 # Grid of correlation lengths, from the patches' edge to this many sizes of the overlap: distortions
 # may be correlated beyond it.
-_LENGTHS, _FURTHEST = 5, 4.0
+_LENGTHS, _MAX_LENGTH = 5, 4.0
 # Lower limit of the Hessian relative to the Gauss-Newton approximation, and number of points of its
 # finite differences.
-_STEEPNESS, _TRIED = 0.1, 1500
+_STEEPNESS, _DIFFERENCE_POINTS = 0.1, 1500
 # Lower limit of the residuals' sigma, as a fraction of the resolution.
 _MIN_SIGMA = 1e-3
 # Sigma along degenerate directions, in sizes of the overlap, or in rad.
@@ -62,14 +62,14 @@ def cloud_information(
     if pairs is None:
         size = max(float(np.linalg.norm(np.ptp(source.view.points, axis=0))), source.size)
         return np.diag((_UNBOUNDED * np.r_[[size] * 3, [1.0] * 3]) ** -2.0)
-    shift = np.eye(4)
-    shift[:3, 3] = -pairs.centre
+    T_centre_source = np.eye(4)
+    T_centre_source[:3, 3] = -pairs.centre
     # From the perturbation about the origin to that about the centroid, in units in which rotations
     # move the points as far as translations.
     unit = np.array([1, 1, 1, *[1 / pairs.size] * 3])
-    to_centre = se3.adjoint(shift) / unit[:, None]
-    slope = _slope(source, target, T_target_source, pairs, unit)
-    H = to_centre.T @ _information(pairs, slope, unit, unobservable @ to_centre.T) @ to_centre
+    to_centre = se3.adjoint(T_centre_source) / unit[:, None]
+    hessian = _hessian(source, target, T_target_source, pairs, unit)
+    H = to_centre.T @ _information(pairs, hessian, unit, unobservable @ to_centre.T) @ to_centre
     return np.asarray(0.5 * (H + H.T), np.float64)
 
 
@@ -122,20 +122,20 @@ class _Pairs:
     resolution: float
 
     @classmethod
-    def of(cls, source: CloudMap, target: CloudMap, T: Float64, every: int = 1) -> _Pairs | None:
-        """Match every n-th point with its nearest neighbour in the target; None if few match."""
+    def of(cls, source: CloudMap, target: CloudMap, T: Float64, stride: int = 1) -> _Pairs | None:
+        """Match every n-th point with its nearest target point; None if there are too few."""
         size = max(source.size, target.size)
-        p = source.view.points[::every].astype(np.float64)
-        nearest, _ = target.tree.nearest(se3.transform(T, p), _NEAR * size)
+        p = source.view.points[::stride].astype(np.float64)
+        nearest, _ = target.tree.nearest(se3.transform(T, p), _MAX_DISTANCE * size)
         R, j = T[:3, :3], np.maximum(nearest, 0)
-        a, b = target.normals[j] @ R, source.normals[::every]
+        a, b = target.normals[j] @ R, source.normals[::stride]
         q = se3.transform(se3.inverse(T), target.view.points[j].astype(np.float64))
-        together = (a * b).sum(1)
-        good = (nearest >= 0) & (np.abs(together) > _ALIKE)  # nan is not
-        if np.count_nonzero(good) < FEWEST_PAIRS:
+        cosine = (a * b).sum(1)
+        matched = (nearest >= 0) & (np.abs(cosine) > _MIN_NORMAL_COSINE)  # false for NaN
+        if np.count_nonzero(matched) < MIN_PAIRS:
             return None
-        p, q, a = p[good], q[good], a[good]
-        b = b[good] * np.sign(together[good])[:, None]
+        p, q, a = p[matched], q[matched], a[matched]
+        b = b[matched] * np.sign(cosine[matched])[:, None]
         # Of a normal and its opposite the one with its largest component positive.
         n = a + b
         n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -152,14 +152,14 @@ class _Pairs:
         """Robust standard deviation of the residuals, m."""
         return max(robust_sigma(self.residual), _MIN_SIGMA * self.resolution)
 
-    def kept(self, unit: Float64) -> Float64:
+    def cross_information(self, unit: Float64) -> Float64:
         """Sum of w times the symmetrised product of both Jacobians (6, 6), where noise cancels."""
         Ja = _jacobian(self.points, self.target_normals) * unit
         Jb = _jacobian(self.points, self.source_normals) * unit
         X = (Ja * self.weight[:, None]).T @ Jb
         return np.asarray(0.5 * (X + X.T), np.float64)
 
-    def weighed(self, unit: Float64) -> Float64:
+    def plain_information(self, unit: Float64) -> Float64:
         """(6, 6) sum of w J^T J."""
         J = _jacobian(self.points, self.normals) * unit
         return np.asarray((J * self.weight[:, None]).T @ J, np.float64)
@@ -181,7 +181,7 @@ class _Patches:
 
     Attributes
     ----------
-    places, normals
+    positions, normals
         (n, 3) centroids in m, and mean normals, shorter than 1 where the surface is curved.
     residual
         (n,) m.
@@ -193,7 +193,7 @@ class _Patches:
         Of the patches, m.
     """
 
-    places: Float64
+    positions: Float64
     normals: Float64
     residual: Float64
     responses: Float64
@@ -203,18 +203,18 @@ class _Patches:
     @classmethod
     def of(cls, pairs: _Pairs, unit: Float64) -> _Patches:
         """Group points by voxel and by the dominant axis of their normals."""
-        facing = np.abs(pairs.normals).argmax(1).astype(np.int64)
-        edge = _EDGE * pairs.resolution
+        dominant_axis = np.abs(pairs.normals).argmax(1).astype(np.int64)
+        edge = _MIN_EDGE * pairs.resolution
         while True:
             cell = np.floor(pairs.points / edge).astype(np.int64)
             cell -= cell.min(0)
             _, rows, layers = cell.max(0) + 1
-            key = ((cell[:, 0] * rows + cell[:, 1]) * layers + cell[:, 2]) * 3 + facing
+            key = ((cell[:, 0] * rows + cell[:, 1]) * layers + cell[:, 2]) * 3 + dominant_axis
             patch = np.unique(key, return_inverse=True)[1]
             count = int(patch.max()) + 1
             if count <= _MAX_PATCHES:
                 break
-            edge *= _LARGER * float(np.sqrt(count / _MAX_PATCHES))
+            edge *= _EDGE_GROWTH * float(np.sqrt(count / _MAX_PATCHES))
         total = np.bincount(patch, pairs.weight)
         valid = total > 0
 
@@ -234,12 +234,12 @@ class _Patches:
         )
 
 
-def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) -> Float64:
-    """Return the information (6, 6) about the centroid, degenerate along `free` (k, 6)."""
+def _information(pairs: _Pairs, hessian: Float64, unit: Float64, unobservable: Float64) -> Float64:
+    """Return the information (6, 6) about the centroid, degenerate along `unobservable` (k, 6)."""
     constrained = np.eye(6)
     H = np.zeros((6, 6))
-    if len(free):
-        _, s, vt = np.linalg.svd(free)
+    if len(unobservable):
+        _, s, vt = np.linalg.svd(unobservable)
         count = int((s > 1e-9 * s[0]).sum())
         constrained = vt[count:].T
         H += vt[:count].T @ vt[:count] / (_UNBOUNDED * pairs.size) ** 2
@@ -247,10 +247,16 @@ def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) ->
         return H
     patches = _Patches.of(pairs, unit)
     if len(patches.residual) >= _MIN_PATCHES:
-        meat = _estimated(patches, patches.responses @ constrained)
+        meat = _posterior_meat(patches, patches.responses @ constrained)
     else:  # too few patches for the field: assume neighbourhoods to be fully correlated
-        meat = NEIGHBOURS * pairs.noise**2 * constrained.T @ pairs.weighed(unit) @ constrained
-    bread = np.linalg.inv(constrained.T @ slope @ constrained)
+        meat = (
+            NEIGHBOURS
+            * pairs.noise**2
+            * constrained.T
+            @ pairs.plain_information(unit)
+            @ constrained
+        )
+    bread = np.linalg.inv(constrained.T @ hessian @ constrained)
     # A pose from another estimator is not the minimum: half the squared difference of the two
     # estimates is their common variance.
     step = bread @ constrained.T @ pairs.gradient(pairs.centre, unit)
@@ -259,70 +265,80 @@ def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) ->
     return np.asarray(H + constrained @ np.linalg.inv(C) @ constrained.T, np.float64)
 
 
-def _slope(source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: Float64) -> Float64:
+def _hessian(
+    source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: Float64
+) -> Float64:
     """Return X (6, 6), the derivative of the gradient ``sum w J r``, matches updated.
 
     Where noise is as large as the point spacing, nearest neighbours follow the pose and the
-    gradient is less steep than with fixed matches. So it is taken by finite differences.
+    gradient is less steep than with fixed matches, so X is computed by finite differences.
     """
-    every = max(1, len(source.view.points) // _TRIED)
-    to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = pairs.centre, -pairs.centre
-    weighed, kept = pairs.weighed(unit), pairs.kept(unit)
-    values, vectors = np.linalg.eigh(weighed)
+    stride = max(1, len(source.view.points) // _DIFFERENCE_POINTS)
+    T_source_centre, T_centre_source = np.eye(4), np.eye(4)
+    T_source_centre[:3, 3], T_centre_source[:3, 3] = pairs.centre, -pairs.centre
+    plain, cross = pairs.plain_information(unit), pairs.cross_information(unit)
+    values, vectors = np.linalg.eigh(plain)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
     step = pairs.noise
-    measured = np.zeros((6, 6))
+    derivative = np.zeros((6, 6))
     total = 0.0
     for k, direction in enumerate(vectors.T):
-        ends = []
+        gradients = []
         for sign in (1.0, -1.0):
-            moved = T @ to @ se3.exp(sign * step * direction * unit) @ back
-            there = _Pairs.of(source, target, moved, every)
-            if there is None:
+            T_moved = (
+                T @ T_source_centre @ se3.exp(sign * step * direction * unit) @ T_centre_source
+            )
+            moved_pairs = _Pairs.of(source, target, T_moved, stride)
+            if moved_pairs is None:
                 break
-            ends.append(there.gradient(pairs.centre, unit))
-            total += float(there.weight.sum()) / 12
-        if len(ends) == 2:
-            measured[:, k] = (ends[0] - ends[1]) / (2 * step)
-    measured = measured @ vectors.T * (pairs.weight.sum() / max(total, 1e-12))
-    steep = _bounded(inverse @ (0.5 * (measured + measured.T)) @ inverse, _STEEPNESS)
-    real = _bounded(inverse @ kept @ inverse, _STEEPNESS)
-    values, vectors = np.linalg.eigh(real)
-    half = (vectors * np.sqrt(values)) @ vectors.T
-    return np.asarray(root @ half @ steep @ half @ root, np.float64)
+            gradients.append(moved_pairs.gradient(pairs.centre, unit))
+            total += float(moved_pairs.weight.sum()) / 12
+        if len(gradients) == 2:
+            derivative[:, k] = (gradients[0] - gradients[1]) / (2 * step)
+    derivative = derivative @ vectors.T * (pairs.weight.sum() / max(total, 1e-12))
+    slope_ratio = _bounded(inverse @ (0.5 * (derivative + derivative.T)) @ inverse, _STEEPNESS)
+    signal_ratio = _bounded(inverse @ cross @ inverse, _STEEPNESS)
+    values, vectors = np.linalg.eigh(signal_ratio)
+    signal_root = (vectors * np.sqrt(values)) @ vectors.T
+    return np.asarray(root @ signal_root @ slope_ratio @ signal_root @ root, np.float64)
 
 
-def _bounded(S: Float64, least: float) -> Float64:
-    """Clip the eigenvalues of a symmetric matrix to the range from `least` to 1."""
+def _bounded(S: Float64, min_eigenvalue: float) -> Float64:
+    """Clip the eigenvalues of a symmetric matrix to the range from `min_eigenvalue` to 1."""
     values, vectors = np.linalg.eigh(S)
-    return np.asarray((vectors * np.clip(values, least, 1.0)) @ vectors.T, np.float64)
+    return np.asarray((vectors * np.clip(values, min_eigenvalue, 1.0)) @ vectors.T, np.float64)
 
 
-def _estimated(patches: _Patches, J: Float64) -> Float64:
+def _posterior_meat(patches: _Patches, J: Float64) -> Float64:
     """Posterior mean of ``J^T W V W J`` over the residuals' covariance V."""
     n, constrained = J.shape
     root = np.sqrt(patches.weight)
     y, A = root * patches.residual, root[:, None] * J
-    apart = np.linalg.norm(patches.places[:, None] - patches.places, axis=2)
-    along = (patches.normals @ patches.normals.T) * np.outer(root, root) / np.mean(root**2)
-    largest = max(_FURTHEST * float(np.percentile(apart, 90)), 2 * patches.edge)
-    freedom = max(n - constrained, 1)
-    likely, meat = [], []
-    for length in np.geomspace(patches.edge, largest, _LENGTHS):
-        values, vectors = np.linalg.eigh(along * np.exp(-apart / length))
+    distance = np.linalg.norm(patches.positions[:, None] - patches.positions, axis=2)
+    normal_correlation = (
+        (patches.normals @ patches.normals.T) * np.outer(root, root) / np.mean(root**2)
+    )
+    max_length = max(_MAX_LENGTH * float(np.percentile(distance, 90)), 2 * patches.edge)
+    degrees_of_freedom = max(n - constrained, 1)
+    log_likelihoods, meat = [], []
+    for length in np.geomspace(patches.edge, max_length, _LENGTHS):
+        values, vectors = np.linalg.eigh(normal_correlation * np.exp(-distance / length))
         values = np.maximum(values, 0.0)
-        seen, at = vectors.T @ y, vectors.T @ A
-        noise, field = at.T @ at, (at.T * values) @ at
+        y_rotated, A_rotated = vectors.T @ y, vectors.T @ A
+        noise, field = A_rotated.T @ A_rotated, (A_rotated.T * values) @ A_rotated
         for ratio in _RATIOS:
             variance = 1 + ratio * values
-            inner = (at.T / variance) @ at
-            fit = np.linalg.pinv(inner, hermitian=True) @ ((at.T / variance) @ seen)
-            square = float(((seen - at @ fit) ** 2 / variance).sum())
-            logs = np.log(variance).sum() + np.linalg.slogdet(inner)[1]
-            likely.append(-0.5 * logs - 0.5 * freedom * np.log(max(square, 1e-300)))
+            normal_matrix = (A_rotated.T / variance) @ A_rotated
+            fit = np.linalg.pinv(normal_matrix, hermitian=True) @ (
+                (A_rotated.T / variance) @ y_rotated
+            )
+            square = float(((y_rotated - A_rotated @ fit) ** 2 / variance).sum())
+            logs = np.log(variance).sum() + np.linalg.slogdet(normal_matrix)[1]
+            log_likelihoods.append(
+                -0.5 * logs - 0.5 * degrees_of_freedom * np.log(max(square, 1e-300))
+            )
             # The scale's posterior mean, with the prior 1 / scale.
-            meat.append((noise + ratio * field) * square / max(freedom - 2, 1))
-    weight = np.exp(np.array(likely) - max(likely))
+            meat.append((noise + ratio * field) * square / max(degrees_of_freedom - 2, 1))
+    weight = np.exp(np.array(log_likelihoods) - max(log_likelihoods))
     return np.asarray(np.tensordot(weight / weight.sum(), np.array(meat), 1), np.float64)

@@ -17,7 +17,7 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
-from tofuse.registration.pairs import FEWEST_PAIRS
+from tofuse.registration.pairs import MIN_PAIRS
 from tofuse.registration.reduce import averaged, extent, reduced
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.remapping import Remapping
@@ -27,13 +27,13 @@ from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PlaneToPlane
 
 _SPACING_SAMPLE = 5000
-_SMALLEST_LEVEL = 60
+_MIN_LEVEL_POINTS = 60
 _CELLS_PER_EXTENT = 10
 # Median roughness above which normals are unreliable, and number of points of the estimate.
-_ROUGHEST, _ROUGHNESS_SAMPLE = 0.25, 1500
-_COARSER = 1.5
+_MAX_ROUGHNESS, _ROUGHNESS_SAMPLE = 0.25, 1500
+_COARSENING = 1.5
 # Minimum extent of the scene, in resolutions of the finest level.
-_FINEST = 10
+_MIN_EXTENT = 10
 
 
 @part("registration", "in-turn")
@@ -58,10 +58,10 @@ class InTurn(Bounded, Registrar):
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
     ) -> Registration:
         """See `Registrar.register`; the result is that of the last stage."""
-        found = self.stages[0].register(source, target, guess, rng)
+        registration = self.stages[0].register(source, target, guess, rng)
         for stage in self.stages[1:]:
-            found = stage.register(source, target, found.T_target_source, rng)
-        return found
+            registration = stage.register(source, target, registration.T_target_source, rng)
+        return registration
 
 
 @part("registration", "coarse-to-fine", label="validated")
@@ -94,7 +94,7 @@ class CoarseToFine(Bounded, Registrar):
     """
 
     resolution: Annotated[float | None, Bounds(0, exclusive=True)] = None
-    points: Annotated[int, Bounds(_SMALLEST_LEVEL)] = 20000
+    points: Annotated[int, Bounds(_MIN_LEVEL_POINTS)] = 20000
     metric: Metric = field(default_factory=lambda: PlaneToPlane(loss="tukey"))
     reach: float = 3.0
     neighbours: int = 12
@@ -113,37 +113,39 @@ class CoarseToFine(Bounded, Registrar):
             If there are too few points, or too few correspond.
         """
         for view in (source, target):
-            if len(view) < FEWEST_PAIRS:
+            if len(view) < MIN_PAIRS:
                 raise RegistrationError(
-                    f"has {len(view)} points, {FEWEST_PAIRS} are needed",
+                    f"has {len(view)} points, {MIN_PAIRS} are needed",
                     where=f"frame {view.index}",
                 )
         if self.resolution is None:
-            fine = self.finest(source, target, max(spacing(source), spacing(target)))
+            finest = self.finest(source, target, max(spacing(source), spacing(target)))
         else:
             size = self.resolution
-            fine = size, averaged(source, size), averaged(target, size)
-        levels = [fine]
-        most = extent(fine[2].points) / _CELLS_PER_EXTENT
-        most = most if self.coarsest is None else min(most, self.coarsest)
-        while levels[-1][0] * 2 < most:
+            finest = size, averaged(source, size), averaged(target, size)
+        levels = [finest]
+        max_resolution = extent(finest[2].points) / _CELLS_PER_EXTENT
+        max_resolution = (
+            max_resolution if self.coarsest is None else min(max_resolution, self.coarsest)
+        )
+        while levels[-1][0] * 2 < max_resolution:
             resolution = 2 * levels[-1][0]
-            coarser = resolution, averaged(fine[1], resolution), averaged(fine[2], resolution)
-            if min(len(coarser[1]), len(coarser[2])) < _SMALLEST_LEVEL:
+            coarser = resolution, averaged(finest[1], resolution), averaged(finest[2], resolution)
+            if min(len(coarser[1]), len(coarser[2])) < _MIN_LEVEL_POINTS:
                 break
             levels.append(coarser)
         T = guess
         for resolution, data, model in reversed(levels):
-            last = resolution == fine[0]
-            icp = self._icp(resolution, 1e-3 if last else 1e-2)
+            is_finest = resolution == finest[0]
+            icp = self._icp(resolution, 1e-3 if is_finest else 1e-2)
             try:
-                found = icp.register(data, model, T, rng)
+                registration = icp.register(data, model, T, rng)
             except RegistrationError:
-                if last:
+                if is_finest:
                     raise
                 continue  # too few pairs at this level: a finer one may have enough
-            T = found.T_target_source
-        return _kept(found, icp, data, model, guess, rng)
+            T = registration.T_target_source
+        return _remapped(registration, icp, data, model, guess, rng)
 
     def at(
         self,
@@ -158,9 +160,9 @@ class CoarseToFine(Bounded, Registrar):
         Degenerate directions keep the guess (4, 4).
         """
         icp, rng = self._icp(resolution, 1e-3), np.random.default_rng(0)  # nothing is drawn
-        return _kept(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
+        return _remapped(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
 
-    def roughly(
+    def approximate_pose(
         self, resolution: float, data: CloudFrame, model: CloudFrame, T_start: Float64, points: int
     ) -> Float64:
         """Register about `points` points as `at` does, less accurately; return the pose (4, 4).
@@ -196,24 +198,24 @@ class CoarseToFine(Bounded, Registrar):
         """
         size, data, model = reduced(source, target, size, self.points)
         # Averaging reduces noise, but not true roughness, which keeps the first size.
-        first = size, data, model
-        while max(self._roughness(data), self._roughness(model)) > _ROUGHEST:
-            size *= _COARSER
+        initial = size, data, model
+        while max(self._roughness(data), self._roughness(model)) > _MAX_ROUGHNESS:
+            size *= _COARSENING
             data, model = averaged(source, size), averaged(target, size)
-            if min(len(data), len(model)) < _SMALLEST_LEVEL or size * _FINEST > extent(
+            if min(len(data), len(model)) < _MIN_LEVEL_POINTS or size * _MIN_EXTENT > extent(
                 model.points
             ):
-                return first
+                return initial
         return size, data, model
 
     def _roughness(self, view: CloudFrame) -> float:
-        some = np.arange(0, len(view), max(1, len(view) // _ROUGHNESS_SAMPLE))
-        rough = shape_at(view, some, self.neighbours).roughness
-        return float(np.nanmedian(rough)) if np.isfinite(rough).any() else 0.0
+        sampled = np.arange(0, len(view), max(1, len(view) // _ROUGHNESS_SAMPLE))
+        roughness = shape_at(view, sampled, self.neighbours).roughness
+        return float(np.nanmedian(roughness)) if np.isfinite(roughness).any() else 0.0
 
 
-def _kept(
-    found: Registration,
+def _remapped(
+    registration: Registration,
     icp: Icp,
     data: CloudFrame,
     model: CloudFrame,
@@ -221,10 +223,10 @@ def _kept(
     rng: np.random.Generator,
 ) -> Registration:
     """Return the registration with degenerate directions fixed to the guess (4, 4)."""
-    if len(found.unobservable) == 0:
-        return found
-    remapping = Remapping.of(found.unobservable, data.points.astype(np.float64))
-    T = found.T_target_source
+    if len(registration.unobservable) == 0:
+        return registration
+    remapping = Remapping.of(registration.unobservable, data.points.astype(np.float64))
+    T = registration.T_target_source
     T = T @ remapping.along(se3.inverse(T) @ guess)
     return icp.register(data, model, T, rng, remapping)
 

@@ -28,23 +28,23 @@ def with_extended_planes(
 ) -> PreparedView:
     """Return the view of `frame` with more planes, for fusion: at noisy pixels and depth edges.
 
-    They are left out for tracking. Existing planes stay; variances are those of
+    Tracking does not use these. Existing planes stay; variances are those of
     `PreparedView.with_pixel_variance`.
     """
     surface = surface.with_pixel_variance()
-    known = (surface.z > 0) & (surface.sigma > 0)
-    if not known.any():
+    valid = (surface.z > 0) & (surface.sigma > 0)
+    if not valid.any():
         return surface
-    w = inverse(surface.z, known)
-    noise = np.where(known, surface.sigma * w, np.float32(0))
-    typical = median(noise[known])
+    w = inverse(surface.z, valid)
+    noise = np.where(valid, surface.sigma * w, np.float32(0))
+    typical = median(noise[valid])
     options = options.for_image(surface.projection.pitch, float(np.sqrt(2) * typical))
-    missing = known & (surface.planes[..., 3] == 0)
-    quiet = surface.planes
-    if np.count_nonzero(missing & (noise > _NOISY_RATIO * typical)) >= _MIN_NOISY * known.size:
+    missing = valid & (surface.planes[..., 3] == 0)
+    typical_planes = surface.planes
+    if np.count_nonzero(missing & (noise > _NOISY_RATIO * typical)) >= _MIN_NOISY * valid.size:
         surface = _with_planes_at_noisy_pixels(surface, frame, w, noise, missing, options)
-        missing = known & (surface.planes[..., 3] == 0)
-    return _with_planes_of_neighbours(surface, quiet, w, noise, missing, options)
+        missing = valid & (surface.planes[..., 3] == 0)
+    return _with_planes_of_neighbours(surface, typical_planes, w, noise, missing, options)
 
 
 def _with_planes_at_noisy_pixels(
@@ -67,17 +67,19 @@ def _with_planes_at_noisy_pixels(
     planes, quality = fitted_planes(w, surface.rays, weight, missing, limit, options)
     new = missing & (planes[..., 3] > 0)
     shared = shared_sigma(frame, surface.projection.lengths2)
-    variance, own = with_shared_error(quality[..., 1], planes, shared)
+    variance, pixel_variance = with_shared_error(quality[..., 1], planes, shared)
     return replace(
         surface,
         planes=np.where(new[..., None], planes, surface.planes),
-        plane_variance=np.where(new, variance if own is None else own, surface.plane_variance),
+        plane_variance=np.where(
+            new, variance if pixel_variance is None else pixel_variance, surface.plane_variance
+        ),
     )
 
 
 def _with_planes_of_neighbours(
     surface: PreparedView,
-    quiet: Float32,
+    typical_planes: Float32,
     w: Float32,
     noise: Float32,
     missing: Bool,
@@ -86,13 +88,13 @@ def _with_planes_of_neighbours(
     """Return the view with the planes of neighbours at pixels whose depth agrees with these.
 
     No window fits next to a depth edge, yet the surface extends up to it; a pixel that mixes light
-    of both sides agrees with neither plane. Only the planes `quiet` (H, W, 4) of pixels with
+    of both sides agrees with neither plane. Only the `typical_planes` (H, W, 4) of pixels with
     typical noise are extended: dark surfaces are biased by multipath beyond their noise.
     """
     steps, growth = _steps(options.radii[0])
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
     extend_planes(
-        w, noise * w, surface.rays, missing, quiet, surface.plane_variance, steps, growth,
+        w, noise * w, surface.rays, missing, typical_planes, surface.plane_variance, steps, growth,
         _MAX_PLANE_SIGMAS, options.edge_jump, planes, variance,
     )  # fmt: skip
     return replace(surface, planes=planes, plane_variance=variance)
@@ -104,11 +106,11 @@ def _steps(radius: int) -> tuple[Int32, Float32]:
 
     The variance of a plane fitted to a window of this radius grows with the squared distance
     relative to the window's mean square. Offsets reach two pixels beyond the window's radius, as
-    pixels on both sides of an edge are left out.
+    pixels on both sides of an edge are excluded.
     """
     reach = radius + 2
-    around = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
-    squares = (around**2).sum(1)
+    offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
+    squares = (offsets**2).sum(1)
     order = np.argsort(squares, kind="stable")[1:]
     growth = 1 + squares[order] / (radius * (radius + 1) / 3)
-    return around[order].astype(np.int32), growth.astype(np.float32)
+    return offsets[order].astype(np.int32), growth.astype(np.float32)

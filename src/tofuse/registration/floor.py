@@ -23,7 +23,7 @@ class Floor:
 
 
 # Number of sampled points, and of plane hypotheses.
-_POINTS, _TRIED = 1200, 200
+_POINTS, _HYPOTHESES = 1200, 200
 # Inlier tolerances: angle between the normals, rad, and distance from the plane, m plus a fraction
 # of the depth. They cover the systematic errors of ToF cameras, which exceed their noise.
 _ANGLE, _BAND_M, _BAND_FRACTION = 0.15, 0.02, 0.01
@@ -33,8 +33,8 @@ _MIN_INLIERS, _MAX_BELOW = 0.04, 0.02
 _BELOW = 3.0
 # Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
 _DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-# Maximum angle between the floor's normal and down, rad: for a camera that is held in any way, and
-# if gravity is known.
+# Maximum angle between the floor's normal and down, rad: for any attitude of the camera, and if
+# gravity is known.
 _MAX_TILT, _KNOWN_TILT = 0.9, np.radians(10.0)
 
 
@@ -66,35 +66,35 @@ def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -
 
     Its normal is within `max_tilt`, rad, of `down`.
     """
-    seen = sampled_points(view, _POINTS)
-    p, n = seen.points.astype(float), seen.normals.astype(float)
+    sampled = sampled_points(view, _POINTS)
+    p, n = sampled.points.astype(float), sampled.normals.astype(float)
     if len(p) < 20:
         return None
     down = np.asarray(down, float) / np.linalg.norm(down)
-    least = np.cos(max_tilt)
-    facing = np.flatnonzero(n @ down > least)
+    min_cosine = np.cos(max_tilt)
+    facing = np.flatnonzero(n @ down > min_cosine)
     if len(facing) < _MIN_INLIERS * len(p):
         return None
-    tried = facing[:: max(1, len(facing) // _TRIED)]
-    weight = 1 / np.maximum(seen.sigma.astype(float), 1e-4) ** 2
+    hypotheses = facing[:: max(1, len(facing) // _HYPOTHESES)]
+    weight = 1 / np.maximum(sampled.sigma.astype(float), 1e-4) ** 2
     band = _BAND_M + _BAND_FRACTION * p[:, 2]
     # A table may be larger than the visible floor, but has points below it.
-    cosine, most = float(np.cos(_ANGLE)), _MAX_BELOW * len(p)
-    best = kernels.lowest_plane(p, n, band, tried, cosine, most, _BELOW)
+    cosine, max_below = float(np.cos(_ANGLE)), _MAX_BELOW * len(p)
+    best = kernels.lowest_plane(p, n, band, hypotheses, cosine, max_below, _BELOW)
     normal, height = n[best], float(p[best] @ n[best])
-    mine = _on(p, n, band, normal, height, cosine)
+    inliers = _on_plane(p, n, band, normal, height, cosine)
     for _ in range(3):  # least squares over the inliers
-        normal, height = fit_plane(p[mine], weight[mine])
-        mine = _on(p, n, band, normal, height, cosine)
-        if mine.sum() < max(20, _MIN_INLIERS * len(p)):
+        normal, height = fit_plane(p[inliers], weight[inliers])
+        inliers = _on_plane(p, n, band, normal, height, cosine)
+        if inliers.sum() < max(20, _MIN_INLIERS * len(p)):
             return None
     below = np.count_nonzero(p @ normal > height + _BELOW * band)
-    if below > _MAX_BELOW * len(p) or normal @ down < least or height <= 0:
+    if below > _MAX_BELOW * len(p) or normal @ down < min_cosine or height <= 0:
         return None
-    return Floor(normal, height, float(mine.mean()))
+    return Floor(normal, height, float(inliers.mean()))
 
 
-def _on(
+def _on_plane(
     p: Float64, n: Float64, band: Float64, normal: Float64, height: float, cosine: float
 ) -> Bool:
     """Whether points p (N, 3) with normals n (N, 3) lie on a plane, (N,)."""

@@ -35,19 +35,19 @@ _BINS = 11
 # Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
 # Maximum number of neighbours within reach.
-_MAX_NEAR = 60
+_MAX_NEIGHBOURS = 60
 # Sampling noise of an averaged point along each axis, and maximum distance of points that fit, in
 # resolutions.
-_SCATTER, _FITS = 0.4, 1.5
+_SAMPLING_SIGMA, _FIT_DISTANCE = 0.4, 1.5
 # Maximum extent of a surface across relative to that along it.
-_ROUGHEST = 0.6
+_MAX_ROUGHNESS = 0.6
 # Motions that differ by more are distinct: resolutions, and rad (rotations from matches are
 # inaccurate).
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.3
 # Reach of ICP per iteration, resolutions, and minimum number of correspondences.
-_REACHES, _FEWEST = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
+_REACHES, _MIN_PAIRS = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
 # Minimum cosine of the angle between normals that fit.
-_ALIKE = 0.8
+_MIN_NORMAL_COSINE = 0.8
 
 
 @part("registration", "fpfh")
@@ -113,15 +113,15 @@ class Fpfh(Bounded, Registrar):
         RegistrationError
             If too few matches agree on a motion, or, once refined, too few points correspond.
         """
-        found = self.candidates(source, target, rng)
-        best = found.poses[0]
-        rival = found.poses[1].inlier_ratio if len(found.poses) > 1 else 0.0
-        first = registration_of(found.pairs, best.agreed, best.inlier_ratio - rival)
+        candidates = self.candidates(source, target, rng)
+        best = candidates.poses[0]
+        rival = candidates.poses[1].inlier_ratio if len(candidates.poses) > 1 else 0.0
+        coarse = registration_of(candidates.pairs, best.consensus, best.inlier_ratio - rival)
         if not self.refine:
-            return first
-        fine = CoarseToFine(coarsest=found.size)
-        finer = fine.register(source, target, best.T_target_source, rng)
-        return replace(finer, margin=first.margin)
+            return coarse
+        refinement = CoarseToFine(coarsest=candidates.size)
+        refined = refinement.register(source, target, best.T_target_source, rng)
+        return replace(refined, margin=coarse.margin)
 
     def candidates(self, source: Frame, target: Frame, rng: np.random.Generator) -> Candidates:
         """Return the consensus poses of the matches, and how well the averaged views fit there.
@@ -133,46 +133,53 @@ class Fpfh(Bounded, Registrar):
         """
         size = _COARSER * max(spacing(source), spacing(target))
         size, data, model = reduced(source, target, size, self.points)
-        there, here = self._described(data, size), self._described(model, size)
-        i, j = mutually_nearest(there.histograms, here.histograms)
-        variance = np.full(len(i), 2 * (_SCATTER * size) ** 2)
-        pairs = Pairs(there.points[i], here.points[j], variance)
-        tree = KdTree(here.points)
+        described_source, described_target = (
+            self._described(data, size),
+            self._described(model, size),
+        )
+        i, j = mutually_nearest(described_source.histograms, described_target.histograms)
+        variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
+        pairs = Pairs(described_source.points[i], described_target.points[j], variance)
+        tree = KdTree(described_target.points)
         refined = [
-            Candidate(*_refined(there, here, tree, c.T_target_source, size), c)
+            Candidate(
+                *_refined(described_source, described_target, tree, c.T_target_source, size), c
+            )
             for c in consensus(pairs, self._consensus(size), rng)
         ]
         distinct: list[Candidate] = []
-        for one in sorted(refined, key=lambda c: -c.inlier_ratio):
+        for candidate in sorted(refined, key=lambda c: -c.inlier_ratio):
             # Discard poses that converge to a better one.
             if all(
                 are_distinct(
-                    one.T_target_source,
+                    candidate.T_target_source,
                     c.T_target_source,
-                    there.points,
+                    described_source.points,
                     metres=_DISTINCT * size,
                     rad=_DISTINCT_RAD,
                 )
                 for c in distinct
             ):
-                distinct.append(one)
+                distinct.append(candidate)
         return Candidates(size, pairs, tuple(distinct))
 
-    def _described(self, view: CloudFrame, size: float) -> Described:
+    def _described(self, view: CloudFrame, size: float) -> DescribedCloud:
         shape = shape_at(view, np.arange(len(view)), self.neighbours)
         # Points that are on no surface have no descriptor and corrupt those of their neighbours.
-        known = np.isfinite(shape.normals).all(1) & (shape.roughness < _ROUGHEST)
-        points, normals = view.points[known].astype(np.float64), shape.normals[known]
+        valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
+        points, normals = view.points[valid].astype(np.float64), shape.normals[valid]
         if len(points) < self.inliers:
             raise RegistrationError(
                 f"has {len(points)} points on surfaces, too few to be matched",
                 where=f"frame {view.index}",
             )
-        return Described(points, normals, fpfh(points, normals, self.reach * size, self.signed))
+        return DescribedCloud(
+            points, normals, fpfh(points, normals, self.reach * size, self.signed)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class DescribedCloud:
     """Points (n, 3) of a view, their normals (n, 3), and histograms (n, 33)."""
 
     points: Float64
@@ -186,7 +193,7 @@ class Candidate:
 
     T_target_source: Float64
     inlier_ratio: float
-    agreed: Consensus
+    consensus: Consensus
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,22 +234,30 @@ def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float
         opposite give the same histogram.
     """
     n = len(points)
-    near, squared = KdTree(points).neighbours(points, min(_MAX_NEAR + 1, n))
-    own, around = np.empty((n, 3, _BINS)), np.empty((n, 3 * _BINS))
+    neighbours, squared = KdTree(points).neighbours(points, min(_MAX_NEIGHBOURS + 1, n))
+    spfh, neighbour_mean = np.empty((n, 3, _BINS)), np.empty((n, 3 * _BINS))
     run_chunks(
-        lambda a, b: kernels.histograms(points, normals, near, squared, reach, signed, own, a, b), n
+        lambda a, b: kernels.histograms(
+            points, normals, neighbours, squared, reach, signed, spfh, a, b
+        ),
+        n,
     )
-    flat = own.reshape(n, 3 * _BINS)
-    run_chunks(lambda a, b: kernels.weighted_means(flat, near, squared, reach, around, a, b), n)
-    return flat + around
+    spfh_flat = spfh.reshape(n, 3 * _BINS)
+    run_chunks(
+        lambda a, b: kernels.weighted_means(
+            spfh_flat, neighbours, squared, reach, neighbour_mean, a, b
+        ),
+        n,
+    )
+    return spfh_flat + neighbour_mean
 
 
 def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
     """Return the positions in a (n, d) and b (m, d) of mutual nearest neighbours."""
-    there = _nearest(a, b)
-    back = _nearest(b, a)
-    i = np.flatnonzero(back[there] == np.arange(len(a)))
-    return i.astype(np.int64), there[i]
+    forward = _nearest(a, b)
+    backward = _nearest(b, a)
+    i = np.flatnonzero(backward[forward] == np.arange(len(a)))
+    return i.astype(np.int64), forward[i]
 
 
 def _nearest(a: Float64, b: Float64) -> Int64:
@@ -255,25 +270,25 @@ def _nearest(a: Float64, b: Float64) -> Int64:
 
 
 def _refined(
-    source: Described, target: Described, tree: KdTree, T: Float64, size: float
+    source: DescribedCloud, target: DescribedCloud, tree: KdTree, T: Float64, size: float
 ) -> tuple[Float64, float]:
     """Refine T (4, 4) by ICP over the averaged points; return it and the fraction that fits."""
-    for far in _REACHES:
-        fits, nearest = _fitting(source, target, tree, T, far * size)
-        if np.count_nonzero(fits) < _FEWEST:
+    for reach in _REACHES:
+        fits, nearest = _fitting(source, target, tree, T, reach * size)
+        if np.count_nonzero(fits) < _MIN_PAIRS:
             break
         p, q = source.points[fits], target.points[nearest[fits]]
         T = motion_of(Pairs(p, q, np.ones(len(p))))
-    fits, _ = _fitting(source, target, tree, T, _FITS * size)
+    fits, _ = _fitting(source, target, tree, T, _FIT_DISTANCE * size)
     return T, float(np.mean(fits))
 
 
 def _fitting(
-    source: Described, target: Described, tree: KdTree, T: Float64, far: float
+    source: DescribedCloud, target: DescribedCloud, tree: KdTree, T: Float64, max_distance: float
 ) -> tuple[Bool, Int64]:
     """Return which source points fit a target point with a similar normal (n,), and its index."""
-    nearest, squared = tree.nearest(se3.transform(T, source.points), far)
-    turned = source.normals @ T[:3, :3].T
+    nearest, squared = tree.nearest(se3.transform(T, source.points), max_distance)
+    rotated_normals = source.normals @ T[:3, :3].T
     # Without a neighbour the squared distance is infinite and the normals are irrelevant.
-    alike = np.abs((turned * target.normals[nearest]).sum(1)) > _ALIKE
-    return (squared < far * far) & alike, nearest
+    same_normal = np.abs((rotated_normals * target.normals[nearest]).sum(1)) > _MIN_NORMAL_COSINE
+    return (squared < max_distance * max_distance) & same_normal, nearest

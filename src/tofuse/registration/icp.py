@@ -34,13 +34,13 @@ from tofuse.registration.selectors import Random, at_most
 from tofuse.registration.shape import NEIGHBOURS
 from tofuse.registration.stopping import TwoLoops
 
-_FEWEST_POINTS = 3
+_MIN_POINTS = 3
 
 
 @part("registration", "icp", label="validated")
 @dataclass(frozen=True)
 class Icp(Bounded, Registrar):
-    """ICP: match, reject, move, until the stopping rule is met.
+    """ICP: match, reject and move until the stopping rule is met.
 
     Attributes
     ----------
@@ -102,21 +102,21 @@ class Icp(Bounded, Registrar):
         reach = min((r.reach(self.resolution) for r in self.rejectors), default=math.inf)
 
         T = se3.orthonormalise(guess)
-        moved = transform_points(T, data.points)
+        transformed = transform_points(T, data.points)
         history = History()
         converged = False
         while not converged and len(history) < self.stopping.max_iterations:
             if self.source.each_iteration and len(history) > 0:
                 data = self._select(self.source, source, rng)
-                moved = transform_points(T, data.points)
+                transformed = transform_points(T, data.points)
             if self.target.each_iteration and len(history) > 0:
                 model = self._select(self.target, target, rng)
                 search = self.matcher.prepare(model)
-            alignment = Alignment(data, model, self.resolution, T, moved)
+            alignment = Alignment(data, model, self.resolution, T, transformed)
             matches = search.match(alignment, reach)
             for rejector in self.rejectors:
                 matches = rejector.reject(matches, alignment)
-            before = moved
+            previous = transformed
             motion = self.metric.motion(matches, alignment)
             T = (
                 motion @ T
@@ -126,14 +126,14 @@ class Icp(Bounded, Registrar):
             # R^T is used as the inverse of R: without this, rounding errors grow with every
             # iteration.
             T = se3.orthonormalise(T)
-            moved = transform_points(T, data.points)
+            transformed = transform_points(T, data.points)
             history.correspondences.append(len(matches))
             history.errors.append(float(matches.distance.sum()) / (len(data) * self.resolution))
-            step = math.sqrt(float(((moved - before) ** 2).sum()) / len(data))
+            step = math.sqrt(float(((transformed - previous) ** 2).sum()) / len(data))
             history.steps.append(step / self.resolution)
             converged = self.stopping.met(history)
 
-        final = Alignment(data, model, self.resolution, T, moved)
+        final = Alignment(data, model, self.resolution, T, transformed)
         return Registration(
             T_target_source=T,
             converged=converged,
@@ -148,13 +148,13 @@ class Icp(Bounded, Registrar):
         )
 
     def _select(self, selector: Selector, view: Frame, rng: np.random.Generator) -> Points:
-        chosen = Points.of(view, selector.select(view, rng), self.neighbours)
-        if len(chosen) < _FEWEST_POINTS:
+        points = Points.of(view, selector.select(view, rng), self.neighbours)
+        if len(points) < _MIN_POINTS:
             raise RegistrationError(
-                f"has {len(chosen)} points, {_FEWEST_POINTS} are needed",
+                f"has {len(points)} points, {_MIN_POINTS} are needed",
                 where=f"frame {view.index}",
             )
-        return chosen
+        return points
 
 
 def algorithm_1(
@@ -172,8 +172,8 @@ def algorithm_1(
 
         E = sum(d_i) / (n_p res),
 
-    d_i are the distances of the corresponding points and n_p is the number of points of the
-    source that take part.
+    d_i are the distances of the corresponding points and n_p is the number of selected points
+    of the source.
 
     Parameters
     ----------

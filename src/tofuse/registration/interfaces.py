@@ -183,7 +183,7 @@ class Search(Protocol):
     def match(self, alignment: Alignment, reach: float) -> Matches:
         """Pair points of the source with points of the target.
 
-        Pairs of points further apart than `reach` (m) will be rejected anyway and may be left out.
+        Pairs of points further apart than `reach` (m) will be rejected anyway and may be omitted.
         """
         ...
 

@@ -23,11 +23,11 @@ class ClosestPoint(Matcher):
     def prepare(self, target: Points) -> Search:
         """Build the tree, once for all iterations: the target doesn't move.
 
-        That over a whole view is built once for all registrations against it.
+        The tree of a full view is shared by all registrations against it.
         """
         view = target.view
-        whole = len(target) == len(view) and bool((np.diff(target.index) == 1).all())
-        return _TreeSearch(tree_of(view) if whole else KdTree(target.points))
+        is_full_view = len(target) == len(view) and bool((np.diff(target.index) == 1).all())
+        return _TreeSearch(tree_of(view) if is_full_view else KdTree(target.points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,6 @@ class _TreeSearch:
     tree: KdTree
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        index, distance2 = self.tree.nearest(alignment.moved, reach)
+        index, squared = self.tree.nearest(alignment.moved, reach)
         source = np.flatnonzero(index >= 0)
-        return Matches(source, index[source], np.sqrt(distance2[source]))
+        return Matches(source, index[source], np.sqrt(squared[source]))

@@ -16,7 +16,7 @@ from tofuse.registration.interfaces import Alignment, Matches, Metric
 _RANK_TOLERANCE = 1e-12
 _ROUNDING = 1e-14
 # Lower limit of the residuals' sigma, as a fraction of the resolution.
-_SMALLEST_SIGMA = 1e-3
+_MIN_SIGMA_RATIO = 1e-3
 
 
 @part("metric", "point-to-point", label="validated")
@@ -74,8 +74,8 @@ class PointToPoint(Metric):
         degenerate.
         """
         weight = matches.weights()
-        r = alignment.moved[matches.source] - alignment.target.points[matches.target]
-        freedom = max(3 * len(matches) - 6, 1)
-        variance = float((weight[:, None] * r * r).sum()) / freedom
-        variance = max(variance, (_SMALLEST_SIGMA * alignment.resolution) ** 2)
+        residual = alignment.moved[matches.source] - alignment.target.points[matches.target]
+        degrees_of_freedom = max(3 * len(matches) - 6, 1)
+        variance = float((weight[:, None] * residual * residual).sum()) / degrees_of_freedom
+        variance = max(variance, (_MIN_SIGMA_RATIO * alignment.resolution) ** 2)
         return point_information(alignment.source.points, matches.source, weight) / variance

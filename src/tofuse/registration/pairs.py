@@ -21,18 +21,18 @@ from tofuse.registration.interfaces import Alignment, Matches
 
 Loss = Literal["square", "huber", "cauchy", "tukey"]
 
-FEWEST_PAIRS = 6
+MIN_PAIRS = 6
 # Lower limit of the residuals' sigma, as a fraction of the resolution.
-_SMALLEST_SIGMA = 1e-3
+_MIN_SIGMA_RATIO = 1e-3
 # Tuning constants for 95 % efficiency on normal errors, in standard deviations.
 _HUBER, _CAUCHY, _TUKEY = 1.345, 2.385, 4.685
 # Relative eigenvalues below this are rounding errors.
 _RANK_TOLERANCE = 1e-10
 # Normals that differ by more than 60 degrees are of different surfaces.
-_ALIKE = 0.5
+_MIN_NORMAL_COSINE = 0.5
 # Minimum fraction of a direction's information that is not noise. Degenerate directions have less
 # than 0.15, directions constrained by a few percent of the points more than 0.5.
-_SIGNAL = 0.4
+_MIN_SIGNAL_FRACTION = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +76,16 @@ class SurfacePairs:
 
     def motion(self, xi: Float64) -> Float64:
         """Return the motion (4, 4) in the target's frame of a perturbation about the centre."""
-        to, back = np.eye(4), np.eye(4)
-        to[:3, 3], back[:3, 3] = self.centre, -self.centre
+        T_source_centre, T_centre_source = np.eye(4), np.eye(4)
+        T_source_centre[:3, 3], T_centre_source[:3, 3] = self.centre, -self.centre
         T = self.T_target_source
-        return T @ to @ se3.exp(xi) @ back @ se3.inverse(T)
+        return T @ T_source_centre @ se3.exp(xi) @ T_centre_source @ se3.inverse(T)
 
     def to_origin(self, H: Float64) -> Float64:
         """Transform information (6, 6) about the centre to the source's origin."""
-        shift = np.eye(4)
-        shift[:3, 3] = -self.centre
-        adjoint = se3.adjoint(shift)
+        T_centre_source = np.eye(4)
+        T_centre_source[:3, 3] = -self.centre
+        adjoint = se3.adjoint(T_centre_source)
         H = adjoint.T @ H @ adjoint
         return (H + H.T) / 2
 
@@ -106,7 +106,7 @@ class SurfacePairs:
 def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = False) -> SurfacePairs:
     """Convert matches to pairs with normals of the target and, if `source`, of the source.
 
-    Pairs without normals are left out.
+    Pairs without normals are excluded.
 
     Raises
     ------
@@ -115,33 +115,42 @@ def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = Fals
     """
     i, j = matches.source, matches.target
     T = alignment.T_target_source
-    turn = np.eye(4)
-    turn[:3, :3] = T[:3, :3].T
+    rotation = np.eye(4)
+    rotation[:3, :3] = T[:3, :3].T
     p = alignment.source.points[i]
-    residual = transform_points(turn, alignment.moved[i] - alignment.target.points[j])
-    of_target = transform_points(turn, alignment.target.normals[j])
-    of_source = alignment.source.normals[i] if source else np.zeros((len(i), 3))
+    residual = transform_points(rotation, alignment.moved[i] - alignment.target.points[j])
+    target_normals = transform_points(rotation, alignment.target.normals[j])
+    source_normals = alignment.source.normals[i] if source else np.zeros((len(i), 3))
     weight = matches.weights() * _noise_weights(matches, alignment)
-    known = np.isfinite(of_target).all(1) & np.isfinite(of_source).all(1) & (weight > 0)
-    if np.count_nonzero(known) < FEWEST_PAIRS:
+    valid = np.isfinite(target_normals).all(1) & np.isfinite(source_normals).all(1) & (weight > 0)
+    if np.count_nonzero(valid) < MIN_PAIRS:
         raise RegistrationError(
-            f"only {np.count_nonzero(known)} points of the views correspond and have normals, "
-            f"{FEWEST_PAIRS} are needed"
+            f"only {np.count_nonzero(valid)} points of the views correspond and have normals, "
+            f"{MIN_PAIRS} are needed"
         )
-    centre = p[known].mean(0)
+    centre = p[valid].mean(0)
     pairs = SurfacePairs(
-        T, centre, p - centre, residual, of_target, of_source, weight, alignment.resolution
+        T,
+        centre,
+        p - centre,
+        residual,
+        target_normals,
+        source_normals,
+        weight,
+        alignment.resolution,
     )
-    return pairs.keep(known)
+    return pairs.keep(valid)
 
 
 def _noise_weights(matches: Matches, alignment: Alignment) -> Float64:
     """Return inverse variances (m,) relative to their mean; ones if sigma is unknown."""
-    a, b = alignment.source.variance, alignment.target.variance
-    if a is None or b is None or len(matches) == 0:
+    source_variance, target_variance = alignment.source.variance, alignment.target.variance
+    if source_variance is None or target_variance is None or len(matches) == 0:
         return np.ones(len(matches))
-    floor = (_SMALLEST_SIGMA * alignment.resolution) ** 2
-    inverse = 1 / np.maximum(a[matches.source] + b[matches.target], floor)
+    floor = (_MIN_SIGMA_RATIO * alignment.resolution) ** 2
+    inverse = 1 / np.maximum(
+        source_variance[matches.source] + target_variance[matches.target], floor
+    )
     return inverse / inverse.mean()
 
 
@@ -156,12 +165,12 @@ def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
 
 
 def in_scales(residual: Float64, resolution: float) -> Float64:
-    """Return absolute residuals (m,), given in m, relative to their robust scale.
+    """Return absolute residuals (m,), in m, relative to their robust scale.
 
     The scale is 1.4826 times their median, at least a thousandth of the resolution.
     """
-    size = np.abs(residual)
-    return np.asarray(size / max(robust_sigma(size), _SMALLEST_SIGMA * resolution))
+    magnitude = np.abs(residual)
+    return np.asarray(magnitude / max(robust_sigma(magnitude), _MIN_SIGMA_RATIO * resolution))
 
 
 def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
@@ -179,7 +188,7 @@ def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
 def variance_of(square: float, weight: Float64, resolution: float) -> float:
     """Variance in m^2 of residuals with the weighted sum of squares `square`."""
     variance = square / max(float(weight.sum()) - 6, 1.0)
-    return max(variance, (_SMALLEST_SIGMA * resolution) ** 2)
+    return max(variance, (_MIN_SIGMA_RATIO * resolution) ** 2)
 
 
 def solve(H: Float64, g: Float64, size: float) -> Float64:
@@ -189,9 +198,9 @@ def solve(H: Float64, g: Float64, size: float) -> Float64:
     """
     scale = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
     values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
-    good = values > _RANK_TOLERANCE * values[-1]
+    nonsingular = values > _RANK_TOLERANCE * values[-1]
     step = np.zeros(6)
-    for value, vector in zip(values[good], vectors.T[good], strict=True):
+    for value, vector in zip(values[nonsingular], vectors.T[nonsingular], strict=True):
         step -= vector * float((vector * scale * g).sum()) / value
     return scale * step
 
@@ -216,9 +225,9 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     or if most of its plain information is noise, and absent from the cross-information.
     """
     # The orientation of the normals is irrelevant here.
-    together = (pairs.target_normals * pairs.source_normals).sum(1)
-    turned = pairs.source_normals * np.sign(together)[:, None]
-    pairs = replace(pairs, source_normals=turned).keep(np.abs(together) > _ALIKE)
+    cosine = (pairs.target_normals * pairs.source_normals).sum(1)
+    oriented = pairs.source_normals * np.sign(cosine)[:, None]
+    pairs = replace(pairs, source_normals=oriented).keep(np.abs(cosine) > _MIN_NORMAL_COSINE)
     if not len(pairs):
         return np.eye(6)
     unit = pairs.resolution
@@ -226,11 +235,11 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     C = cross_information(pairs, variance) * scale[:, None] * scale
     values, vectors = np.linalg.eigh(C)
     directions = np.ascontiguousarray((vectors * scale[:, None]).T)
-    both, plain = direction_products(
+    cross, plain = direction_products(
         pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
     )
-    constrained = (values > 1) & (both > _SIGNAL * plain)
-    shift = np.eye(4)
-    shift[:3, 3] = pairs.centre
-    free = directions[~constrained] @ se3.adjoint(shift).T
-    return free / np.linalg.norm(free, axis=1, keepdims=True)
+    constrained = (values > 1) & (cross > _MIN_SIGNAL_FRACTION * plain)
+    T_source_centre = np.eye(4)
+    T_source_centre[:3, 3] = pairs.centre
+    unobservable = directions[~constrained] @ se3.adjoint(T_source_centre).T
+    return unobservable / np.linalg.norm(unobservable, axis=1, keepdims=True)

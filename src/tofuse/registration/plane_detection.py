@@ -11,7 +11,7 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import sampled_points
 
 # Points of a view, and hypotheses in each round of RANSAC.
-_POINTS, _TRIED = 3000, 150
+_POINTS, _HYPOTHESES = 3000, 150
 # Largest angle between the normals of a plane and of its inliers, rad.
 _MAX_ANGLE = 0.35
 
@@ -27,9 +27,9 @@ class Plane:
     offset
         m, above 0.
     fraction
-        Of the view's points, those on it.
+        Fraction of the view's points on it.
     rms_m
-        Distance of these from it.
+        RMS distance of these points from it.
     """
 
     normal: Float64
@@ -65,34 +65,40 @@ def detect_planes(
     sigmas, thickness
         Largest distance of an inlier: standard deviations, plus a fraction of its depth.
     """
-    seen = sampled_points(view, _POINTS)
-    p, n = seen.points.astype(float), seen.normals.astype(float)
-    within = sigmas * seen.sigma.astype(float) + thickness * p[:, 2]
-    weight = 1 / within**2
-    left = np.ones(len(p), bool)
+    sampled = sampled_points(view, _POINTS)
+    p, n = sampled.points.astype(float), sampled.normals.astype(float)
+    max_distance = sigmas * sampled.sigma.astype(float) + thickness * p[:, 2]
+    weight = 1 / max_distance**2
+    remaining = np.ones(len(p), bool)
     planes: list[Plane] = []
-    while len(planes) < max_planes and left.sum() >= max(3, min_fraction * len(p)):
-        tried = rng.choice(np.flatnonzero(left), min(_TRIED, int(left.sum())), replace=False)
-        offsets = (p[tried] * n[tried]).sum(1)
-        on = _on(p, n, within, n[tried], offsets) & left
-        mine = on[int(np.argmax(on.sum(1)))]
+    while len(planes) < max_planes and remaining.sum() >= max(3, min_fraction * len(p)):
+        hypotheses = rng.choice(
+            np.flatnonzero(remaining), min(_HYPOTHESES, int(remaining.sum())), replace=False
+        )
+        offsets = (p[hypotheses] * n[hypotheses]).sum(1)
+        is_inlier = _on_planes(p, n, max_distance, n[hypotheses], offsets) & remaining
+        inliers = is_inlier[int(np.argmax(is_inlier.sum(1)))]
         for _ in range(3):
-            normal, offset = fit_plane(p[mine], weight[mine])
-            mine = _on(p, n, within, normal[None], np.array([offset]))[0] & left
-            if mine.sum() < 3:
+            normal, offset = fit_plane(p[inliers], weight[inliers])
+            inliers = (
+                _on_planes(p, n, max_distance, normal[None], np.array([offset]))[0] & remaining
+            )
+            if inliers.sum() < 3:
                 break
-        if mine.sum() < max(3, min_fraction * len(p)):
+        if inliers.sum() < max(3, min_fraction * len(p)):
             break
-        left &= ~mine
-        rms = float(np.sqrt(((p[mine] @ normal - offset) ** 2).mean()))
-        planes.append(Plane(normal, offset, float(mine.mean()), rms))
+        remaining &= ~inliers
+        rms = float(np.sqrt(((p[inliers] @ normal - offset) ** 2).mean()))
+        planes.append(Plane(normal, offset, float(inliers.mean()), rms))
     return planes
 
 
-def _on(p: Float64, n: Float64, within: Float64, normals: Float64, offsets: Float64) -> Bool:
+def _on_planes(
+    p: Float64, n: Float64, max_distance: Float64, normals: Float64, offsets: Float64
+) -> Bool:
     """Whether each point lies on each of K planes, (K, N)."""
-    near = np.abs(normals @ p.T - offsets[:, None]) < within
-    return near & (normals @ n.T > np.cos(_MAX_ANGLE))
+    is_near = np.abs(normals @ p.T - offsets[:, None]) < max_distance
+    return is_near & (normals @ n.T > np.cos(_MAX_ANGLE))
 
 
 def fit_plane(p: Float64, weight: Float64) -> tuple[Float64, float]:

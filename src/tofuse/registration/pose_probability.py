@@ -24,7 +24,7 @@ ACCEPTED = 0.9
 # not compared with rivals.
 CERTAIN = 0.98
 # Usual limits of right poses: minimum support, minimum lead and maximum contradiction.
-_LITTLE_SUPPORT, _SMALL_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
+_MIN_SUPPORT, _MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Evidence:
         degenerate: int = 0,
         model: Model = IMAGES,
     ) -> Evidence:
-        """Make the evidence from the agreement of both views."""
+        """Return the evidence from the agreement of both views."""
         return cls(agreement.support, agreement.contradiction, margin, degenerate, model)
 
     @property
@@ -86,8 +86,8 @@ class Evidence:
         them would fit as well. Support enters by the lead.
         """
         lead = max(self.margin or 0.0, 0.0)
-        loose = max(1 - lead / _SMALL_LEAD, 0.0) if self.degenerate else 0.0
-        return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), loose])
+        degeneracy = max(1 - lead / _MIN_LEAD, 0.0) if self.degenerate else 0.0
+        return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy])
 
     @property
     def followed(self) -> Float64:
@@ -109,13 +109,15 @@ class Evidence:
         if self.probability >= ACCEPTED:
             return ""
         problems = []
-        if self.support < _LITTLE_SUPPORT:
+        if self.support < _MIN_SUPPORT:
             problems.append(f"only {self.support:.0%} of the points of both views support the pose")
-        if self.margin is not None and self.margin < _SMALL_LEAD:
-            how = "as well or better"
+        if self.margin is not None and self.margin < _MIN_LEAD:
+            comparison = "as well or better"
             if self.margin > 0:
-                how = f"nearly as well, with a score lower by {self.margin:.1%} of the points"
-            problems.append(f"another pose fits {how}")
+                comparison = (
+                    f"nearly as well, with a score lower by {self.margin:.1%} of the points"
+                )
+            problems.append(f"another pose fits {comparison}")
         if self.contradiction > CONTRADICTION:
             problems.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
         if self.degenerate:

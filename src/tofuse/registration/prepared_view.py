@@ -20,9 +20,9 @@ from tofuse.registration.view_noise import (
     inverse,
     noise_law,
     noise_scale,
-    own_sigma,
     scale_at,
     shared_sigma,
+    stated_sigma,
     typical_noise,
     with_shared_error,
 )
@@ -81,7 +81,7 @@ class PreparedView:
     unknown_falloff
         Whether `albedo` includes an unknown falloff of the amplitude towards the corners.
     measures_range
-        Whether the camera measures radial range, of which z was computed.
+        Whether the camera measures radial range, from which z was computed.
     """
 
     index: int
@@ -128,24 +128,24 @@ class PreparedView:
         return replace(self)
 
     def with_falloff(self, exponent: float) -> PreparedView:
-        """Return the view with an albedo that is compensated for this falloff (further)."""
+        """Return the view with its albedo compensated for this falloff, beyond any earlier one."""
         if exponent == 0 or not self.has_albedo:
             return self
         x, y = np.moveaxis(self.rays, -1, 0)
         length2 = 1 + x * x + y * y
-        more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
-        return replace(self, albedo=np.asarray(self.albedo + exponent * more, np.float32))
+        compensation = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
+        return replace(self, albedo=np.asarray(self.albedo + exponent * compensation, np.float32))
 
     def with_range_falloff(self, exponent: float) -> PreparedView:
-        """Return the view with an albedo that is compensated for this falloff with the range."""
+        """Return the view with its albedo compensated for this falloff with the range."""
         if exponent == 0 or not self.has_albedo:
             return self
         # The range is the length of the ray over w = 1/z, of which a and b are the slopes.
         a, b, _, w = np.moveaxis(self.planes, -1, 0)
         w = np.where(w > 0, w, np.float32(np.nan))
-        near = np.stack([np.log(w), a / w, b / w], -1)
+        compensation = np.stack([np.log(w), a / w, b / w], -1)
         view = self.with_falloff(exponent)
-        return replace(view, albedo=np.asarray(view.albedo - exponent * near, np.float32))
+        return replace(view, albedo=np.asarray(view.albedo - exponent * compensation, np.float32))
 
     def subsampled(self, columns: int) -> PreparedView:
         """Return the view at every n-th pixel, so that it has at most `columns` columns.
@@ -159,17 +159,17 @@ class PreparedView:
         if step in self._subsampled:
             return self._subsampled[step]
         first = step // 2
-        kept = (slice(first, None, step),) * 2
+        pixels = (slice(first, None, step),) * 2
         z, sigma, planes, variance = (
-            np.ascontiguousarray(image[kept])
+            np.ascontiguousarray(image[pixels])
             for image in (self.z, self.sigma, self.planes, self.plane_variance)
         )
         albedo = (
-            np.ascontiguousarray(self.albedo[kept]) if self.has_albedo else _no_albedo(*z.shape)
+            np.ascontiguousarray(self.albedo[pixels]) if self.has_albedo else _no_albedo(*z.shape)
         )
         projection = self.projection.subsampled(step)
         rays = projection.rays
-        own = self.pixel_variance
+        pixel_variance = self.pixel_variance
         self._subsampled[step] = PreparedView(
             self.index,
             rays,
@@ -180,7 +180,9 @@ class PreparedView:
             albedo,
             projection,
             self.has_albedo,
-            pixel_variance=None if own is None else np.ascontiguousarray(own[kept]),
+            pixel_variance=None
+            if pixel_variance is None
+            else np.ascontiguousarray(pixel_variance[pixels]),
             unknown_falloff=self.unknown_falloff,
             measures_range=self.measures_range,
         )
@@ -199,7 +201,7 @@ class PreparedView:
 
     @property
     def images(self) -> ViewImages:
-        """The images as the kernels take them."""
+        """The images as input of the kernels."""
         return ViewImages(self.rays, self.planes, self.plane_variance, self.albedo)
 
     @property
@@ -224,36 +226,42 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     those of cameras that drop single pixels, of spot projectors, and depth that was projected into
     an image of higher resolution.
     """
-    projection, z, amplitude, own = _at_working_resolution(frame, options.columns)
+    projection, z, amplitude, stated = _at_working_resolution(frame, options.columns)
     rays = projection.rays
     w = inverse(z, z > 0)
-    lit = frame.amplitude_image is not None
-    sigma = noise_law(frame, z, amplitude if lit else None, projection) if own is None else own
+    from_amplitude = frame.amplitude_image is not None
+    sigma = (
+        noise_law(frame, z, amplitude if from_amplitude else None, projection)
+        if stated is None
+        else stated
+    )
     # d(1/z) = dz / z^2
     weight = inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = typical_noise(w, weight)
-    given, options = options, options.for_image(projection.pitch, noise)
+    requested, options = options, options.for_image(projection.pitch, noise)
     columns = _columns_without_gaps(frame, z, options)
     if columns < z.shape[1]:
-        return prepare_view(frame, replace(given, columns=columns))
+        return prepare_view(frame, replace(requested, columns=columns))
     if options.edge_margin:
         jump = max(options.edge_jump, options.edge_sigmas * noise)
         weight[edge_pixels(w, jump, options.edge_margin)] = 0
-    known = weight > 0
+    valid = weight > 0
     rows, columns = z.shape
     scale = max(
         noise_scale(w, rays, weight, options.radii[0]),
-        scale_at(_MIN_NOISE, z, sigma) if own is None else 1.0,
+        scale_at(_MIN_NOISE, z, sigma) if stated is None else 1.0,
     )
     limit = options.misfit * max(scale, scale_at(options.flatness, z, sigma))
-    planes, quality = fitted_planes(w, rays, weight, known, limit, options)
+    planes, quality = fitted_planes(w, rays, weight, valid, limit, options)
     albedo = _no_albedo(rows, columns)
     has_albedo = amplitude is not None
     if amplitude is not None:
         albedo = np.full((rows, columns, 3), np.nan, np.float32)
         raw_albedo = np.empty((rows, columns), np.float32)
-        falls = lit and frame.amplitude_kind == "raw"
-        albedo_image(planes, rays, amplitude, falls, lit, options.falloff or 0.0, raw_albedo)
+        falls_off = from_amplitude and frame.amplitude_kind == "raw"
+        albedo_image(
+            planes, rays, amplitude, falls_off, from_amplitude, options.falloff or 0.0, raw_albedo
+        )
         run_chunks(
             lambda a, b: smooth_and_slope(
                 raw_albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
@@ -262,7 +270,9 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
             row_chunks(rows),
         )
     shared = shared_sigma(frame, projection.lengths2)
-    variance, own_variance = with_shared_error(quality[..., 1] * np.float32(scale), planes, shared)
+    variance, pixel_variance = with_shared_error(
+        quality[..., 1] * np.float32(scale), planes, shared
+    )
     view = PreparedView(
         frame.index,
         rays,
@@ -273,16 +283,18 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         albedo,
         projection,
         has_albedo,
-        pixel_variance=own_variance,
+        pixel_variance=pixel_variance,
         unknown_falloff=(
-            lit and options.falloff is None and frame.amplitude_kind != "range_compensated"
+            from_amplitude
+            and options.falloff is None
+            and frame.amplitude_kind != "range_compensated"
         ),
         measures_range=frame.depth_kind == "range",
     )
-    if lit and frame.amplitude_kind != "ir":
+    if from_amplitude and frame.amplitude_kind != "ir":
         return view
-    by_kind = RAW_RANGE_FALLOFF if lit else 0.0
-    exponent = by_kind if options.range_falloff is None else options.range_falloff
+    default_exponent = RAW_RANGE_FALLOFF if from_amplitude else 0.0
+    exponent = default_exponent if options.range_falloff is None else options.range_falloff
     return view.with_range_falloff(exponent)
 
 
@@ -299,14 +311,14 @@ def _at_working_resolution(
     z = frame.z
     z = np.where(frame.valid & (z > _MIN_DEPTH) & (z < _MAX_DEPTH), z, np.float32(0))
     amplitude = _amplitude(frame)
-    sigma = own_sigma(frame)
+    sigma = stated_sigma(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
         variance = z if sigma is None else sigma * sigma
-        halves = _halve(z, z if amplitude is None else amplitude, variance)
-        z = halves[0]
-        amplitude = None if amplitude is None else halves[1]
-        sigma = None if sigma is None else np.sqrt(halves[2])
+        halved = _halve(z, z if amplitude is None else amplitude, variance)
+        z = halved[0]
+        amplitude = None if amplitude is None else halved[1]
+        sigma = None if sigma is None else np.sqrt(halved[2])
         step *= 2
     projection = projection_of(frame.camera, step)
     if step > 1 and projection.unknown is not None:
@@ -330,18 +342,20 @@ def _amplitude(frame: RangeFrame) -> Float32 | None:
     color = np.ascontiguousarray(frame.color_image)
     grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
     unsaturated = cv2.inRange(color, (0, 0, 0), (_MAX_LEVEL - 1,) * 3) > 0
-    seen = (grey >= _MIN_LEVEL) & unsaturated
-    return np.where(seen, grey, 0).astype(np.float32)
+    usable = (grey >= _MIN_LEVEL) & unsaturated
+    return np.where(usable, grey, 0).astype(np.float32)
 
 
 def _halve(z: Float32, amplitude: Float32, variance: Float32) -> list[Float32]:
-    out = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
+    halved = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
     run_chunks(
-        lambda a, b: halve(z, amplitude, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
-        len(out[0]),
-        row_chunks(len(out[0])),
+        lambda a, b: halve(
+            z, amplitude, variance, _HALVING_JUMP, halved[0], halved[1], halved[2], a, b
+        ),
+        len(halved[0]),
+        row_chunks(len(halved[0])),
     )
-    return out
+    return halved
 
 
 def _columns_without_gaps(frame: RangeFrame, z: Float32, options: SurfaceOptions) -> int:
@@ -356,8 +370,8 @@ def _columns_without_gaps(frame: RangeFrame, z: Float32, options: SurfaceOptions
         return columns
     rows, halved = z.shape[0] // 2, columns // 2
     while min(rows, halved) >= _MIN_SIDE:
-        filled, _ = pixels_with_plane(_at_working_resolution(frame, halved)[1], options)
-        if filled > best:
-            best, columns = filled, halved
+        with_plane, _ = pixels_with_plane(_at_working_resolution(frame, halved)[1], options)
+        if with_plane > best:
+            best, columns = with_plane, halved
         rows, halved = rows // 2, halved // 2
     return columns

@@ -59,7 +59,7 @@ class Projection:
 
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
-        """Make the projection of a camera whose images are downsampled by `step`.
+        """Return the projection of a camera whose images are downsampled by `step`.
 
         `spacing` is the distance between nodes, in pixels of the full image.
         """
@@ -93,10 +93,10 @@ _projections: WeakKeyDictionary[Camera, dict[int, Projection]] = WeakKeyDictiona
 
 def projection_of(camera: Camera, step: int) -> Projection:
     """Return the projection of a camera downsampled by `step`, one object for all its images."""
-    known = _projections.setdefault(camera, {})
-    if step not in known:
-        known[step] = Projection.of(camera, step)
-    return known[step]
+    cached = _projections.setdefault(camera, {})
+    if step not in cached:
+        cached[step] = Projection.of(camera, step)
+    return cached[step]
 
 
 def _halve_rays(rays: Float32, step: int) -> Float32:

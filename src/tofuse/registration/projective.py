@@ -25,9 +25,9 @@ UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 # Below this depth, noise inflation is reduced in proportion to the depth.
 _NEAR_M = 1.0
 # With fewer points the noise scale, their median residual, has an error above 8 %.
-_FEW = 200
+_MIN_POINTS = 200
 # Noise scales of one camera's views differ by less than this factor.
-_LARGER = 3.0
+_MAX_SCALE_RATIO = 3.0
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _points_of_level(view: PreparedView, level: Level) -> Float32:
     """Return the points of a level; more of a view that has few pixels with a plane."""
     stride = level.stride
     points = points_of(view, stride)
-    while stride > 1 and len(points) < _FEW:
+    while stride > 1 and len(points) < _MIN_POINTS:
         stride //= 2
         points = points_of(view, stride)
     return points
@@ -139,7 +139,7 @@ class Aligned:
         the Jacobians of the two views cancels in it; less spurious information by common errors.
     unobservable
         (k, 6) degenerate unit directions, in units of 1 cm and 1 degree.
-    points, landed, compared, inliers, in_front
+    points, projected, compared, inliers, in_front
         Counts of source points, summed over the targets.
     rms_m
         RMS distance of the inliers, m.
@@ -165,7 +165,7 @@ class Aligned:
     cross: Float64
     unobservable: Float64
     points: int
-    landed: int
+    projected: int
     compared: int
     inliers: int
     in_front: int
@@ -185,21 +185,21 @@ class Aligned:
     @cached_property
     def overlap(self) -> float:
         """Fraction of the points that project into a target (the mean over targets)."""
-        return self.landed / self.points if self.points else 0.0
+        return self.projected / self.points if self.points else 0.0
 
 
-def span(directions: Float64, least: float) -> Float64:
+def span(directions: Float64, min_ratio: float) -> Float64:
     """Return an orthonormal basis (6, m), in `UNITS`, of directions (k, 6) in m and rad.
 
     Parameters
     ----------
     directions
         Spanning set.
-    least
+    min_ratio
         Minimum singular value relative to the largest.
     """
     u, s, _ = np.linalg.svd((directions / UNITS).T, full_matrices=False)
-    return np.asarray(u[:, s > least * s[0]], np.float64)
+    return np.asarray(u[:, s > min_ratio * s[0]], np.float64)
 
 
 def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> Registration:
@@ -262,60 +262,60 @@ def align(
     )
     prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3)
     points = _points_of_level(source, options.levels[0])
-    guessed = np.array([0.0, 1.0, 0.1 if photometric else 0.0])
+    nuisance = np.array([0.0, 1.0, 0.1 if photometric else 0.0])
     if photometric:
-        guessed[steps.EXPOSURE] = (
-            _seen_exposure(points, targets, T0) if exposure is None else exposure
+        nuisance[steps.EXPOSURE] = (
+            _initial_exposure(points, targets, T0) if exposure is None else exposure
         )
-    most = 10.0  # times the sigmas that the views claim
+    max_scale = 10.0  # relative to the stated sigmas of the views
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        most = max(3.0, options.max_sigma_m / median(sigma), _LARGER * usual_scale)
-    near = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
+        max_scale = max(3.0, options.max_sigma_m / median(sigma), _MAX_SCALE_RATIO * usual_scale)
+    depth_factor = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     images = tuple(t.view.target_image for t in targets)
     T_targets = np.stack([t.T_target_world for t in targets])
     T = T0.copy()
     iterations = 0
-    for number, level in enumerate(options.levels):
-        if number and level.stride != options.levels[number - 1].stride:
+    for index, level in enumerate(options.levels):
+        if index and level.stride != options.levels[index - 1].stride:
             points = _points_of_level(source, level)
         settings = steps.LevelSettings(
             level.iterations,
             options.tolerance,
-            most,
-            level.inflation_m * near,
+            max_scale,
+            level.inflation_m * depth_factor,
             level.photometric_inflation,
             options.robust,
             math.cos(options.max_angle),
-            remap=number > 0,  # at the coarsest level the views are not yet aligned
+            remap=index > 0,  # at the coarsest level the views are not yet aligned
             tilt=options.common_tilt,
             slope=options.common_slope,
             max_sigma=options.constrained,
             prior=prior,
             units=UNITS,
         )
-        total, spurious, weak, size, done = steps.iterate_level(
-            points, images, T_targets, T, T_world_predicted, guessed, settings
+        total, spurious, unobservable, step_size, level_iterations = steps.iterate_level(
+            points, images, T_targets, T, T_world_predicted, nuisance, settings
         )
-        iterations += done
+        iterations += level_iterations
     inliers = total[kernels.INLIERS]
     noise_scale = steps.scale_of_distances(total[kernels.HISTOGRAM :])
     return Aligned(
         T_world_source=T,
-        converged=size < options.convergence,
+        converged=step_size < options.convergence,
         iterations=iterations,
         information=steps.information(total),
         cross=steps.cross_information(total) - spurious,
-        unobservable=weak,
+        unobservable=unobservable,
         points=len(points) * len(targets),
-        landed=int(total[kernels.PROJECTED]),
+        projected=int(total[kernels.PROJECTED]),
         compared=int(total[kernels.COMPARED]),
         inliers=int(inliers),
         in_front=int(total[kernels.IN_FRONT]),
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / inliers)) if inliers else np.inf,
-        scale=float(guessed[steps.SCALE_G]),
-        photo_scale=float(guessed[steps.SCALE_P]),
-        exposure=float(guessed[steps.EXPOSURE]),
+        scale=float(nuisance[steps.SCALE_G]),
+        photo_scale=float(nuisance[steps.SCALE_P]),
+        exposure=float(nuisance[steps.EXPOSURE]),
         photometric=photometric and bool(total[kernels.COUNT_P] > 0),
         noise_scale=float(noise_scale) if np.isfinite(noise_scale) else np.inf,
         score=float(
@@ -325,12 +325,14 @@ def align(
     )
 
 
-def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
+def _initial_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
     """Return the median difference in log albedo over a subset of the points at T (4, 4)."""
-    every = max(1, len(points) // steps.SOME_POINTS)
-    seen = []
+    stride = max(1, len(points) // steps.SOME_POINTS)
+    per_target = []
     for target in targets:
-        moved = np.ascontiguousarray(target.T_target_world @ T)
-        seen.append(kernels.exposure_differences(points, every, target.view.target_image, moved))
-    both = np.concatenate(seen) if seen else np.zeros(0)
-    return median(both) if len(both) else 0.0
+        T_target_source = np.ascontiguousarray(target.T_target_world @ T)
+        per_target.append(
+            kernels.exposure_differences(points, stride, target.view.target_image, T_target_source)
+        )
+    differences = np.concatenate(per_target) if per_target else np.zeros(0)
+    return median(differences) if len(differences) else 0.0

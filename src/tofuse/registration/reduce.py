@@ -54,16 +54,16 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
 
 
 def reduced(
-    source: Frame, target: Frame, size: float, most: int
+    source: Frame, target: Frame, size: float, max_points: int
 ) -> tuple[float, CloudFrame, CloudFrame]:
-    """Return the voxel size in m and both averaged views, with at most `most` points each.
+    """Return the voxel size in m and both averaged views, with at most `max_points` points each.
 
     The voxel size is `size` m, or larger if that leaves too many points.
     """
     while True:
         data, model = averaged(source, size), averaged(target, size)
         count = max(len(data), len(model))
-        if count <= most:
+        if count <= max_points:
             return size, data, model
         # Points lie on surfaces: their number falls with the square of the edge.
-        size *= 1.02 * max(1.05, math.sqrt(count / most))
+        size *= 1.02 * max(1.05, math.sqrt(count / max_points))

@@ -10,12 +10,12 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.blas import one_blas_thread
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-from tofuse.registration.any_pair import FEWEST_POINTS, AnyPair
+from tofuse.registration.any_pair import MIN_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
 
-_FURTHEST_M = 1e9
+_MAX_COORDINATE_M = 1e9
 # Clouds with a larger distance are in different frames.
-_OTHER_FRAME_M = 1e4
+_MAX_FRAME_DISTANCE_M = 1e4
 
 
 def register(
@@ -97,18 +97,22 @@ def _register_arrays(
 
     A distant source, in a frame of its own, is shifted to its own median.
     """
-    there, here = np.median(source, 0), np.median(target, 0)
-    there = there if np.linalg.norm(there - here) > _OTHER_FRAME_M else here
-    data, model = (
-        CloudFrame(index, 0.0, (points - middle).astype(np.float32), origin=-middle)
-        for index, points, middle in ((1, source, there), (0, target, here))
+    source_centre, target_centre = np.median(source, 0), np.median(target, 0)
+    source_centre = (
+        source_centre
+        if np.linalg.norm(source_centre - target_centre) > _MAX_FRAME_DISTANCE_M
+        else target_centre
     )
-    to_target, to_source = np.eye(4), np.eye(4)
-    to_target[:3, 3], to_source[:3, 3] = here, there
-    from_source, from_target = se3.inverse(to_source), se3.inverse(to_target)
-    start = None if guess is None else from_target @ guess @ to_source
-    found = _registered(data, model, start, method, rng)
-    return found.between(to_target, from_source)
+    data, model = (
+        CloudFrame(index, 0.0, (points - centre).astype(np.float32), origin=-centre)
+        for index, points, centre in ((1, source, source_centre), (0, target, target_centre))
+    )
+    T_target_model, T_source_data = np.eye(4), np.eye(4)
+    T_target_model[:3, 3], T_source_data[:3, 3] = target_centre, source_centre
+    T_data_source, T_model_target = se3.inverse(T_source_data), se3.inverse(T_target_model)
+    start = None if guess is None else T_model_target @ guess @ T_source_data
+    registration = _registered(data, model, start, method, rng)
+    return registration.between(T_target_model, T_data_source)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:
@@ -129,15 +133,15 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
             where=name,
             remedy="pass a frame, or (N, 3) numbers in metres; for a file, tofuse.open(path)[0]",
         )
-    good = array[np.isfinite(array).all(1)].astype(np.float64)
-    if len(good) < FEWEST_POINTS:
+    finite = array[np.isfinite(array).all(1)].astype(np.float64)
+    if len(finite) < MIN_POINTS:
         raise InputError(
-            f"has {len(good)} finite points",
+            f"has {len(finite)} finite points",
             where=name,
-            remedy=f"use {FEWEST_POINTS} or more",
+            remedy=f"use {MIN_POINTS} or more",
         )
-    if np.abs(good).max() > _FURTHEST_M:
+    if np.abs(finite).max() > _MAX_COORDINATE_M:
         raise InputError(
-            f"has coordinates up to {np.abs(good).max():.0e} m", where=name, remedy="use metres"
+            f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
         )
-    return good
+    return finite

@@ -30,7 +30,7 @@ class Remapping:
 
     @classmethod
     def of(cls, directions: Float64, points: Float64) -> Remapping:
-        """Fix `directions` (k, 6) of a source with the given points (n, 3)."""
+        """Fix `directions` (k, 6) of a source with points (n, 3)."""
         centre = points.mean(0)
         size = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
         return cls(directions, centre, size or 1.0)
@@ -44,11 +44,11 @@ class Remapping:
         return self._project(T, along=False)
 
     def _project(self, T: Float64, *, along: bool) -> Float64:
-        back = np.eye(4)
-        back[:3, 3] = -self.centre
+        T_centre_source = np.eye(4)
+        T_centre_source[:3, 3] = -self.centre
         scale = np.array([1, 1, 1, self.size, self.size, self.size])
-        scaled = (self.directions @ se3.adjoint(back).T) * scale
+        scaled = (self.directions @ se3.adjoint(T_centre_source).T) * scale
         basis = np.linalg.svd(scaled, full_matrices=False)[2]
         xi = se3.log(se3.about(-self.centre, T)) * scale
-        part = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
-        return se3.about(self.centre, se3.exp((part if along else xi - part) / scale))
+        component = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
+        return se3.about(self.centre, se3.exp((component if along else xi - component) / scale))

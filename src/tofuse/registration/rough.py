@@ -1,4 +1,4 @@
-"""Planes with a looser tolerance for views too noisy for tracking, for use in a search."""
+"""Planes with a looser tolerance, for the search with views that are too noisy for tracking."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.registration.prepared_view import PreparedView
 _CHUNKS = 4
 # Deviation from a plane as a fraction of the depth, and half width of a plane's window as a
 # fraction of the image.
-_ROUGH, _WINDOW = 0.01, 0.016
+_DEVIATION, _WINDOW = 0.01, 0.016
 
 
 def with_rough_planes(view: PreparedView) -> PreparedView:
@@ -25,26 +25,26 @@ def with_rough_planes(view: PreparedView) -> PreparedView:
     but constrains a search.
     """
     z = cv2.medianBlur(view.z, 5)
-    z[(view.z <= 0) | (np.abs(z - view.z) > 5 * _ROUGH * view.z)] = 0
+    z[(view.z <= 0) | (np.abs(z - view.z) > 5 * _DEVIATION * view.z)] = 0
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
-    weight = np.divide(1, (_ROUGH * w) ** 2, out=np.zeros_like(z), where=z > 0)
-    known = weight > 0
+    weight = np.divide(1, (_DEVIATION * w) ** 2, out=np.zeros_like(z), where=z > 0)
+    valid = weight > 0
     rows, columns = z.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     radii = np.array([max(2, round(_WINDOW * columns))], np.int64)
     run_chunks(
         lambda a, b: fit_planes(
-            w, view.rays, weight, known, radii, 1.0, 0.7, 0.2, planes, quality, a, b
+            w, view.rays, weight, valid, radii, 1.0, 0.7, 0.2, planes, quality, a, b
         ),
         rows,
         _CHUNKS,
     )
-    own = view.planes[..., 3] > 0
+    has_plane = view.planes[..., 3] > 0
     misfit = quality[..., 0]
-    spread: Float32 = quality[..., 1] * np.where(np.isfinite(misfit), misfit, 0)
+    variance: Float32 = quality[..., 1] * np.where(np.isfinite(misfit), misfit, 0)
     return replace(
         view,
-        planes=np.where(own[..., None], view.planes, planes),
-        plane_variance=np.where(own, view.plane_variance, spread).astype(np.float32),
+        planes=np.where(has_plane[..., None], view.planes, planes),
+        plane_variance=np.where(has_plane, view.plane_variance, variance).astype(np.float32),
     )

@@ -1,6 +1,6 @@
 """Exhaustive pose search between two range images with a wide baseline.
 
-Every pose of a coarse grid is scored on some hundred pixels of both images; the best ones are
+Every pose of a coarse grid is scored on a few hundred pixels of both images; the best ones are
 refined by two-way projective ICP and ranked by `agreement`. Where both views see the floor, the
 grid is yaw and two translations; else it has all six dimensions. The search is deterministic.
 """
@@ -47,16 +47,16 @@ _PHOTOMETRIC = ProjectiveOptions(
 # Pixels of each image that refine a candidate by ICP.
 _ICP_POINTS = 700
 # Number of best candidates that are refined again down to the noise, and of the pixels used.
-_POLISHED, _POLISH_POINTS = 10, 2500
+_MAX_REFINED, _REFINEMENT_POINTS = 10, 2500
 # Maximum score that a candidate may lose in photometric alignment.
-_GIVEN_UP = 0.05
+_MAX_SCORE_LOSS = 0.05
 # Poses that differ by more, m or rad, are distinct hypotheses: beyond the error of a coarse
 # alignment (10 cm, 5 degrees).
 DISTINCT_M, DISTINCT_RAD = 0.1, 0.0873
 # Minimum score of a planar result at which "auto" skips the full search.
-_CONVINCING = 0.4
+_SUFFICIENT_SCORE = 0.4
 # Reach of the two-way ICP per iteration, relative to the first.
-_NARROWER = 0.85 ** np.arange(28)
+_REACH_DECAY = 0.85 ** np.arange(28)
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ class SearchOptions(Bounded):
 
 def differ(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
     """Whether two poses (4, 4) are distinct hypotheses."""
-    between = se3.inverse(a) @ b
-    return bool(np.linalg.norm(between[:3, 3]) > distinct_m or se3.angle(between) > DISTINCT_RAD)
+    T_a_b = se3.inverse(a) @ b
+    return bool(np.linalg.norm(T_a_b[:3, 3]) > distinct_m or se3.angle(T_a_b) > DISTINCT_RAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +172,8 @@ def search(
     Match or None
         None if a view has too few planes.
     """
-    prepared = Search.of(source, target, options)
-    return None if prepared is None else prepared.everywhere(gravity)
+    views = Search.of(source, target, options)
+    return None if views is None else views.exhaustive(gravity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ class Search:
     ----------
     source, target
         Views, with rough planes where there are no others.
-    compared
+    comparison
         Comparison that evaluates poses.
     distinct_m
         Poses that differ by more are distinct candidates, m.
@@ -192,11 +192,11 @@ class Search:
 
     source: PreparedView
     target: PreparedView
-    compared: Comparison
+    comparison: Comparison
     options: SearchOptions
     distinct_m: float
-    s: ResampledView
-    t: ResampledView
+    resampled_source: ResampledView
+    resampled_target: ResampledView
 
     @classmethod
     def of(
@@ -210,25 +210,24 @@ class Search:
     ) -> Search | None:
         """Prepare two views; None if one has too few planes.
 
-        `agreement` evaluates poses; the tolerances are those of views some metres deep unless
-        given.
+        `agreement` evaluates poses; by default its tolerances are for depths of a few metres.
         """
         options = SearchOptions() if options is None else options
         source, target = with_rough_planes(source), with_rough_planes(target)
         s, t = resampled(source), resampled(target)
         if min(len(s.points), len(t.points)) < MIN_POINTS:
             return None
-        compared = Comparison.of(source, target, agreement)
-        return cls(source, target, compared, options, distinct_m, s, t)
+        comparison = Comparison.of(source, target, agreement)
+        return cls(source, target, comparison, options, distinct_m, s, t)
 
-    def everywhere(self, gravity: tuple[Float64, Float64] | None = None) -> Match | None:
-        """Search the whole grid; see `search`."""
-        s, t, options = self.s, self.t, self.options
-        found: list[Candidate] = []
+    def exhaustive(self, gravity: tuple[Float64, Float64] | None = None) -> Match | None:
+        """Search the full grid; see `search`."""
+        s, t, options = self.resampled_source, self.resampled_target, self.options
+        candidates: list[Candidate] = []
         if options.mode != "full":
             floors = find_floors((self.source, self.target), gravity)
             if floors is not None:
-                found = self._refined(
+                candidates = self._refined(
                     planar_poses(
                         s,
                         t,
@@ -238,10 +237,10 @@ class Search:
                         count=options.planar_candidates,
                     )
                 )
-            convinced = bool(found) and max(c.score for c in found) >= _CONVINCING
-            if options.mode == "planar" or (options.mode == "auto" and convinced):
-                return Match(self._ordered(found), "planar") if found else None
-        found += self._refined(
+            sufficient = bool(candidates) and max(c.score for c in candidates) >= _SUFFICIENT_SCORE
+            if options.mode == "planar" or (options.mode == "auto" and sufficient):
+                return Match(self._ranked(candidates), "planar") if candidates else None
+        candidates += self._refined(
             full_poses(
                 s,
                 t,
@@ -251,59 +250,59 @@ class Search:
                 count=options.full_candidates,
             )
         )
-        return Match(self._ordered(found), "full")
+        return Match(self._ranked(candidates), "full")
 
-    def among(self, poses: Float64, match: Match) -> Match:
+    def with_proposals(self, poses: Float64, match: Match) -> Match:
         """Refine further poses T_target_source (N, 4, 4) and rank them among the candidates."""
         if not len(poses):
             return match
-        return replace(match, candidates=self._ordered([*match.candidates, *self._refined(poses)]))
+        return replace(match, candidates=self._ranked([*match.candidates, *self._refined(poses)]))
 
     def _refined(self, poses: Float64) -> list[Candidate]:
         """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
-        s, t, options = self.s, self.t, self.compared.options
+        s, t, options = self.resampled_source, self.resampled_target, self.comparison.options
         poses = poses.copy()
         floor = _noise_floor(s, t, options)
         depth = 0.5 * (s.depth + t.depth)
-        reaches = np.maximum(0.25 * depth * _NARROWER, 3 * floor)
+        reaches = np.maximum(0.25 * depth * _REACH_DECAY, 3 * floor)
         refine_poses(s, t, poses, reaches, _ICP_POINTS, options.max_angle)
-        # Many converge to the same pose, which is evaluated once.
+        # Poses that converge to the same one are evaluated once.
         R, x = poses[:, :3, :3].copy(), poses[:, :3, 3].copy()
-        judged = self._evaluated(poses[kernels.select_distinct(R, x, depth, floor, len(poses))])
-        best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
-        finer = np.stack([candidate.T_target_source for candidate in best])
-        reaches = np.maximum(8 * floor * _NARROWER, 1.3 * floor)
-        refine_poses(s, t, finer, reaches, _POLISH_POINTS, options.max_angle)
-        return judged + self._evaluated(finer)
+        evaluated = self._evaluated(poses[kernels.select_distinct(R, x, depth, floor, len(poses))])
+        best = sorted(evaluated, key=lambda candidate: -candidate.score)[:_MAX_REFINED]
+        refined = np.stack([candidate.T_target_source for candidate in best])
+        reaches = np.maximum(8 * floor * _REACH_DECAY, 1.3 * floor)
+        refine_poses(s, t, refined, reaches, _REFINEMENT_POINTS, options.max_angle)
+        return evaluated + self._evaluated(refined)
 
     def _evaluated(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:
-        agreements = run_all([partial(self.compared.at, T) for T in poses])
+        agreements = run_all([partial(self.comparison.at, T) for T in poses])
         return [Candidate(T, agreement) for T, agreement in zip(poses, agreements, strict=True)]
 
-    def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
+    def _ranked(self, candidates: list[Candidate]) -> tuple[Candidate, ...]:
         """Rank candidates after photometric alignment of the best ones."""
-        distinct = _distinct(found, self.distinct_m)
+        distinct = _distinct(candidates, self.distinct_m)
         if not (self.source.has_albedo and self.target.has_albedo):
             return distinct
         falloff = distinct[0].agreement.falloff
         source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
-        best, rest = distinct[:count], distinct[count:]
+        best, remaining = distinct[:count], distinct[count:]
         targets = [Target(target, np.eye(4))]
-        moved = run_all(
+        alignments = run_all(
             [
                 partial(align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
                 for candidate in best
             ]
         )
-        placed = self._evaluated([aligned.T_world_source for aligned in moved])
+        realigned = self._evaluated([aligned.T_world_source for aligned in alignments])
         # Along degenerate directions the geometric score may decrease slightly with photometric
         # alignment.
         kept = [
-            new if new.score > old.score - _GIVEN_UP else old
-            for old, new in zip(best, placed, strict=True)
+            after if after.score > before.score - _MAX_SCORE_LOSS else before
+            for before, after in zip(best, realigned, strict=True)
         ]
-        return _distinct([*kept, *rest], self.distinct_m)
+        return _distinct([*kept, *remaining], self.distinct_m)
 
 
 def _noise_floor(s: ResampledView, t: ResampledView, options: AgreementOptions) -> float:
@@ -311,17 +310,17 @@ def _noise_floor(s: ResampledView, t: ResampledView, options: AgreementOptions) 
     return options.floor_m + options.floor_fraction * 0.5 * (s.depth + t.depth)
 
 
-def _distinct(found: Sequence[Candidate], distinct_m: float) -> tuple[Candidate, ...]:
+def _distinct(candidates: Sequence[Candidate], distinct_m: float) -> tuple[Candidate, ...]:
     """Return the distinct candidates, the best first."""
-    found = sorted(found, key=lambda candidate: -candidate.score)
-    poses = np.array([candidate.T_target_source for candidate in found]).reshape(-1, 4, 4)
+    candidates = sorted(candidates, key=lambda candidate: -candidate.score)
+    poses = np.array([candidate.T_target_source for candidate in candidates]).reshape(-1, 4, 4)
     # The trace of a rotation decreases with its angle.
-    least = 1 + 2 * np.cos(DISTINCT_RAD)
+    min_trace = 1 + 2 * np.cos(DISTINCT_RAD)
     kept: list[int] = []
     for k, T in enumerate(poses):
-        better = poses[kept]
-        far = np.linalg.norm(better[:, :3, 3] - T[:3, 3], axis=1) > distinct_m
-        turned = (better[:, :3, :3] * T[:3, :3]).sum((1, 2)) < least
-        if (far | turned).all():
+        accepted = poses[kept]
+        distant = np.linalg.norm(accepted[:, :3, 3] - T[:3, 3], axis=1) > distinct_m
+        rotated = (accepted[:, :3, :3] * T[:3, :3]).sum((1, 2)) < min_trace
+        if (distant | rotated).all():
             kept.append(k)
-    return tuple(found[k] for k in kept)
+    return tuple(candidates[k] for k in kept)

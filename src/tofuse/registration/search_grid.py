@@ -1,4 +1,4 @@
-"""Grids of poses between two views, scored on some of their points, and refined by two-way ICP."""
+"""Grids of poses between two views, scored on a subset of points and refined by two-way ICP."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ _FULL_ANGLE, _FULL_STEP = 0.13, 0.1
 _PLANAR_POINTS, _FULL_POINTS = 200, 150
 # Sigma of the albedo's low-pass filter for the coarse grid, in the plane z = 1, and difference in
 # log albedo at which a point counts neither for nor against a pose.
-_BLUR, _ALBEDO = 0.04, 0.12
+_ALBEDO_BLUR, _ALBEDO_TOLERANCE = 0.04, 0.12
 _NO_BORDER = cv2.BORDER_CONSTANT
 # Nodes of the lookup grid of an image, along its wider side.
-_GRID = 128
+_GRID_NODES = 128
 # Minimum number of points of a view.
 MIN_POINTS = 50
 # Points of a view from which the search draws its subsets.
-_SEEN = 3000
-# The whole grid is scored on a sixth of the points; the best poses, this many times the number of
+_SAMPLED_POINTS = 3000
+# The full grid is scored on a sixth of the points; the best poses, this many times the number of
 # candidates, on all.
-_COARSE_DIVISOR, _KEPT = 6, 200
+_COARSE_DIVISOR, _KEPT_PER_CANDIDATE = 6, 200
 # In six dimensions the centres of cells of eight translations are scored first, with the reach
-# multiplied by the first number; the best fraction of the cells is then scored in full.
-_WIDER, _PROMISING = 1.5, 0.1
+# multiplied by this factor; the best fraction of the cells is then scored in full.
+_CELL_REACH_FACTOR, _PROMISING_FRACTION = 1.5, 0.1
 _CHUNKS = 16
 
 
@@ -65,11 +65,11 @@ class ResampledView:
     albedo: Float32
     depth: float
 
-    def some(self, count: int, less: Bool | None = None) -> kernels.Resampled:
-        """Return `count` of the points with the grid, one in four of those marked `less`."""
+    def subset(self, count: int, thinned: Bool | None = None) -> kernels.Resampled:
+        """Return `count` points with the grid, only one in four of the `thinned` ones (N,)."""
         keep = np.arange(len(self.points))
-        if less is not None:
-            keep = np.concatenate([keep[~less], keep[less][::4]])
+        if thinned is not None:
+            keep = np.concatenate([keep[~thinned], keep[thinned][::4]])
         keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
         points = self.points[keep], self.normals[keep], self.albedo[keep]
         return kernels.Resampled(*points, self.grid, self.frame)
@@ -79,12 +79,12 @@ def resampled(view: PreparedView) -> ResampledView:
     """Resample a view to a pinhole grid."""
     rays = view.rays[view.planes[..., 3] > 0]
     if len(rays) < MIN_POINTS:
-        nothing = np.zeros((0, 3), np.float32)
-        none = np.zeros((1, 1, 5), np.float32)
-        return ResampledView(none, np.ones(4), nothing, nothing, nothing[:, 0], 1.0)
+        no_points = np.zeros((0, 3), np.float32)
+        no_nodes = np.zeros((1, 1, 5), np.float32)
+        return ResampledView(no_nodes, np.ones(4), no_points, no_points, no_points[:, 0], 1.0)
     rays = view.rays[view.z > 0]
     low, high = rays.min(0).astype(float), rays.max(0).astype(float)
-    spacing = max(float((high - low).max()) / _GRID, 1e-6)
+    spacing = max(float((high - low).max()) / _GRID_NODES, 1e-6)
     x, y = (np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True))
     x0, y0, per_x, per_y = view.projection.frame
     lookup = view.projection.lookup
@@ -100,33 +100,33 @@ def resampled(view: PreparedView) -> ResampledView:
     inside = (pixel >= 0).all(-1) & (pixel[..., 0] < columns) & (pixel[..., 1] < rows)
     u, v = np.where(inside[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
     abc = view.planes[v, u, :3].astype(float)
-    known = inside & (view.planes[v, u, 3] > 0)
+    has_plane = inside & (view.planes[v, u, 3] > 0)
     length = np.maximum(np.sqrt((abc * abc).sum(-1)), 1e-12)
-    grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
-    grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
-    seen = sampled_points(view, _SEEN)
-    albedo = _low_pass(np.where(known, view.albedo[v, u, 0], np.nan), _BLUR / spacing)
-    at = seen.points[:, :2] / seen.points[:, 2:] - (x[0], y[0])
-    j, i = (at / spacing).round().astype(int).T
+    grid = np.where(has_plane[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
+    grid[..., 3] -= np.where(inside & ~has_plane, nearest_depth(view)[v, u], 0)
+    sampled = sampled_points(view, _SAMPLED_POINTS)
+    albedo = _low_pass(np.where(has_plane, view.albedo[v, u, 0], np.nan), _ALBEDO_BLUR / spacing)
+    ray = sampled.points[:, :2] / sampled.points[:, 2:] - (x[0], y[0])
+    j, i = (ray / spacing).round().astype(int).T
     i, j = np.clip(i, 0, len(y) - 1), np.clip(j, 0, len(x) - 1)
     return ResampledView(
         np.dstack([grid, albedo]).astype(np.float32),
         np.array([x[0], y[0], 1 / spacing, 1 / spacing]),
-        seen.points,
-        seen.normals,
+        sampled.points,
+        sampled.normals,
         albedo[i, j],
-        float(np.median(seen.points[:, 2])),
+        float(np.median(sampled.points[:, 2])),
     )
 
 
 def _low_pass(albedo: Float64, sigma: float) -> Float32:
     """Low-pass filter an image (H, W), ignoring NaN, to match the step of the coarse grid."""
-    known = np.isfinite(albedo)
+    valid = np.isfinite(albedo)
     size = (0, 0)
-    total = cv2.GaussianBlur(np.where(known, albedo, 0), size, sigma, borderType=_NO_BORDER)
-    density = cv2.GaussianBlur(known.astype(float), size, sigma, borderType=_NO_BORDER)
+    total = cv2.GaussianBlur(np.where(valid, albedo, 0), size, sigma, borderType=_NO_BORDER)
+    density = cv2.GaussianBlur(valid.astype(float), size, sigma, borderType=_NO_BORDER)
     mean = total / np.maximum(density, 1e-9)
-    return np.where(known, mean, np.nan).astype(np.float32)
+    return np.where(valid, mean, np.nan).astype(np.float32)
 
 
 def planar_poses(
@@ -155,22 +155,22 @@ def planar_poses(
     """
     floor_s, floor_t = floors
     depth = 0.5 * (s.depth + t.depth)
-    to_s, to_t = _upright(floor_s.normal), _upright(floor_t.normal)
+    upright_s, upright_t = _upright(floor_s.normal), _upright(floor_t.normal)
     n = round(yaw / _PLANAR_ANGLE)
     yaws = np.zeros((2 * n + 1, 3))
     yaws[:, 1] = np.linspace(-n, n, 2 * n + 1) * _PLANAR_ANGLE
-    rotations = to_t.T @ se3.so3_exp(yaws) @ to_s
-    moves = _ball(_PLANAR_STEP * depth, reach * depth, (1.0, 0.0, 1.0))
-    moves[:, 1] = floor_t.height - floor_s.height
-    less = [
+    rotations = upright_t.T @ se3.so3_exp(yaws) @ upright_s
+    translations = _ellipsoid_nodes(_PLANAR_STEP * depth, reach * depth, (1.0, 0.0, 1.0))
+    translations[:, 1] = floor_t.height - floor_s.height
+    thinned = [
         np.abs(v.points @ f.normal - f.height) < 0.02 + 0.02 * v.points[:, 2]
         for v, f in ((s, floor_s), (t, floor_t))
     ]
     step = depth * max(_PLANAR_STEP, _PLANAR_ANGLE)
-    return _best(
-        _Scorer(s, t, less, step),
+    return _best_of_grid(
+        _Scorer(s, t, thinned, step),
         rotations,
-        moves @ to_t,
+        translations @ upright_t,
         _PLANAR_POINTS,
         count,
     )
@@ -193,42 +193,48 @@ def full_poses(
         Maximum number of poses.
     """
     depth = 0.5 * (s.depth + t.depth)
-    flat = roll / turn if turn else 1.0
-    rotations = se3.so3_exp(_ball(_FULL_ANGLE, turn, (1.0, 1.0, flat)))
-    moves = _ball(_FULL_STEP * depth, reach * depth, (1.0, 1.0, 1.0))
+    roll_ratio = roll / turn if turn else 1.0
+    rotations = se3.so3_exp(_ellipsoid_nodes(_FULL_ANGLE, turn, (1.0, 1.0, roll_ratio)))
+    translations = _ellipsoid_nodes(_FULL_STEP * depth, reach * depth, (1.0, 1.0, 1.0))
     step = depth * max(_FULL_STEP, _FULL_ANGLE)
     scorer = _Scorer(s, t, [None, None], step)
-    turns, shifts = _promising(scorer, rotations, moves, _FULL_STEP * depth, count)
-    few = max(1, _FULL_POINTS // _COARSE_DIVISOR)
-    scores = scorer(rotations[turns], moves[shifts][:, None], few)[:, 0]
-    top = _highest(scores, _KEPT * count)
-    return _thinned(
+    rotation_index, translation_index = _promising(
+        scorer, rotations, translations, _FULL_STEP * depth, count
+    )
+    coarse_points = max(1, _FULL_POINTS // _COARSE_DIVISOR)
+    scores = scorer(
+        rotations[rotation_index], translations[translation_index][:, None], coarse_points
+    )[:, 0]
+    best = _highest(scores, _KEPT_PER_CANDIDATE * count)
+    return _non_maximum_suppression(
         scorer,
-        rotations[turns[top]],
-        moves[shifts[top]],
+        rotations[rotation_index[best]],
+        translations[translation_index[best]],
         _FULL_POINTS,
         count,
     )
 
 
 def _promising(
-    scorer: _Scorer, rotations: Float64, moves: Float64, step: float, count: int
+    scorer: _Scorer, rotations: Float64, translations: Float64, step: float, count: int
 ) -> tuple[Intp, Intp]:
     """Return the indices of rotations and translations in the best-scoring cells."""
-    cells, cell = np.unique(np.floor(moves / (2 * step) + 0.25), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    sizes = np.bincount(cell)
-    middles = np.stack([np.bincount(cell, axis) for axis in moves.T], 1) / sizes[:, None]
-    wider = replace(scorer, reach=_WIDER * scorer.reach)
-    few = max(1, _FULL_POINTS // _COARSE_DIVISOR)
-    scores = wider(rotations, middles[None], few).ravel()
-    best = _highest(scores, max(count, round(_PROMISING * len(scores))))
-    turns, at = np.divmod(best, len(cells))
-    order, first = np.argsort(cell, kind="stable"), np.cumsum(sizes) - sizes
+    cells, cell_of = np.unique(
+        np.floor(translations / (2 * step) + 0.25), axis=0, return_inverse=True
+    )
+    cell_of = cell_of.ravel()
+    sizes = np.bincount(cell_of)
+    centres = np.stack([np.bincount(cell_of, axis) for axis in translations.T], 1) / sizes[:, None]
+    wide_scorer = replace(scorer, reach=_CELL_REACH_FACTOR * scorer.reach)
+    coarse_points = max(1, _FULL_POINTS // _COARSE_DIVISOR)
+    scores = wide_scorer(rotations, centres[None], coarse_points).ravel()
+    best = _highest(scores, max(count, round(_PROMISING_FRACTION * len(scores))))
+    rotation_index, cell_index = np.divmod(best, len(cells))
+    order, start = np.argsort(cell_of, kind="stable"), np.cumsum(sizes) - sizes
     # Concatenate the translations of these cells.
-    several = sizes[at]
-    within = np.arange(several.sum()) - np.repeat(np.cumsum(several) - several, several)
-    return np.repeat(turns, several), order[np.repeat(first[at], several) + within]
+    counts = sizes[cell_index]
+    offset = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.repeat(rotation_index, counts), order[np.repeat(start[cell_index], counts) + offset]
 
 
 def _highest(scores: Float32, count: int) -> Intp:
@@ -243,13 +249,13 @@ class _Scorer:
 
     source: ResampledView
     target: ResampledView
-    less: Sequence[Bool | None]
+    thinned: Sequence[Bool | None]
     reach: float
 
     def __call__(self, rotations: Float64, translations: Float64, points: int) -> Float32:
         """Scores (A, B) of rotations (A, 3, 3) with translations (1, B, 3), or (A, 1) pairwise."""
-        source = self.source.some(points, self.less[0])
-        target = self.target.some(points, self.less[1])
+        source = self.source.subset(points, self.thinned[0])
+        target = self.target.subset(points, self.thinned[1])
         rotations, translations = (
             np.ascontiguousarray(rotations),
             np.ascontiguousarray(translations),
@@ -257,7 +263,7 @@ class _Scorer:
         scores = np.empty((len(rotations), translations.shape[-2]), np.float32)
         run_chunks(
             lambda a, b: kernels.score_grid(
-                source, target, rotations, translations, self.reach, _ALBEDO, scores, a, b
+                source, target, rotations, translations, self.reach, _ALBEDO_TOLERANCE, scores, a, b
             ),
             len(rotations),
             _CHUNKS,
@@ -265,19 +271,25 @@ class _Scorer:
         return scores
 
 
-def _best(
+def _best_of_grid(
     scorer: _Scorer, rotations: Float64, translations: Float64, points: int, count: int
 ) -> Float64:
     """Score a grid and return its `count` best poses (N, 4, 4) after non-maximum suppression."""
     scores = scorer(rotations, translations[None], max(1, points // _COARSE_DIVISOR)).ravel()
-    turns, shifts = np.divmod(_highest(scores, _KEPT * count), len(translations))
-    return _thinned(scorer, rotations[turns], translations[shifts], points, count)
+    rotation_index, translation_index = np.divmod(
+        _highest(scores, _KEPT_PER_CANDIDATE * count), len(translations)
+    )
+    return _non_maximum_suppression(
+        scorer, rotations[rotation_index], translations[translation_index], points, count
+    )
 
 
-def _thinned(scorer: _Scorer, R: Float64, x: Float64, points: int, count: int) -> Float64:
+def _non_maximum_suppression(
+    scorer: _Scorer, R: Float64, x: Float64, points: int, count: int
+) -> Float64:
     """Return the `count` best of poses R (N, 3, 3), x (N, 3), with non-maximum suppression."""
-    finer = scorer(R, x[:, None], points)[:, 0]
-    order = np.argsort(-finer, kind="stable")
+    scores = scorer(R, x[:, None], points)[:, 0]
+    order = np.argsort(-scores, kind="stable")
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
     chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)
@@ -295,7 +307,7 @@ def refine_poses(
     max_angle: float,
 ) -> None:
     """Refine poses (N, 4, 4) in place by two-way ICP, with normals within `max_angle`, rad."""
-    source, target = s.some(points), t.some(points)
+    source, target = s.subset(points), t.subset(points)
     cosine = float(np.cos(max_angle))
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
@@ -315,12 +327,12 @@ def _upright(down: Float64) -> Float64:
     return se3.so3_exp(axis / sine * np.arctan2(sine, float(down @ y)))
 
 
-def _ball(step: float, radius: float, shape: tuple[float, float, float]) -> Float64:
+def _ellipsoid_nodes(step: float, radius: float, shape: tuple[float, float, float]) -> Float64:
     """Return the nodes (N, 3) of a cubic grid in an ellipsoid of axes `radius` times `shape`."""
     axes = []
-    for squeeze in shape:
-        n = int(radius * squeeze / step + 1e-9)
+    for factor in shape:
+        n = int(radius * factor / step + 1e-9)
         axes.append(np.arange(-n, n + 1) * step)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    half = [max(radius * squeeze, step) for squeeze in shape]
-    return nodes[((nodes / half) ** 2).sum(1) <= 1 + 1e-9]
+    semi_axes = [max(radius * factor, step) for factor in shape]
+    return nodes[((nodes / semi_axes) ** 2).sum(1) <= 1 + 1e-9]

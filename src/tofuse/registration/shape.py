@@ -18,11 +18,11 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import Frame
 
 NEIGHBOURS = 20
-# Twenty random neighbours leave a gap this wide at one of 300 inner points; at a straight edge the
-# gap is 180 degrees.
+# Twenty random neighbours have an angular gap this wide at one in 300 inner points; at a straight
+# edge it is 180 degrees.
 _BOUNDARY_GAP = np.deg2rad(135)
 # Below this fraction of a view's points only the requested ones are computed.
-_FEW = 0.25
+_MAX_SUBSET = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Shape:
         (n, 3) unit normals of fitted planes, towards the sensor; NaN where points lie on a line.
     curvature
         (n,) mean curvature in 1/m, positive where the surface bulges towards the sensor; NaN where
-        it is not fixed.
+        undetermined.
     boundary
         (n,) True where the surface ends: an empty angle of 135 degrees or more round the point.
     roughness
@@ -49,7 +49,7 @@ class Shape:
     roughness: Float64
 
     def at(self, index: Int64) -> Shape:
-        """Return the shape at some of the points."""
+        """Return the shape at a subset of the points."""
         return Shape(
             self.normals[index],
             self.curvature[index],
@@ -59,46 +59,50 @@ class Shape:
 
 
 @dataclass(eq=False)
-class _Known:
+class _CachedView:
     tree: KdTree
     shapes: dict[int, Shape]
 
 
-_known: WeakKeyDictionary[Frame, _Known] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[Frame, _CachedView] = WeakKeyDictionary()
 
 
 def tree_of(view: Frame) -> KdTree:
     """Return the kd-tree over all points of a view."""
-    return _of(view).tree
+    return _cached(view).tree
 
 
 def shape_at(view: Frame, index: Int64, neighbours: int = NEIGHBOURS) -> Shape:
     """Return the shape of the view's surface at the points ``view.points[index]``."""
-    known = _of(view)
-    if neighbours not in known.shapes:
-        if len(index) < _FEW * len(view):
-            return _fit(view, known.tree, index, neighbours)
-        known.shapes[neighbours] = _fit(view, known.tree, np.arange(len(view)), neighbours)
-    return known.shapes[neighbours].at(index)
+    cached = _cached(view)
+    if neighbours not in cached.shapes:
+        if len(index) < _MAX_SUBSET * len(view):
+            return _fit(view, cached.tree, index, neighbours)
+        cached.shapes[neighbours] = _fit(view, cached.tree, np.arange(len(view)), neighbours)
+    return cached.shapes[neighbours].at(index)
 
 
 def normals_at(view: Frame, index: Int64, neighbours: int = NEIGHBOURS) -> Float64:
     """Return the normals (n, 3) at the points `index`: the view's own if it has any, else fits."""
-    own = view.normals
-    return shape_at(view, index, neighbours).normals if own is None else own[index].astype(float)
+    normals = view.normals
+    return (
+        shape_at(view, index, neighbours).normals
+        if normals is None
+        else normals[index].astype(float)
+    )
 
 
-def _of(view: Frame) -> _Known:
-    known = _known.get(view)
-    if known is None:
-        known = _known[view] = _Known(KdTree(view.points), {})
-    return known
+def _cached(view: Frame) -> _CachedView:
+    cached = _cache.get(view)
+    if cached is None:
+        cached = _cache[view] = _CachedView(KdTree(view.points), {})
+    return cached
 
 
 def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
     points = view.points.astype(np.float64)
     centres = points[index]
-    near, _ = tree.neighbours(centres, neighbours)
+    neighbour_index, _ = tree.neighbours(centres, neighbours)
     n = len(index)
     normals = np.empty((n, 3))
     curvature, gap, roughness = np.empty(n), np.empty(n), np.empty(n)
@@ -107,7 +111,7 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
     def work(a: int, b: int) -> None:
         local_shapes(
             points,
-            near[a:b],
+            neighbour_index[a:b],
             centres[a:b],
             origin,
             normals[a:b],

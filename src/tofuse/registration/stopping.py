@@ -9,7 +9,7 @@ from tofuse.bounds import Bounded, Bounds
 from tofuse.parts import part
 from tofuse.registration.interfaces import History, Stopping
 
-_REPEATED = 1e-6
+_REPETITION_TOLERANCE = 1e-6
 
 
 @part("stopping", "two-loops", label="validated")
@@ -18,7 +18,7 @@ class TwoLoops(Bounded, Stopping):
     """The two loops of Algorithm 1.
 
     The first (lines 1 to 15) runs until the number of corresponding points is the same in two
-    iterations. The second (line 16) goes on until the change of E from one iteration to the next,
+    iterations. The second (line 16) continues until the change of E from one iteration to the next,
     ``|E_i - E_(i-1)|``, has been below `epsilon` in `k` iterations in a row; its first change is
     that from the last E of the first loop.
 
@@ -75,6 +75,6 @@ class SmallStep(Bounded, Stopping):
         return (
             len(errors) >= 5
             and counts[-1] == counts[-3] == counts[-5]
-            and abs(errors[-1] - errors[-3]) <= _REPEATED * errors[-1]
-            and abs(errors[-3] - errors[-5]) <= _REPEATED * errors[-1]
+            and abs(errors[-1] - errors[-3]) <= _REPETITION_TOLERANCE * errors[-1]
+            and abs(errors[-3] - errors[-5]) <= _REPETITION_TOLERANCE * errors[-1]
         )

@@ -41,7 +41,7 @@ class SurfaceMetric(Metric, Protocol):
 
         Pairs with the same target point share its noise and count less.
         """
-        pairs = _measurements(matches, alignment)
+        pairs = _independent_pairs(matches, alignment)
         return pairs.to_origin(self.fit(pairs)[0])
 
     def cross_information(self, matches: Matches, alignment: Alignment) -> Float64:
@@ -50,16 +50,16 @@ class SurfaceMetric(Metric, Protocol):
         Of the right perturbation in the source's frame, as `information`; not positive definite
         where noise exceeds the information of the surface.
         """
-        pairs = _measurements(matches, alignment)
+        pairs = _independent_pairs(matches, alignment)
         return pairs.to_origin(cross_information(pairs, self.fit(pairs)[1]))
 
     def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.unobservable`."""
-        pairs = _measurements(matches, alignment)
+        pairs = _independent_pairs(matches, alignment)
         return unobservable_directions(pairs, self.fit(pairs)[1])
 
 
-def _measurements(matches: Matches, alignment: Alignment) -> SurfacePairs:
+def _independent_pairs(matches: Matches, alignment: Alignment) -> SurfacePairs:
     weight = matches.weights() * shared_weights(matches, alignment)
     return surface_pairs(replace(matches, weight=weight), alignment, source=True)
 

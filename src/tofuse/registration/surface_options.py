@@ -45,15 +45,15 @@ class SurfaceOptions:
         Half widths of the windows of the plane fits, pixels: the smallest gives the depth, the
         widest one that contains a single surface gives the slope.
     edge_jump, edge_margin, edge_sigmas
-        Pixels within `edge_margin` pixels of a depth edge are left out of the fits, as they mix
+        Pixels within `edge_margin` pixels of a depth edge are excluded from the fits, as they mix
         light of both sides. An edge is a relative difference above `edge_jump`, above that of
         neighbouring pixels on a surface at an incidence of 80 degrees, and above `edge_sigmas`
         times the view's typical noise.
     misfit
         Largest ratio of the residual variance of a window to that of the smallest windows.
     flatness
-        Deviations from a plane below this fraction of the depth are accepted whatever the noise of
-        the view, as cameras may smooth their images.
+        Deviations from a plane below this fraction of the depth are accepted regardless of the
+        noise of the view, as cameras may smooth their images.
     fill, offset
         Smallest valid fraction of a window, and largest squared offset of its valid pixels'
         centroid relative to their variance.
@@ -64,8 +64,8 @@ class SurfaceOptions:
         None to estimate it from the recording.
     range_falloff
         Exponent of the range by which colour (as if lit by a lamp on the camera) or infrared
-        images of kind "ir" get darker; None to estimate it from the recording. A view alone is
-        taken for one in ambient light, or for that of a time-of-flight camera.
+        images of kind "ir" get darker; None to estimate it from the recording. A single view is
+        assumed to be in ambient light, or of a time-of-flight camera.
     fine_scale
         Options for views with hardly any noise.
     """

@@ -10,7 +10,7 @@ true pose, and its covariance ``X^-1 B X^-1`` with X the derivative of g and B i
 - B is not the pixels' noise alone. Smoothing correlates the noise of neighbours; multipath,
   scattering and motion distort whole patches of the range image. Differences between patches
   appear in the residuals, less the part absorbed by the fit; errors common to all patches are
-  absorbed wholly and invisible in the residuals. They are modelled as proportional to the change
+  fully absorbed and invisible in the residuals. They are modelled as proportional to the change
   of the view: a constant bias of the camera causes no pose error from the same viewpoint.
 """
 
@@ -35,15 +35,15 @@ _UPPER7 = np.triu_indices(7)
 # Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.
 _SCALE = np.append(UNITS, 1.0)
 _SCALES = np.outer(_SCALE, _SCALE)
-# Minimum number of compared pixels of a tile, and of tiles.
+# Minimum number of compared pixels per tile, and of tiles.
 _MIN_PIXELS = 10
 _MIN_TILES = 6
 # Minimum sigma, in units of 1 cm and 1 degree: keeps the covariance of a still camera invertible.
 _MIN_SIGMA = 1e-3
 # Information of an unconstrained direction, as a fraction of that of the weak prior.
-_NO_INFORMATION = 1e-3
+_MIN_INFORMATION = 1e-3
 # Approximate number of pixels used: the noise of denser ones is correlated.
-_PIXELS = 6336
+_SAMPLED_PIXELS = 6336
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class Patches:
     ----------
     geometry, photo
         (7, 7) sums of w J J^T; the seventh unknown is the exposure.
-    weighed, cross
+    weighted, cross
         (7, 7) sums of w times the symmetrised product of target's and source's Jacobian; and X, the
         derivative of the gradient, which has the derivative of the influence function for w.
-    places
+    positions
         (n, 2) column and row of the patches with distances, as fractions of the image's width.
     weights
         (n,) sums of w, 1/m^2.
@@ -111,9 +111,9 @@ class Patches:
 
     geometry: Float64
     photo: Float64
-    weighed: Float64
+    weighted: Float64
     cross: Float64
-    places: Float64
+    positions: Float64
     weights: Float64
     means: Float64
     responses: Float64
@@ -137,14 +137,14 @@ def patches(
         As given to `align`, which returned `aligned`.
     """
     rows, columns = source.z.shape
-    stride = max(1, round(float(np.sqrt(rows * columns / _PIXELS))))
-    across, down = options.tiles
+    stride = max(1, round(float(np.sqrt(rows * columns / _SAMPLED_PIXELS))))
+    tile_columns, tile_rows = options.tiles
     photometric = (
         alignment.photometric and source.has_albedo and all(t.view.has_albedo for t in targets)
     )
-    some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
-    some = some[some > 0]
-    depth = 1 / median(some) if len(some) else 1.0
+    inverse_depths = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
+    inverse_depths = inverse_depths[inverse_depths > 0]
+    depth = 1 / median(inverse_depths) if len(inverse_depths) else 1.0
     residuals = Residuals(
         aligned.exposure,
         aligned.scale,
@@ -153,33 +153,35 @@ def patches(
         alignment.robust,
         math.cos(alignment.max_angle),
     )
-    distances = []
+    sums_per_target = []
     upper = np.zeros((kernels.KINDS, kernels.UPPER))
     changes = []
     for target in targets:
         view = target.view
         T = np.ascontiguousarray(target.T_target_world @ aligned.T_world_source)
-        moved, turned = distance_and_angle(np.eye(4), T)
-        changes.append(turned + moved / depth)
+        translation, rotation = distance_and_angle(np.eye(4), T)
+        changes.append(rotation + translation / depth)
         of_tiles, of_image = kernels.tile_sums(
-            source.images, view.target_image, T, residuals, stride, across, down
+            source.images, view.target_image, T, residuals, stride, tile_columns, tile_rows
         )
-        distances.append(of_tiles)
+        sums_per_target.append(of_tiles)
         upper += of_image
-    total = np.concatenate(distances)
-    valid = total[:, kernels.COUNT] >= _MIN_PIXELS
-    places = np.tile(_places(rows, columns, across, down), (len(targets), 1))[valid]
-    total = total[valid]
-    weights = total[:, kernels.WEIGHT]
+    tile_sums = np.concatenate(sums_per_target)
+    valid = tile_sums[:, kernels.COUNT] >= _MIN_PIXELS
+    positions = np.tile(_positions(rows, columns, tile_columns, tile_rows), (len(targets), 1))[
+        valid
+    ]
+    tile_sums = tile_sums[valid]
+    weights = tile_sums[:, kernels.WEIGHT]
     return Patches(
         _matrix(upper[kernels.GEOMETRY]),
         _matrix(upper[kernels.PHOTO]),
         _matrix(upper[kernels.WEIGHED]),
         _matrix(upper[kernels.CROSS]),
-        places,
+        positions,
         weights,
-        total[:, kernels.RESIDUAL] / weights,
-        total[:, kernels.A : kernels.A + 7] * _SCALE,
+        tile_sums[:, kernels.RESIDUAL] / weights,
+        tile_sums[:, kernels.A : kernels.A + 7] * _SCALE,
         sum(changes) / len(changes),
         depth,
         stride,
@@ -187,29 +189,33 @@ def patches(
 
 
 @cache
-def _places(rows: int, columns: int, across: int, down: int) -> Float64:
+def _positions(rows: int, columns: int, tile_columns: int, tile_rows: int) -> Float64:
     """Return column and row (down * across, 2) of the tiles, as fractions of the image's width."""
-    v, u = np.mgrid[:down, :across]
-    return np.stack([u / across, v * rows / (down * columns)], -1).reshape(-1, 2)
+    v, u = np.mgrid[:tile_rows, :tile_columns]
+    return np.stack([u / tile_columns, v * rows / (tile_rows * columns)], -1).reshape(-1, 2)
 
 
-def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
+def covariance_of_patches(sums: Patches, options: UncertaintyOptions) -> Float64:
     """Return the covariance (6, 6) of the right perturbation in m and rad, without a prior."""
-    slope, prior = _with_weak_prior(_slope(found, options), options.max_sigma)
-    bread = np.asarray(np.linalg.inv(slope), np.float64)
-    per_pixel = found.stride**2
-    B = max(1.0, options.noise_pixels / per_pixel) * found.geometry + prior
-    B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
-    if len(found.weights) >= _MIN_TILES:
-        x, y = found.places.T
-        apart = np.hypot(x[:, None] - x, y[:, None] - y)
-        alike = np.exp(-apart / options.reach)
-        seen = _seen_variance(found, bread, alike, options)
-        hidden = (options.hidden * found.depth * found.change) ** 2
-        shared = np.exp(-0.5 * apart / options.reach) + options.offset**2
-        B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
+    hessian, prior = _with_weak_prior(_hessian(sums, options), options.max_sigma)
+    bread = np.asarray(np.linalg.inv(hessian), np.float64)
+    per_pixel = sums.stride**2
+    B = max(1.0, options.noise_pixels / per_pixel) * sums.geometry + prior
+    B += max(1.0, options.photo_noise_pixels / per_pixel) * sums.photo
+    if len(sums.weights) >= _MIN_TILES:
+        x, y = sums.positions.T
+        distance = np.hypot(x[:, None] - x, y[:, None] - y)
+        correlation = np.exp(-distance / options.reach)
+        observed = _observed_variance(sums, bread, correlation, options)
+        hidden = (options.hidden * sums.depth * sums.change) ** 2
+        hidden_correlation = np.exp(-0.5 * distance / options.reach) + options.offset**2
+        B += (
+            sums.responses.T
+            @ (observed * correlation + hidden * hidden_correlation)
+            @ sums.responses
+        )
     C = (bread @ B @ bread)[:6, :6]
-    floor = options.floor * found.change * np.array([found.depth] * 3 + [1.0] * 3) / UNITS
+    floor = options.floor * sums.change * np.array([sums.depth] * 3 + [1.0] * 3) / UNITS
     C += np.diag(np.maximum(floor, _MIN_SIGMA) ** 2)
     return 0.5 * (C + C.T) * np.outer(UNITS, UNITS)
 
@@ -232,10 +238,10 @@ def covariance(
     options
         Constants of the covariance; the calibrated ones unless given.
     """
-    chosen = options or UncertaintyOptions()
-    C = covariance_of_patches(patches(source, targets, aligned, alignment, chosen), chosen)
+    constants = options or UncertaintyOptions()
+    C = covariance_of_patches(patches(source, targets, aligned, alignment, constants), constants)
     prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
-    return with_prior(no_worse_than(C, prior), aligned.unobservable, prior)
+    return with_prior(bounded_by_prior(C, prior), aligned.unobservable, prior)
 
 
 def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
@@ -253,13 +259,15 @@ def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
     if not len(unobservable):
         return C
     scaled = C / np.outer(UNITS, UNITS)
-    P = unobservable.T @ unobservable
-    kept = np.eye(6) - P
-    scaled = kept @ scaled @ kept + P @ np.diag((prior / UNITS) ** 2) @ P
+    projector = unobservable.T @ unobservable
+    complement = np.eye(6) - projector
+    scaled = (
+        complement @ scaled @ complement + projector @ np.diag((prior / UNITS) ** 2) @ projector
+    )
     return 0.5 * (scaled + scaled.T) * np.outer(UNITS, UNITS)
 
 
-def no_worse_than(C: Float64, prior: Float64) -> Float64:
+def bounded_by_prior(C: Float64, prior: Float64) -> Float64:
     """Bound the covariance C (6, 6) by that of the prediction, sigma `prior` (6,).
 
     X^-1 B X^-1 is unbounded along directions in which the robust loss has no minimum.
@@ -267,55 +275,57 @@ def no_worse_than(C: Float64, prior: Float64) -> Float64:
     values, vectors = np.linalg.eigh(C / np.outer(prior, prior))
     if values[-1] <= 1:
         return C
-    cut: Float64 = ((vectors * np.minimum(values, 1.0)) @ vectors.T) * np.outer(prior, prior)
-    return 0.5 * (cut + cut.T)
+    bounded: Float64 = ((vectors * np.minimum(values, 1.0)) @ vectors.T) * np.outer(prior, prior)
+    return 0.5 * (bounded + bounded.T)
 
 
-def _seen_variance(
-    found: Patches, bread: Float64, alike: Float64, options: UncertaintyOptions
+def _observed_variance(
+    sums: Patches, bread: Float64, correlation: Float64, options: UncertaintyOptions
 ) -> float:
     """Estimate the variance in m^2 of the correlated errors of patches from the residuals.
 
     Method of moments, corrected for the degrees of freedom of the fit: residuals are (1 - P) times
     the errors, P the projection of the fit (as in restricted maximum likelihood).
     """
-    n = len(found.weights)
-    M = np.eye(n) - (found.responses / found.weights[:, None]) @ bread @ found.responses.T
-    relative = found.weights / found.weights.sum()
-    relative = np.minimum(relative, 4 * median(relative))
-    expected = float(relative @ ((M @ alike) * M).sum(1))
-    noise = float(relative @ ((M / found.weights) * M).sum(1))
-    surplus = float(relative @ found.means**2) - noise
-    return max(surplus, 0.0) / max(expected, 0.1 * float(relative.sum()))
+    n = len(sums.weights)
+    M = np.eye(n) - (sums.responses / sums.weights[:, None]) @ bread @ sums.responses.T
+    weights = sums.weights / sums.weights.sum()
+    weights = np.minimum(weights, 4 * median(weights))
+    expected = float(weights @ ((M @ correlation) * M).sum(1))
+    noise = float(weights @ ((M / sums.weights) * M).sum(1))
+    surplus = float(weights @ sums.means**2) - noise
+    return max(surplus, 0.0) / max(expected, 0.1 * float(weights.sum()))
 
 
-def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
+def _hessian(sums: Patches, options: UncertaintyOptions) -> Float64:
     """Return X (7, 7), bounded below by `steepness` times its value without robust weights.
 
     For normal errors the ratio is two thirds. With many residuals near the limit of the loss, X is
     a difference of large numbers and may even be negative.
     """
-    least = _NO_INFORMATION * options.max_sigma**-2
-    return bounded_below(found.cross, found.weighed, options.steepness, least)
+    min_eigenvalue = _MIN_INFORMATION * options.max_sigma**-2
+    return bounded_below(sums.cross, sums.weighted, options.steepness, min_eigenvalue)
 
 
-def bounded_below(X: Float64, plain: Float64, fraction: float, least: float) -> Float64:
-    """Return the symmetric matrix `X` with no direction below a fraction of `plain`.
+def bounded_below(
+    X: Float64, reference: Float64, fraction: float, min_eigenvalue: float
+) -> Float64:
+    """Return the symmetric matrix `X` with no direction below a fraction of `reference`.
 
-    Eigenvalues of `plain` below `least` count as this.
+    Eigenvalues of `reference` are at least `min_eigenvalue`.
     """
-    values, vectors = np.linalg.eigh(plain)
-    root = vectors / np.sqrt(np.maximum(values, least))
-    values, turned = np.linalg.eigh(root.T @ X @ root)
-    back = np.linalg.inv(root).T @ turned
-    return np.asarray((back * np.maximum(values, fraction)) @ back.T, np.float64)
+    values, vectors = np.linalg.eigh(reference)
+    root = vectors / np.sqrt(np.maximum(values, min_eigenvalue))
+    values, directions = np.linalg.eigh(root.T @ X @ root)
+    basis = np.linalg.inv(root).T @ directions
+    return np.asarray((basis * np.maximum(values, fraction)) @ basis.T, np.float64)
 
 
 def _with_weak_prior(X: Float64, max_sigma: float) -> tuple[Float64, Float64]:
     """Raise the eigenvalues of X (7, 7) to ``max_sigma**-2``; return it, and the prior's B (7, 7).
 
-    What is added to X is the information of a prior, which counts in B as well: without it, the
-    less a direction is constrained, the smaller would be its variance ``B / X**2``.
+    The information added to X is that of a prior, which counts in B as well: without it, the
+    variance ``B / X**2`` would decrease the less a direction is constrained.
     """
     X = X.copy()
     if X[6, 6] <= 0:

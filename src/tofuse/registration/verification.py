@@ -3,7 +3,7 @@
 The quality of fit at the right pose depends on the camera: 92 % of the compared pixels are inliers
 for a smoothing phone, two thirds for a stereo camera. Instead of a fixed limit, `FitStatistics`
 estimates the distribution of a few statistics from accepted alignments, starting with a wide prior.
-Outliers by more than `FitStatistics.sigmas` are not rejected, but have to be compared with rival
+Alignments beyond `FitStatistics.sigmas` are not rejected, but have to be compared with rival
 poses.
 """
 
@@ -28,24 +28,24 @@ _NAMES = ("outliers", "free-space violations", "noise", "albedo differences")
 _ODDS_FLOOR = np.array([0.02, 0.01])
 # Prior for an unknown camera: mean and standard deviation of the statistics (15 % outliers, 2 % in
 # free space, four times the stated sigmas, 5 % of the albedo), and its weight in alignments; number
-# of alignments from which on the camera is known.
+# of alignments required for a known camera.
 _PRIOR_MEAN = np.array([np.log(0.17 / 0.87), np.log(0.03 / 0.98), np.log(4.0), np.log(0.05)])
 _PRIOR_SIGMA = np.array([0.6, 0.9, 1.5, 0.45])
-_PRIOR_COUNT, _KNOWN = 2.0, 10
+_PRIOR_COUNT, _MIN_KNOWN = 2.0, 10
 # Differences within this many usual standard deviations of the camera are no conflict.
-_NO_CONFLICT = 2.0
+_TOLERATED_SIGMAS = 2.0
 # Lower limit of the spread, as the next view may differ from all so far.
 _MIN_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
 # Once a camera is known, the distribution is updated every n-th alignment.
 _RELEARN_EVERY = 10
-# Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
+# Views hardly overlap beyond this distance: the sum of a fraction of the depth and rad.
 IN_SIGHT = 1.2
 # For six unknowns, with noise that is correlated between neighbouring pixels.
 _MIN_INLIERS = 40
-# Registrations without a prediction need more iterations than tracking does.
+# Registrations without a prediction need more iterations than tracking.
 PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
-# A guess may be less accurate than tracking's prediction: start with more noise inflation.
+# A guess may be less accurate than a prediction in tracking: start with more noise inflation.
 COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
@@ -62,7 +62,7 @@ class Assessment:
     reason
         Statistic that is out of range, with its usual value; empty for a usual fit.
     conflict
-        Whether the views conflict, rather than being noisier only.
+        Whether the views conflict, rather than only being noisier.
     """
 
     usual: bool
@@ -85,7 +85,7 @@ class FitStatistics:
 
     def __init__(self, sigmas: float = 3.0) -> None:
         self._sigmas = sigmas
-        self._seen: deque[Float64] = deque(maxlen=_WINDOW)
+        self._history: deque[Float64] = deque(maxlen=_WINDOW)
         self._mean, self._sigma = _PRIOR_MEAN, _PRIOR_SIGMA
         self._rms: deque[float] = deque(maxlen=_WINDOW)
         self._count = 0
@@ -98,7 +98,7 @@ class FitStatistics:
     @property
     def is_known(self) -> bool:
         """Whether there were enough alignments to estimate the distribution."""
-        return len(self._seen) >= _KNOWN
+        return len(self._history) >= _MIN_KNOWN
 
     @property
     def albedo(self) -> float:
@@ -112,97 +112,99 @@ class FitStatistics:
 
     def learn(self, aligned: Aligned, depth: float) -> None:
         """Add an accepted alignment of a view with this median depth in m."""
-        self._seen.append(_statistics(aligned))
+        self._history.append(_statistics(aligned))
         if np.isfinite(aligned.rms_m) and depth > 0:
             self._rms.append(aligned.rms_m / depth)
         self._count += 1
-        if self._count <= 2 * _KNOWN or self._count % _RELEARN_EVERY == 0:
+        if self._count <= 2 * _MIN_KNOWN or self._count % _RELEARN_EVERY == 0:
             self._update()
 
     def _update(self) -> None:
-        seen = np.stack(self._seen)
+        history = np.stack(self._history)
         mean, sigma = _PRIOR_MEAN.copy(), _PRIOR_SIGMA.copy()
         for k in range(len(_NAMES)):
-            known = seen[np.isfinite(seen[:, k]), k]
-            n = len(known)
+            values = history[np.isfinite(history[:, k]), k]
+            n = len(values)
             if n:
-                middle = float(np.median(known))
-                spread = float(np.median(np.abs(known - middle))) / MEDIAN_OF_NORMAL
+                location = float(np.median(values))
+                spread = float(np.median(np.abs(values - location))) / MEDIAN_OF_NORMAL
                 weight = n / (n + _PRIOR_COUNT)
-                mean[k] += weight * (middle - mean[k])
+                mean[k] += weight * (location - mean[k])
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])
         self._mean, self._sigma = mean, np.maximum(sigma, _MIN_SIGMA)
 
     def assess(self, aligned: Aligned) -> Assessment:
         """Compare an alignment with the distribution."""
         if aligned.inliers < _MIN_INLIERS:
-            words = f"{aligned.inliers} inliers are too few to determine a pose"
-            return Assessment(False, np.inf, words, True)
-        found = _statistics(aligned)
-        over = np.where(np.isfinite(found), found - self._mean, 0.0)
-        worst = int(np.argmax(over / self._sigma))
-        if over[worst] <= self._sigmas * self._sigma[worst]:
+            reason = f"{aligned.inliers} inliers are too few to determine a pose"
+            return Assessment(False, np.inf, reason, True)
+        statistics = _statistics(aligned)
+        deviation = np.where(np.isfinite(statistics), statistics - self._mean, 0.0)
+        worst = int(np.argmax(deviation / self._sigma))
+        if deviation[worst] <= self._sigmas * self._sigma[worst]:
             return Assessment(True, 0.0, "")
-        excess = float(np.maximum(over, 0).sum())
-        words = _in_words(worst, float(found[worst]), float(self._mean[worst]))
-        conflict = np.delete(over > self._sigmas * self._sigma, _NOISE).any()
-        return Assessment(False, excess, words, bool(conflict))
+        excess = float(np.maximum(deviation, 0).sum())
+        reason = _describe(worst, float(statistics[worst]), float(self._mean[worst]))
+        conflict = np.delete(deviation > self._sigmas * self._sigma, _NOISE).any()
+        return Assessment(False, excess, reason, bool(conflict))
 
 
-def _statistics(a: Aligned) -> Float64:
-    n = max(a.compared, 1)
-    fractions = np.array([1 - a.inliers / n, a.in_front / n])
+def _statistics(aligned: Aligned) -> Float64:
+    compared = max(aligned.compared, 1)
+    fractions = np.array([1 - aligned.inliers / compared, aligned.in_front / compared])
     odds = np.log((fractions + _ODDS_FLOOR) / (1 - fractions + _ODDS_FLOOR))
-    noise = np.log(a.noise_scale) if 0 < a.noise_scale < np.inf else np.nan
-    albedo = np.log(a.photo_scale) if a.photometric and a.photo_scale > 0 else np.nan
+    noise = np.log(aligned.noise_scale) if 0 < aligned.noise_scale < np.inf else np.nan
+    albedo = (
+        np.log(aligned.photo_scale) if aligned.photometric and aligned.photo_scale > 0 else np.nan
+    )
     return np.array([*odds, noise, albedo])
 
 
-def _in_words(k: int, found: float, usual: float) -> str:
-    if k < 2:
-        floor = _ODDS_FLOOR[k]
-        odds = np.exp([found, usual])
+def _describe(index: int, value: float, usual: float) -> str:
+    if index < 2:
+        floor = _ODDS_FLOOR[index]
+        odds = np.exp([value, usual])
         fractions = np.clip((odds * (1 + floor) - floor) / (1 + odds), 0, 1)
-        return f"{fractions[0]:.0%} {_NAMES[k]}, usually {fractions[1]:.0%}"
-    return f"{_NAMES[k]} {np.exp(found - usual):.1f} times as large as usual"
+        return f"{fractions[0]:.0%} {_NAMES[index]}, usually {fractions[1]:.0%}"
+    return f"{_NAMES[index]} {np.exp(value - usual):.1f} times as large as usual"
 
 
-def both_ways_agree(
+def are_inverse(
     T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
 ) -> bool:
     """Whether forward and backward alignments (4, 4) are consistent within `metres`, `radians`."""
-    gap = T_target_source @ T_source_target
-    return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
+    difference = T_target_source @ T_source_target
+    return bool(np.linalg.norm(difference[:3, 3]) <= metres and se3.angle(difference) <= radians)
 
 
-def self_scaled(usual: FitStatistics) -> AgreementOptions:
+def self_scaled(fit_statistics: FitStatistics) -> AgreementOptions:
     """Return options that tolerate the usual errors of this camera."""
-    plain = AgreementOptions()
+    default = AgreementOptions()
     return replace(
-        plain,
-        floor_fraction=max(plain.floor_fraction, _NO_CONFLICT * usual.rms_fraction),
-        albedo=max(plain.albedo, _NO_CONFLICT * usual.albedo),
+        default,
+        floor_fraction=max(default.floor_fraction, _TOLERATED_SIGMAS * fit_statistics.rms_fraction),
+        albedo=max(default.albedo, _TOLERATED_SIGMAS * fit_statistics.albedo),
     )
 
 
-def finely_scaled(usual: FitStatistics) -> AgreementOptions:
+def finely_scaled(fit_statistics: FitStatistics) -> AgreementOptions:
     """Return options that distinguish rival poses of one image by errors beyond the usual ones."""
-    coarse = self_scaled(usual)
-    if not usual.is_known:
+    coarse = self_scaled(fit_statistics)
+    if not fit_statistics.is_known:
         return coarse
     return replace(
         coarse,
         floor_m=0.0,
-        floor_fraction=_NO_CONFLICT * usual.rms_fraction,
+        floor_fraction=_TOLERATED_SIGMAS * fit_statistics.rms_fraction,
         # An albedo difference counts against a pose beyond twice the usual one.
-        albedo=2 * _NO_CONFLICT * usual.albedo,
+        albedo=2 * _TOLERATED_SIGMAS * fit_statistics.albedo,
     )
 
 
 # Maximum ratio of the median depths of two views from nearby viewpoints.
-_RESCALED = 4.0
+_MAX_DEPTH_RATIO = 4.0
 
 
 def comparable(depth: float, other: float) -> bool:
     """Whether views of these median depths can show the same scene from nearby viewpoints."""
-    return 1 / _RESCALED < depth / other < _RESCALED
+    return 1 / _MAX_DEPTH_RATIO < depth / other < _MAX_DEPTH_RATIO

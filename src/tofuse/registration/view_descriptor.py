@@ -21,9 +21,9 @@ _CHUNKS = 16
 # Limits of the differences of the logarithms.
 _MAX_DEPTH, _MAX_ALBEDO = 0.3, 0.5
 # Minimum fraction of cells with albedo in both views, below which it is not compared.
-_LIT = 0.2
+_MIN_ALBEDO_FRACTION = 0.2
 # Of the index of descriptors: principal components, and nearest neighbours per query.
-_COMPONENTS, _ANSWERS = 8, 6
+_COMPONENTS, _NEAREST = 8, 6
 
 
 def view_descriptor(view: PreparedView) -> Float32:
@@ -33,23 +33,23 @@ def view_descriptor(view: PreparedView) -> Float32:
     j = np.arange(columns) * _COLUMNS // columns
     cell = (i[:, None] * _COLUMNS + j).ravel()
     size = _ROWS * _COLUMNS
-    third = np.bincount(cell, minlength=size) / 3
+    min_count = np.bincount(cell, minlength=size) / 3
     descriptor = np.full((2, size), np.nan, np.float32)
     depth = np.log(np.where(view.z > 0, view.z, np.float32(np.nan)))
     for image, out in ((depth, descriptor[0]), (view.albedo[..., 0], descriptor[1])):
-        known = np.isfinite(image).ravel()
-        count = np.bincount(cell[known], minlength=size)
-        total = np.bincount(cell[known], image.ravel()[known].astype(float), minlength=size)
-        enough = (count > third) & (count > 0)
+        valid = np.isfinite(image).ravel()
+        count = np.bincount(cell[valid], minlength=size)
+        total = np.bincount(cell[valid], image.ravel()[valid].astype(float), minlength=size)
+        enough = (count > min_count) & (count > 0)
         out[enough] = total[enough] / count[enough]
     return descriptor.reshape(2, _ROWS, _COLUMNS)
 
 
 def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64:
-    """Return the distances (N,) of descriptors to one, each at its best shift.
+    """Return the distances (N,) between one descriptor and others, each at its best shift.
 
-    0 for the same image, 1 for nothing in common. The mean difference of log albedo is exposure,
-    and ignored. Views without albedo in both are compared by depth alone.
+    0 for the same image, 1 for no similarity. The mean difference of log albedo is exposure, and
+    ignored. Views without albedo in both are compared by depth alone.
 
     Parameters
     ----------
@@ -58,51 +58,51 @@ def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64
     shift
         Largest shift, as a fraction of the width.
     """
-    across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+    max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     best = np.ones(len(others))
-    for v in range(-down, down + 1):
-        for u in range(-across, across + 1):
-            here = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
-            there = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
-            np.minimum(best, _differ(here, there), out=best)
+    for v in range(-max_v, max_v + 1):
+        for u in range(-max_u, max_u + 1):
+            patch = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
+            other_patches = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
+            np.minimum(best, _difference(patch, other_patches), out=best)
     return best
 
 
 def mutual_dissimilarity(descriptors: Sequence[Float32] | Float32, shift: float) -> Float64:
     """Return the pairwise distances (N, N) of descriptors (N, 2, 9, 12), see `dissimilarity`."""
     stack = np.asarray(descriptors)
-    far = np.ones((len(stack), len(stack)))
+    distances = np.ones((len(stack), len(stack)))
 
     def rows(a: int, b: int) -> None:
         for k in range(a, b):
-            far[k, k:] = dissimilarity(stack[k], stack[k:], shift)
+            distances[k, k:] = dissimilarity(stack[k], stack[k:], shift)
 
     run_chunks(rows, len(stack), _CHUNKS)
-    return np.minimum(far, far.T)
+    return np.minimum(distances, distances.T)
 
 
 def pairwise_dissimilarity(descriptors: Float32, i: Intp, j: Intp, shift: float) -> Float64:
     """Return the distances (M,) of the pairs i, j of descriptors, see `dissimilarity`."""
-    out = np.ones(len(i))
+    distances = np.ones(len(i))
     order = np.argsort(i, kind="stable")
-    different, begin = np.unique(i[order], return_index=True)
+    unique, begin = np.unique(i[order], return_index=True)
     end = np.append(begin[1:], len(order))
 
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             rows = order[begin[k] : end[k]]
-            out[rows] = dissimilarity(descriptors[different[k]], descriptors[j[rows]], shift)
+            distances[rows] = dissimilarity(descriptors[unique[k]], descriptors[j[rows]], shift)
 
-    run_chunks(work, len(different), _CHUNKS)
-    return out
+    run_chunks(work, len(unique), _CHUNKS)
+    return distances
 
 
 def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
-    """Return candidate pairs i < j of similar descriptors (N, 2, 9, 12), some for each view.
+    """Return candidate pairs i < j of similar descriptors (N, 2, 9, 12), a few for each view.
 
     A kd-tree over the first principal components of blocks of cells is queried for each view at
     each shift (see `dissimilarity`). Callers compare the candidates cell by cell. Consecutive views
-    are left out, as these are always similar.
+    are excluded, as these are always similar.
     """
     n = len(descriptors)
     described = _blocks(descriptors, 0, 0)
@@ -110,18 +110,18 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     _, _, axes = np.linalg.svd(described - mean, full_matrices=False)
     axes = axes[:_COMPONENTS]
     tree = cKDTree((described - mean) @ axes.T)
-    here, there = [], []
-    across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
-    for v in range(-down, down + 1):
-        for u in range(-across, across + 1):
-            asked = (_blocks(descriptors, v, u) - mean) @ axes.T
-            _, near = tree.query(asked, k=min(_ANSWERS, n))
-            here.append(np.repeat(np.arange(n), near.shape[1]))
-            there.append(near.ravel())
-    a, b = np.concatenate(here), np.concatenate(there)
+    queried, matched = [], []
+    max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+    for v in range(-max_v, max_v + 1):
+        for u in range(-max_u, max_u + 1):
+            query = (_blocks(descriptors, v, u) - mean) @ axes.T
+            _, neighbours = tree.query(query, k=min(_NEAREST, n))
+            queried.append(np.repeat(np.arange(n), neighbours.shape[1]))
+            matched.append(neighbours.ravel())
+    a, b = np.concatenate(queried), np.concatenate(matched)
     i, j = np.minimum(a, b), np.maximum(a, b)
-    apart = j > i + 1
-    i, j = np.divmod(np.unique(i[apart] * n + j[apart]), n)
+    nonconsecutive = j > i + 1
+    i, j = np.divmod(np.unique(i[nonconsecutive] * n + j[nonconsecutive]), n)
     return i, j
 
 
@@ -130,35 +130,40 @@ def _blocks(descriptors: Float32, v: int, u: int) -> Float64:
 
     Unknown blocks get the mean of all views; log albedo is relative to the view's mean.
     """
-    moved = np.full_like(descriptors, np.nan)
+    shifted = np.full_like(descriptors, np.nan)
     to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
-    to, fro = slice(max(-u, 0), _COLUMNS - max(u, 0)), slice(max(u, 0), _COLUMNS + min(u, 0))
-    moved[:, :, to_rows, to] = descriptors[:, :, from_rows, fro]
-    cells = moved.reshape(len(descriptors), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
-    known = np.isfinite(cells)
-    count = known.sum((3, 5))
-    total = np.where(known, cells, 0).sum((3, 5))
+    to_columns, from_columns = (
+        slice(max(-u, 0), _COLUMNS - max(u, 0)),
+        slice(max(u, 0), _COLUMNS + min(u, 0)),
+    )
+    shifted[:, :, to_rows, to_columns] = descriptors[:, :, from_rows, from_columns]
+    cells = shifted.reshape(len(descriptors), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
+    valid = np.isfinite(cells)
+    count = valid.sum((3, 5))
+    total = np.where(valid, cells, 0).sum((3, 5))
     # Scaled by the limits of the differences.
     means = total / np.maximum(count, 1) / np.array([_MAX_DEPTH, _MAX_ALBEDO])[:, None, None]
-    seen = count > 0
-    own = np.where(seen, means, 0).sum((2, 3)) / np.maximum(seen.sum((2, 3)), 1)
-    means[:, 1] -= own[:, 1, None, None]
-    typical = np.where(seen, means, 0).sum(0) / np.maximum(seen.sum(0), 1)
-    return np.where(seen, means, typical).reshape(len(descriptors), -1)
+    has_value = count > 0
+    view_mean = np.where(has_value, means, 0).sum((2, 3)) / np.maximum(has_value.sum((2, 3)), 1)
+    means[:, 1] -= view_mean[:, 1, None, None]
+    overall_mean = np.where(has_value, means, 0).sum(0) / np.maximum(has_value.sum(0), 1)
+    return np.where(has_value, means, overall_mean).reshape(len(descriptors), -1)
 
 
-def _differ(here: Float32, there: Float32) -> Float64:
+def _difference(patch: Float32, others: Float32) -> Float64:
     """Return the mean differences (N,) of the cells, relative to their limits."""
-    apart = there - here
-    known = np.isfinite(apart)
-    count = known.sum((2, 3))
-    apart = np.where(known, apart, 0)
-    exposure = apart[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
-    depth = np.minimum(np.abs(apart[:, 0]) / _MAX_DEPTH, 1)
-    albedo = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
-    cells = here[0].size
-    far = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
+    difference = others - patch
+    valid = np.isfinite(difference)
+    count = valid.sum((2, 3))
+    difference = np.where(valid, difference, 0)
+    exposure = difference[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
+    depth = np.minimum(np.abs(difference[:, 0]) / _MAX_DEPTH, 1)
+    albedo = np.minimum(np.abs(difference[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
+    cells = patch[0].size
+    depth_distance = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
     # Albedo is known for smooth surfaces only; other cells are ignored.
-    shade = np.where(known[:, 1], albedo, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
-    lit = count[:, 1] > _LIT * cells
-    return np.asarray(np.where(lit, 0.5 * (far + shade), far), np.float64)
+    albedo_distance = np.where(valid[:, 1], albedo, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
+    has_albedo = count[:, 1] > _MIN_ALBEDO_FRACTION * cells
+    return np.asarray(
+        np.where(has_albedo, 0.5 * (depth_distance + albedo_distance), depth_distance), np.float64
+    )

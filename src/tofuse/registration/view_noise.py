@@ -23,13 +23,13 @@ _MIN_SIGMA, _MAX_SIGMA = 1e-6, 1e3
 _CORRELATED_PIXELS = 100.0
 
 
-def own_sigma(frame: RangeFrame) -> Float32 | None:
+def stated_sigma(frame: RangeFrame) -> Float32 | None:
     """Return the sigma of z (H, W) that the frame states, m; 0 where unknown."""
     if frame.sigma_image is None:
         return None
-    known = (frame.sigma_image > _MIN_SIGMA) & (frame.sigma_image < _MAX_SIGMA)
+    valid = (frame.sigma_image > _MIN_SIGMA) & (frame.sigma_image < _MAX_SIGMA)
     # The stated noise is that of the radial range.
-    sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
+    sigma = np.where(valid, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
     return np.asarray(sigma, np.float32)
 
 
@@ -44,11 +44,11 @@ def noise_law(
     else:
         r2 = z * z * projection.lengths2
         raw = amplitude * inverse(r2, r2 > 0)
-    lit = raw[::2, ::2]
-    lit = lit[lit > 0]
-    if len(lit) == 0:
+    positive = raw[::2, ::2]
+    positive = positive[positive > 0]
+    if len(positive) == 0:
         return np.float32(0.001) + np.float32(0.003) * z * z
-    typical = np.float32(median(lit))
+    typical = np.float32(median(positive))
     # A tiny amplitude stands for none, far below the limit of the law.
     law = np.asarray(typical / np.fmax(raw, np.float32(1e-6) * typical), np.float32)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
@@ -57,44 +57,44 @@ def noise_law(
 def typical_noise(w: Float32, weight: Float32) -> float:
     """Return the standard deviation of the difference between neighbours, relative to their depth.
 
-    A robust estimate from the median of second differences along some of the rows.
+    A robust estimate from the median of second differences along a subset of rows.
     """
     rows = np.s_[::4]
-    some = [w[rows, k : w.shape[1] - 2 + k] for k in range(3)]
-    known = np.logical_and.reduce([weight[rows, k : w.shape[1] - 2 + k] > 0 for k in range(3)])
-    if not known.any():
+    neighbours = [w[rows, k : w.shape[1] - 2 + k] for k in range(3)]
+    valid = np.logical_and.reduce([weight[rows, k : w.shape[1] - 2 + k] > 0 for k in range(3)])
+    if not valid.any():
         return 0.0
-    before, here, after = (values[known] for values in some)
-    bend = np.abs(before - 2 * here + after) / here
+    before, here, after = (values[valid] for values in neighbours)
+    second_difference = np.abs(before - 2 * here + after) / here
     # sqrt(6) in a second difference, sqrt(2) in a first one.
-    return median(bend) / MEDIAN_OF_NORMAL / np.sqrt(3.0)
+    return median(second_difference) / MEDIAN_OF_NORMAL / np.sqrt(3.0)
 
 
 def noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> float:
-    """Estimate the variance scale: median misfit of the smallest windows on some of the rows."""
+    """Estimate the variance scale: median misfit of the smallest windows on a subset of rows."""
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     values = []
-    known = weight > 0
+    valid = weight > 0
     radii = np.array([radius], np.int64)
     for i in range(radius, rows - radius, max(1, rows // 12)):
-        fit_planes(w, rays, weight, known, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
+        fit_planes(w, rays, weight, valid, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
         values.append(quality[i, :, 0])
-    found = np.concatenate(values) if values else np.zeros(0)
-    found = found[np.isfinite(found)]
-    if len(found) == 0:
+    misfit = np.concatenate(values) if values else np.zeros(0)
+    misfit = misfit[np.isfinite(misfit)]
+    if len(misfit) == 0:
         return 1.0
-    return min(max(median(found), 1e-6), 1e6)
+    return min(max(median(misfit), 1e-6), 1e6)
 
 
 def scale_at(relative: float, z: Float32, sigma: Float32) -> float:
     """Return the variance scale at which a typical pixel's sigma is `relative` times its depth."""
     z, sigma = z[::4, ::4], sigma[::4, ::4]
-    known = (z > 0) & (sigma > 0)
-    if not known.any():
+    valid = (z > 0) & (sigma > 0)
+    if not valid.any():
         return 0.0
-    return median(relative * z[known] / sigma[known]) ** 2
+    return median(relative * z[valid] / sigma[valid]) ** 2
 
 
 def shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
@@ -105,9 +105,9 @@ def shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
     rows, columns = lengths2.shape
     step = image.shape[1] // columns
     # It varies slowly: one pixel per block is enough.
-    picked = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
-    known = np.isfinite(picked) & (picked > 0)
-    return np.asarray(np.where(known, picked, 0) / np.sqrt(lengths2), np.float32)
+    sampled = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
+    valid = np.isfinite(sampled) & (sampled > 0)
+    return np.asarray(np.where(valid, sampled, 0) / np.sqrt(lengths2), np.float32)
 
 
 def with_shared_error(
@@ -116,10 +116,10 @@ def with_shared_error(
     """Return `plane_variance` and `pixel_variance` with the shared sigma of z (H, W) in m added."""
     if shared is None:
         return variance, None
-    once = (shared * planes[..., 3] ** 2) ** 2
-    return variance + np.float32(_CORRELATED_PIXELS) * once, variance + once
+    shared_variance = (shared * planes[..., 3] ** 2) ** 2
+    return variance + np.float32(_CORRELATED_PIXELS) * shared_variance, variance + shared_variance
 
 
-def inverse(values: Float32, known: Bool) -> Float32:
-    """Return the reciprocal of each value, 0 where it is not known."""
-    return np.reciprocal(np.where(known, values, np.float32(np.inf)))
+def inverse(values: Float32, valid: Bool) -> Float32:
+    """Return the reciprocal of each value, 0 where invalid."""
+    return np.reciprocal(np.where(valid, values, np.float32(np.inf)))

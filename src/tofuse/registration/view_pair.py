@@ -39,21 +39,21 @@ from tofuse.registration.verification import (
     COARSE,
     PATIENT,
     FitStatistics,
-    both_ways_agree,
+    are_inverse,
     comparable,
     self_scaled,
 )
 
-# Few iterations near a guess; else enough for a step of a third of the view.
-_NEAR = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
-_PATIENT = replace(_NEAR, levels=PATIENT)
-_FAR = replace(_NEAR, levels=COARSE)
-# Residual error of the search, m and rad, at depths of a metre and more.
-_AFTER_SEARCH = 0.03
+# Few iterations near a guess; otherwise enough for a step of a third of the view.
+_FEW_ITERATIONS = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
+_PATIENT = replace(_FEW_ITERATIONS, levels=PATIENT)
+_COARSE_START = replace(_FEW_ITERATIONS, levels=COARSE)
+# Error of a pose after the search, m and rad, at depths of a metre and more.
+_SEARCH_ERROR = 0.03
 # Maximum inconsistency of forward and backward alignment: relative to the depth, and rad.
-_BOTH_WAYS = 0.03
+_MAX_INCONSISTENCY = 0.03
 # Loss of score by noise when a pose is aligned, and lead that is not significant.
-_GIVEN_UP, _TIE = 0.05, 0.025
+_MAX_SCORE_LOSS, _TIE = 0.05, 0.025
 # Minimum distance of rival poses relative to the depth (less than the error of a right pose), and
 # depth in m below which tolerances are reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
@@ -86,9 +86,9 @@ class _Pose:
     @property
     def is_certain(self) -> bool:
         """Whether it needs no search."""
-        found = self.evidence
-        agrees = not self.degenerate and found.contradiction <= CONTRADICTION
-        return agrees and found.probability >= CERTAIN
+        evidence = self.evidence
+        is_consistent = not self.degenerate and evidence.contradiction <= CONTRADICTION
+        return is_consistent and evidence.probability >= CERTAIN
 
 
 def register_pair(
@@ -133,19 +133,25 @@ def register_pair(
     if not comparable(source.depth, target.depth):
         return None
     pair = _Pair.of(source, target, usual, uncertainty, rival_m)
-    near = pair.followed(np.eye(4) if guess is None else guess)
-    if near is not None and near.is_certain and not always_search:
-        return pair.registration(near, near.evidence, None)
-    prepared = Search.of(
-        pair.source, pair.target, options, agreement=pair.compared, distinct_m=pair.distinct_m
+    local = pair.local_pose(np.eye(4) if guess is None else guess)
+    if local is not None and local.is_certain and not always_search:
+        return pair.registration(local, local.evidence, None)
+    search = Search.of(
+        pair.source,
+        pair.target,
+        options,
+        agreement=pair.agreement_options,
+        distinct_m=pair.distinct_m,
     )
-    match = None if prepared is None else prepared.everywhere()
-    if prepared is None or match is None:
+    match = None if search is None else search.exhaustive()
+    if search is None or match is None:
         return None
-    found = pair.chosen(near, match, prepared, guess is not None)
-    if found.believed or proposals is None:
-        return found
-    return pair.chosen(near, prepared.among(proposals(), match), prepared, guess is not None)
+    registration = pair.selected(local, match, search, guess is not None)
+    if registration.believed or proposals is None:
+        return registration
+    return pair.selected(
+        local, search.with_proposals(proposals(), match), search, guess is not None
+    )
 
 
 def follow(
@@ -163,8 +169,8 @@ def follow(
     if not comparable(source.depth, target.depth):
         return None
     pair = _Pair.of(source, target, usual, uncertainty)
-    near = pair.followed(guess)
-    return None if near is None else pair.registration(near, near.evidence, None)
+    local = pair.local_pose(guess)
+    return None if local is None else pair.registration(local, local.evidence, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +179,7 @@ class _Pair:
 
     Attributes
     ----------
-    compared
+    agreement_options
         Options of the agreement of the two images.
     distinct_m
         Poses that differ by more are distinct hypotheses, m.
@@ -182,7 +188,7 @@ class _Pair:
     source: PreparedView
     target: PreparedView
     usual: FitStatistics
-    compared: AgreementOptions
+    agreement_options: AgreementOptions
     distinct_m: float
     uncertainty: UncertaintyOptions | None
 
@@ -197,7 +203,7 @@ class _Pair:
     ) -> _Pair:
         """Adapt the tolerances to the depth of the views and the usual errors of the camera.
 
-        An unknown falloff of the amplitude is taken for that of a lens at first.
+        An unknown falloff of the amplitude is initially assumed to be that of a lens.
         """
         source, target = (
             view.with_falloff(_VIGNETTING) if view.unknown_falloff else view
@@ -205,22 +211,24 @@ class _Pair:
         )
         usual = usual or FitStatistics()
         depth = 0.5 * (source.depth + target.depth)
-        compared = self_scaled(usual)
-        compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))
+        agreement_options = self_scaled(usual)
+        agreement_options = replace(
+            agreement_options, floor_m=agreement_options.floor_m * min(1.0, depth / _NEAR_M)
+        )
         distinct_m = min(rival_m, _DISTINCT * depth)
-        return cls(source, target, usual, compared, distinct_m, uncertainty)
+        return cls(source, target, usual, agreement_options, distinct_m, uncertainty)
 
-    def followed(self, guess: Float64) -> _Pose | None:
+    def local_pose(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
         views = self.source, self.target
-        found = self._fitting(views, guess, _NEAR)
-        if found is None or not found.is_certain:
-            coarse = self._aligned(views, guess, _FAR)
-            found = self._fitting(views, coarse.T_world_source, _PATIENT) or found
-        if found is not None and found.agreement.falloff:
-            views = self._compensated(found.agreement.falloff)
-            found = self._fitting(views, found.T_target_source, _PATIENT) or found
-        return found
+        pose = self._consistent_pose(views, guess, _FEW_ITERATIONS)
+        if pose is None or not pose.is_certain:
+            coarse = self._aligned(views, guess, _COARSE_START)
+            pose = self._consistent_pose(views, coarse.T_world_source, _PATIENT) or pose
+        if pose is not None and pose.agreement.falloff:
+            views = self._compensated(pose.agreement.falloff)
+            pose = self._consistent_pose(views, pose.T_target_source, _PATIENT) or pose
+        return pose
 
     def _compensated(self, falloff: float) -> tuple[PreparedView, PreparedView]:
         return self.source.with_falloff(falloff), self.target.with_falloff(falloff)
@@ -229,85 +237,87 @@ class _Pair:
         self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
     ) -> Aligned:
         source, target = views
-        return align(source, _at(target), guess, options, usual_scale=self.usual.noise_scale)
+        return align(source, _as_target(target), guess, options, usual_scale=self.usual.noise_scale)
 
-    def _fitting(
+    def _consistent_pose(
         self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
     ) -> _Pose | None:
         """Align forwards and backwards; None if inconsistent, or if the fit is unusual."""
-        there = self._aligned(views, guess, options)
-        if not there.converged or not self.usual.assess(there).usual:
+        forward = self._aligned(views, guess, options)
+        if not forward.converged or not self.usual.assess(forward).usual:
             return None
-        T = there.T_world_source
-        back = self._aligned((views[1], views[0]), se3.inverse(T), options)
-        far_m = _BOTH_WAYS * self.source.depth
-        same = both_ways_agree(T, back.T_world_source, far_m, _BOTH_WAYS)
-        if not same or not self.usual.assess(back).usual:
+        T = forward.T_world_source
+        backward = self._aligned((views[1], views[0]), se3.inverse(T), options)
+        max_gap_m = _MAX_INCONSISTENCY * self.source.depth
+        consistent = are_inverse(T, backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
+        if not consistent or not self.usual.assess(backward).usual:
             return None
-        agreed = agreement(self.source, self.target, T, self.compared)
-        return _Pose(views, T, there, options, agreed) if agreed.score > 0 else None
+        pose_agreement = agreement(self.source, self.target, T, self.agreement_options)
+        return (
+            _Pose(views, T, forward, options, pose_agreement) if pose_agreement.score > 0 else None
+        )
 
-    def chosen(
-        self, near: _Pose | None, match: Match, prepared: Search, guessed: bool
+    def selected(
+        self, local: _Pose | None, match: Match, search: Search, has_guess: bool
     ) -> Registration:
         """Select between the poses of a search and the pose aligned from the start.
 
-        The latter is preferred if `guessed`, that is if the start was given by the caller.
+        The latter is preferred if the caller passed the start.
         """
-        best = self.refined(match, prepared)
-        confirmed = near is not None and not near.degenerate and self.same(near, best)
-        if guessed and near is not None:
-            best = self.nearer(near, best, prepared)
+        best = self.refined(match, search)
+        confirmed = local is not None and not local.degenerate and self.are_same(local, best)
+        if has_guess and local is not None:
+            best = self.preferred(local, best, search)
         rival = self.rival(best, match)
         lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
         evidence = Evidence.of(best.agreement, lead, best.degenerate)
         return replace(self.registration(best, evidence, rival), confirmed=confirmed)
 
-    def refined(self, match: Match, prepared: Search) -> _Pose:
+    def refined(self, match: Match, search: Search) -> _Pose:
         """Align the best pose of a search, unless its agreement decreases significantly."""
-        error_m = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
-        options = replace(_PATIENT, prior_m=error_m, prior_rad=_AFTER_SEARCH)
+        error_m = _SEARCH_ERROR * min(1.0, self.source.depth / _NEAR_M)
+        options = replace(_PATIENT, prior_m=error_m, prior_rad=_SEARCH_ERROR)
         views = self._compensated(match.agreement.falloff)
         aligned = self._aligned(views, match.T_target_source, options)
-        agreed = prepared.compared.at(aligned.T_world_source)
-        if agreed.score >= match.score - _GIVEN_UP:
-            return _Pose(views, aligned.T_world_source, aligned, options, agreed)
+        pose_agreement = search.comparison.at(aligned.T_world_source)
+        if pose_agreement.score >= match.score - _MAX_SCORE_LOSS:
+            return _Pose(views, aligned.T_world_source, aligned, options, pose_agreement)
         return _Pose(views, match.T_target_source, aligned, options, match.agreement)
 
-    def nearer(self, near: _Pose, best: _Pose, prepared: Search) -> _Pose:
+    def preferred(self, local: _Pose, best: _Pose, search: Search) -> _Pose:
         """Select between the pose aligned from the guess and the best one.
 
         An insignificant lead does not outweigh the guess, and neither does one along directions
         that are degenerate for both: there the pose with the largest overlap leads.
         """
-        agreed = prepared.compared.at(near.T_target_source)
-        near = replace(near, agreement=agreed)
-        if agreed.score >= best.agreement.score - _TIE:
-            return near
-        gap = se3.log(se3.inverse(near.T_target_source) @ best.T_target_source) / UNITS
-        weak = near.aligned.unobservable
-        across = se3.exp((gap - weak.T @ (weak @ gap)) * UNITS)
-        same = not differ(np.eye(4), across, self.distinct_m)
-        return near if near.degenerate and best.degenerate and same else best
+        pose_agreement = search.comparison.at(local.T_target_source)
+        local = replace(local, agreement=pose_agreement)
+        if pose_agreement.score >= best.agreement.score - _TIE:
+            return local
+        difference = se3.log(se3.inverse(local.T_target_source) @ best.T_target_source) / UNITS
+        weak = local.aligned.unobservable
+        across = se3.exp((difference - weak.T @ (weak @ difference)) * UNITS)
+        is_same = not differ(np.eye(4), across, self.distinct_m)
+        return local if local.degenerate and best.degenerate and is_same else best
 
-    def same(self, a: _Pose, b: _Pose) -> bool:
+    def are_same(self, a: _Pose, b: _Pose) -> bool:
         """Whether two poses are the same hypothesis."""
         return not differ(a.T_target_source, b.T_target_source, self.distinct_m)
 
     def rival(self, pose: _Pose, match: Match) -> Candidate | None:
         """Return the best candidate of a search that is distinct from `pose`."""
-        T, least = pose.T_target_source, self.distinct_m
-        others = (c for c in match.candidates if differ(T, c.T_target_source, least))
-        return next(others, None)
+        T, distinct_m = pose.T_target_source, self.distinct_m
+        rivals = (c for c in match.candidates if differ(T, c.T_target_source, distinct_m))
+        return next(rivals, None)
 
     def registration(
         self, pose: _Pose, evidence: Evidence, rival: Candidate | None
     ) -> Registration:
         """Return a pose as a registration."""
         reason = evidence.rejection_reason()
-        found = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
+        registration = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
         return replace(
-            found,
+            registration,
             margin=evidence.margin,
             believed=not reason,
             probability=evidence.probability,
@@ -320,16 +330,18 @@ class _Pair:
         )
 
     def _covariance(self, pose: _Pose) -> Float64:
-        # The search result constrains no degenerate direction.
-        loose = replace(pose.options, prior_m=_NEAR.prior_m, prior_rad=_NEAR.prior_rad)
+        # The result of a search constrains no degenerate direction.
+        wide_prior = replace(
+            pose.options, prior_m=_FEW_ITERATIONS.prior_m, prior_rad=_FEW_ITERATIONS.prior_rad
+        )
         source, target = pose.views
-        C = covariance(source, _at(target), pose.aligned, loose, self.uncertainty)
+        C = covariance(source, _as_target(target), pose.aligned, wide_prior, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
             # Not aligned: add the residual error of the search.
-            o = pose.options
-            C = C + np.diag(np.array([o.prior_m] * 3 + [o.prior_rad] * 3) ** 2)
+            options = pose.options
+            C = C + np.diag(np.array([options.prior_m] * 3 + [options.prior_rad] * 3) ** 2)
         return C
 
 
-def _at(view: PreparedView) -> list[Target]:
+def _as_target(view: PreparedView) -> list[Target]:
     return [Target(view, np.eye(4))]

@@ -1,4 +1,4 @@
-"""Planes of the pixels of range images, and the depth edges that they leave out.
+"""Planes of the pixels of range images, and the depth edges that are excluded from them.
 
 `z` is an image (H, W) of depths in m, `w` their reciprocals, and `weight` the inverse variances of
 these; all are 0 where unknown.
@@ -23,11 +23,11 @@ def fitted_planes(
     w: Float32,
     rays: Float32,
     weight: Float32,
-    wanted: Bool,
+    mask: Bool,
     limit: float,
     options: SurfaceOptions,
 ) -> tuple[Float32, Float32]:
-    """Return planes (H, W, 4) and quality (H, W, 2) at the wanted pixels, see `fit_planes`."""
+    """Return planes (H, W, 4) and quality (H, W, 2) at the pixels of the mask, see `fit_planes`."""
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
@@ -35,7 +35,7 @@ def fitted_planes(
 
     def fit(start: int, stop: int) -> None:
         fit_planes(
-            w, rays, weight, wanted, radii, limit, options.fill, options.offset,
+            w, rays, weight, mask, radii, limit, options.fill, options.offset,
             planes, quality, start, stop,
         )  # fmt: skip
 
@@ -50,23 +50,25 @@ def edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
     """
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        across = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
-        edge[a] |= across
-        edge[b] |= across
+        is_step = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
+        edge[a] |= is_step
+        edge[b] |= is_step
     return dilated(edge, margin)
 
 
 def edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
-    """Do the same as `edge_pixels` with an individual noise (H, W), relative to the depth."""
+    """Return `edge_pixels` for the noise (H, W) of each pixel, relative to the depth."""
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         n, m = noise[a] ** 2, noise[b] ** 2
         # A large change of the noise is an edge between surfaces.
-        differs = np.float32(options.edge_sigmas) * np.sqrt(np.minimum(n + m, 4 * np.minimum(n, m)))
-        limit = np.minimum(np.maximum(differs, np.float32(options.edge_jump)), np.float32(0.9))
-        across = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
-        edge[a] |= across
-        edge[b] |= across
+        noise_step = np.float32(options.edge_sigmas) * np.sqrt(
+            np.minimum(n + m, 4 * np.minimum(n, m))
+        )
+        limit = np.minimum(np.maximum(noise_step, np.float32(options.edge_jump)), np.float32(0.9))
+        is_step = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
+        edge[a] |= is_step
+        edge[b] |= is_step
     return dilated(edge, options.edge_margin)
 
 
@@ -77,19 +79,19 @@ def dilated(mask: UInt8, margin: int) -> Bool:
 
 
 def pixels_with_plane(z: Float32, options: SurfaceOptions) -> tuple[int, int]:
-    """Return how many pixels have the neighbours for a plane fit, and how many are valid."""
+    """Return the numbers of pixels with enough neighbours for a plane fit, and of valid pixels."""
     missing = (z <= 0).view(np.uint8)
     usable = z > 0
     if options.edge_margin:
         cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-        beside = np.asarray(cv2.dilate(missing, cross), np.uint8)
-        usable = ~dilated(beside, options.edge_margin)
+        near_missing = np.asarray(cv2.dilate(missing, cross), np.uint8)
+        usable = ~dilated(near_missing, options.edge_margin)
     size = 2 * options.radii[0] + 1
     density = cv2.blur(usable.astype(np.float32), (size, size))
-    filled = (density >= options.fill) & (z > 0)
-    return int(np.count_nonzero(filled)), int(np.count_nonzero(z > 0))
+    with_plane = (density >= options.fill) & (z > 0)
+    return int(np.count_nonzero(with_plane)), int(np.count_nonzero(z > 0))
 
 
 def row_chunks(rows: int) -> int:
-    """Return into how many chunks the rows of an image are divided."""
+    """Return the number of chunks of the rows of an image."""
     return max(2, rows // _CHUNK_ROWS)

@@ -13,8 +13,8 @@ from tofuse.registration.projective import points_of
 
 def sampled_points(view: PreparedView, count: int) -> ViewPoints:
     """Return about `count` pixels that have a plane, evenly over the image."""
-    there = view.planar_fraction * view.z.size
-    packed = points_of(view, max(1, round(float(np.sqrt(there / count)))))
+    available = view.planar_fraction * view.z.size
+    packed = points_of(view, max(1, round(float(np.sqrt(available / count)))))
     points = np.ascontiguousarray(packed[:, POINT : POINT + 3])
     return ViewPoints(
         points,
@@ -30,8 +30,8 @@ def landing_pixels(view: PreparedView, points: Float64) -> Intp:
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
     a, b = (points[:, 0] / z - x0) * per_x, (points[:, 1] / z - y0) * per_y
     rows, columns = lookup.shape[:2]
-    ok = (a >= 0) & (b >= 0) & (a < columns - 1) & (b < rows - 1)
-    a, b = np.where(ok, a, 0), np.where(ok, b, 0)
+    inside = (a >= 0) & (b >= 0) & (a < columns - 1) & (b < rows - 1)
+    a, b = np.where(inside, a, 0), np.where(inside, b, 0)
     j, i = a.astype(np.intp), b.astype(np.intp)
     f, g = (a - j)[:, None], (b - i)[:, None]
     uv = (
@@ -40,4 +40,4 @@ def landing_pixels(view: PreparedView, points: Float64) -> Intp:
         + lookup[i + 1, j] * (1 - f) * g
         + lookup[i + 1, j + 1] * f * g
     )
-    return np.where(ok[:, None], np.round(uv), -1).astype(np.intp)
+    return np.where(inside[:, None], np.round(uv), -1).astype(np.intp)

@@ -1,1 +1,1 @@
-"""What a run gives: its types, the verdict, and the output folder of the contract."""
+"""The result of a run: its types, the verdict, and the output folder."""

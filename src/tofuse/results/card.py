@@ -30,28 +30,31 @@ def card(result: Reconstruction) -> list[str]:
 
 
 def _advice(reasons: Sequence[Reason]) -> str:
-    """Return what to do about the most severe reason, or about one that may cause all others."""
+    """Return the advice for the most severe reason, or for one that may cause all others."""
     by_code = {r.code: ADVICE.get(r.code, "") for r in ranked(reasons)}
     if "faulty_recording" in by_code:
         return "Correct the input as the inspection proposes."
     return by_code.get("calibration_alarm") or next(filter(None, by_code.values()), "")
 
 
-def bound(a: Accuracy, diagonal_m: float) -> str:
+def bound(accuracy: Accuracy, diagonal_m: float) -> str:
     """Return the accuracy of the poses as text: "±24 mm (95 %) over 6.2 m, 0.4 %".
 
     Parameters
     ----------
-    a
+    accuracy
         The accuracy.
     diagonal_m
         Diagonal of the model, m.
     """
-    if not a.assessed:
+    if not accuracy.assessed:
         return "accuracy not assessed"
-    if not np.isfinite(a.position_m):
+    if not np.isfinite(accuracy.position_m):
         return f"accuracy not bounded over {_extent(diagonal_m)}"
-    return f"±{length(a.position_m)} (95 %) over {_extent(diagonal_m)}, {100 * a.relative:.2g} %"
+    return (
+        f"±{length(accuracy.position_m)} (95 %) over {_extent(diagonal_m)}, "
+        f"{100 * accuracy.relative:.2g} %"
+    )
 
 
 def _extent(metres: float) -> str:
@@ -59,14 +62,16 @@ def _extent(metres: float) -> str:
     return f"{metres:.0f} m" if metres >= 100 else f"{metres:.3g} m"
 
 
-def weakest_frame(a: Accuracy) -> str:
-    """Return the frames with the largest pose error, and that; empty where not assessed."""
-    if a.unbounded:
-        where = runs_of(range(a.unbounded[0], a.unbounded[-1] + 1), a.unbounded)
-        return f"{in_words(where)}, not bounded"
-    if a.worst is None:
+def weakest_frame(accuracy: Accuracy) -> str:
+    """Return the frames with the largest pose error, and that error; empty if not assessed."""
+    if accuracy.unbounded:
+        ranges = runs_of(
+            range(accuracy.unbounded[0], accuracy.unbounded[-1] + 1), accuracy.unbounded
+        )
+        return f"{in_words(ranges)}, not bounded"
+    if accuracy.worst is None:
         return ""
-    return f"frame {a.worst.frame}, {length(a.worst.position_m)}"
+    return f"frame {accuracy.worst.frame}, {length(accuracy.worst.position_m)}"
 
 
 def length(metres: float) -> str:

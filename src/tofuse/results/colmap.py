@@ -13,7 +13,7 @@ from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
 from tofuse.results.posed_images import (
     ImageFolder,
     posed_images,
-    some_points,
+    subsampled_points,
 )
 
 # COLMAP's name of a lens model, and its parameters after fx, fy, cx, cy.
@@ -74,7 +74,7 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
     _write(
         sparse / "points3D.txt",
         "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]",
-        _points(*some_points(result)),
+        _points(*subsampled_points(result)),
     )
 
 

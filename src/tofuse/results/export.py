@@ -42,7 +42,7 @@ FACES = 60_000
 _MAX_BYTES = 8_000_000
 _VERTEX_BYTES, _FACE_BYTES, _OTHER_BYTES = 32, 12, 4096
 _QUALITIES = (92, 85, 75, 60, 40)
-# The layout of a texture for more faces would take minutes.
+# Texture layout takes minutes for more faces.
 _MAX_TEXTURED_FACES = 120_000
 _TEXTURE_SIZE = 2048
 
@@ -79,14 +79,14 @@ class _Result:
         ply = read_ply(path)
         faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
         normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
-        unknown = np.zeros(len(ply))
+        zeros = np.zeros(len(ply))
         return Mesh(
             ply.points.astype(np.float32),
             faces,
             normals,
             ply.color,
-            ply.scalars.get("sigma", unknown).astype(np.float32),
-            ply.scalars.get("views", unknown).astype(np.int32),
+            ply.scalars.get("sigma", zeros).astype(np.float32),
+            ply.scalars.get("views", zeros).astype(np.int32),
             np.zeros(3),
         )
 
@@ -99,19 +99,19 @@ class _Result:
     @cached_property
     def textured(self) -> GeometryRecord:
         """The simplified mesh, with its colours in a texture unless that takes too long."""
-        limit = self.faces or FACES
+        max_faces = self.faces or FACES
         if self.mesh.color is None or not len(self.mesh.faces):
-            return self.mesh.decimated(limit).record()
-        if min(limit, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
-            return self.mesh.decimated(limit).record()
-        found = baked(self.mesh, limit, _TEXTURE_SIZE)
-        rows = found.atlas.vertices
+            return self.mesh.decimated(max_faces).record()
+        if min(max_faces, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
+            return self.mesh.decimated(max_faces).record()
+        baked_mesh = baked(self.mesh, max_faces, _TEXTURE_SIZE)
+        vertex_rows = baked_mesh.atlas.vertices
         return GeometryRecord(
-            found.mesh.vertices[rows],
-            found.atlas.faces,
-            found.mesh.normals[rows],
-            uv=found.atlas.uv,
-            texture=_jpeg(found.image, len(rows), len(found.atlas.faces)),
+            baked_mesh.mesh.vertices[vertex_rows],
+            baked_mesh.atlas.faces,
+            baked_mesh.mesh.normals[vertex_rows],
+            uv=baked_mesh.atlas.uv,
+            texture=_jpeg(baked_mesh.image, len(vertex_rows), len(baked_mesh.atlas.faces)),
         )
 
     @cached_property
@@ -130,13 +130,13 @@ _SCALARS = ("views", "sigma")
 
 def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
     """The best JPEG that keeps a mesh of this size below `_MAX_BYTES`, or the smallest one."""
-    room = _MAX_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
-    picture = b""
+    max_bytes = _MAX_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
+    data = b""
     for quality in _QUALITIES:
-        picture = jpeg_bytes(image, quality)
-        if len(picture) <= room:
+        data = jpeg_bytes(image, quality)
+        if len(data) <= max_bytes:
             break
-    return picture
+    return data
 
 
 def _cloud(result: _Result, path: Path) -> None:
@@ -171,7 +171,7 @@ FOLDERS = {
 
 
 def foreign(folder: Path) -> tuple[str, ...]:
-    """Return names in an export folder that no export wrote; its own name if it is no folder."""
+    """Return names in an export folder that no export wrote; the folder's name if it is none."""
     if folder.is_symlink() or not folder.is_dir():
         return (folder.name,)
     return tuple(sorted({p.name for p in folder.iterdir()} - FOLDERS[folder.name]))
@@ -180,18 +180,18 @@ def foreign(folder: Path) -> tuple[str, ...]:
 @contextmanager
 def _folder(path: Path) -> Iterator[Path]:
     """Yield a new folder that then replaces an earlier export in its place."""
-    if os.path.lexists(path) and (others := foreign(path)):
+    if os.path.lexists(path) and (unexpected := foreign(path)):
         raise OutputError(
-            f"contains {others[0]}, which is not part of an export",
+            f"contains {unexpected[0]}, which is not part of an export",
             where=path,
             remedy="move it away, or pass another --out",
         )
-    made = path.with_name(f".{path.name}-{os.getpid()}")
-    with new_folder(made) as folder:
+    staged = path.with_name(f".{path.name}-{os.getpid()}")
+    with new_folder(staged) as folder:
         yield folder
     try:
         shutil.rmtree(path, ignore_errors=True)
-        os.replace(made, path)
+        os.replace(staged, path)
     except OSError as error:
         raise output_error(error, path) from error
 
@@ -284,9 +284,9 @@ def export(
         raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
-        known = ", ".join(FORMATS)
+        available = ", ".join(FORMATS)
         raise InputError(
-            f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {known}"
+            f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {available}"
         )
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}

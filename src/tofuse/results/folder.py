@@ -1,6 +1,6 @@
 """The output folder of a run: locked first, staged inside, moved into place at the end.
 
-Nothing in a folder is touched before it is known to contain an earlier result. One process at a
+A folder is not modified before it is known to contain an earlier result. One process at a
 time may write into it. A process that is stopped while it moves a result into place leaves a plan
 by which the next one, reading or writing, finishes the moves (`files.moving`).
 """
@@ -65,11 +65,11 @@ FILES = (
     "trajectory.kitti.txt",
     "trajectory.log",
 )
-# Large surfaces are in tiles, in a folder of their own (`results.tiles`).
+# Large surfaces are in tiles, in their own folder (`results.tiles`).
 TILES, TILESET = "tiles", "tileset.json"
 _TILES = Names(frozenset({TILESET}), more=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII))
 _WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
-# A component with its own model has it in a folder, with the same files.
+# The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
 
 
@@ -128,13 +128,13 @@ class OutputFolder:
         self._contract = contract or RESULT
         self._names = self._contract.names
         self._staging = self.path / STAGING
-        self._made: list[Path] = []
+        self._created: list[Path] = []
         self._claim: Claim | None = None
         self._entered = False
         try:
-            # Before anything is touched, and again under the lock.
+            # Before any change, and again under the lock.
             _check_content(self.path, self._contract, overwrite)
-            self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
+            self._created = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
             self._claim = Claim(self.path / LOCK, what=self.path)
             _recover(self.path, self._contract)
@@ -199,7 +199,7 @@ class OutputFolder:
                 self._claim.release()
                 self._claim = None
         with contextlib.suppress(OSError):
-            for folder in self._made:
+            for folder in self._created:
                 folder.rmdir()
 
 
@@ -229,7 +229,7 @@ def check_output(path: str | Path, *, overwrite: bool) -> None:
 
 
 def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
-    """Refuse a folder with anything but a result that may be replaced."""
+    """Reject a folder with anything but a result that may be replaced."""
     staging = path / STAGING
     if path.exists() and not path.is_dir():
         raise OutputError("is a file", where=path, remedy="pass a folder as --out")
@@ -275,8 +275,8 @@ def claimed(folder: Path) -> Iterator[None]:
     OutputError
         If another process writes into it, or it can't be written.
     """
-    place = lock_folder(folder)
-    claim = Claim(place / LOCK, what=place)
+    locked = lock_folder(folder)
+    claim = Claim(locked / LOCK, what=locked)
     try:
         yield
     finally:

@@ -38,7 +38,7 @@ from tofuse.results.types import (
 def load_result(folder: str | Path) -> Reconstruction:
     """Read the output folder of a run.
 
-    Not stored, and so empty: poses before loop closure (NaN), the values of the optimiser's
+    Empty, as they are not stored: poses before loop closure (NaN), the values of the optimiser's
     objective, the refinement, sample images, and the model before optimisation.
 
     Raises
@@ -105,9 +105,9 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
 
 def _frame(data: dict[str, Any]) -> FrameRecord:
     unobservable = np.array(data["unobservable"], float).reshape(-1, 6)
-    known = {"covariance": frame_covariance(data)}
+    covariance = {"covariance": frame_covariance(data)}
     stated = {name: data[name] for name in data if name != "session"}
-    return FrameRecord(**{**stated, **known, "unobservable": unobservable})
+    return FrameRecord(**{**stated, **covariance, "unobservable": unobservable})
 
 
 def _session(data: dict[str, Any]) -> SessionRecord:
@@ -147,12 +147,12 @@ def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
 
 def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
     T = data["T_main_component"]
-    own = folder / component_name(number)
+    component_folder = folder / component_name(number)
     return Component(
         tuple((a, b) for a, b in data["frames"]),
         None if T is None else np.array(T, float).reshape(4, 4),
         data["joined"],
-        load_result(own) if T is None and is_result(own) else None,
+        load_result(component_folder) if T is None and is_result(component_folder) else None,
     )
 
 

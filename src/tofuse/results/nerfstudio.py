@@ -23,7 +23,7 @@ from tofuse.results.posed_images import (
     SIGMA_UNIT_M,
     ImageFolder,
     posed_images,
-    some_points,
+    subsampled_points,
 )
 
 _FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGMA}
@@ -67,31 +67,31 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     images.finish()
     if not frames:
         raise InputError("has no readable frame with a pose", where=result)
-    about: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
-    if any(each["camera_model"] != about["camera_model"] for each in lenses):
+    header: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
+    if any(camera["camera_model"] != header["camera_model"] for camera in lenses):
         raise InputError(
             "mixes fisheye and other lenses, which this format does not support",
             where=result,
             remedy="export the results of the recordings one by one",
         )
-    if all(each == lenses[0] for each in lenses):
-        about = lenses[0]
+    if all(camera == lenses[0] for camera in lenses):
+        header = lenses[0]
     else:
-        for frame, each in zip(frames, lenses, strict=True):
-            frame |= {key: value for key, value in each.items() if key != "camera_model"}
+        for frame, camera in zip(frames, lenses, strict=True):
+            frame |= {key: value for key, value in camera.items() if key != "camera_model"}
     if images.masked:
         for frame in frames:
             frame["mask_path"] = f"{MASKS}/{Path(frame['file_path']).name}"
-    about |= {
+    header |= {
         "depth_unit_scale_factor": DEPTH_UNIT_M,
         "integer_depth_scale": DEPTH_UNIT_M,
         "sigma_unit_scale_factor": SIGMA_UNIT_M,
         "ply_file_path": "points.ply",
     }
-    points, color = some_points(result)
+    points, color = subsampled_points(result)
     write_ply(folder / "points.ply", GeometryRecord(points, color=color))
-    about |= {"frames": []}
-    text = json.dumps(about, indent=1, allow_nan=False).removesuffix("[]\n}")
+    header |= {"frames": []}
+    text = json.dumps(header, indent=1, allow_nan=False).removesuffix("[]\n}")
     lines = ",\n  ".join(json.dumps(frame, allow_nan=False) for frame in frames)
     write_text(folder / "transforms.json", f"{text}[\n  {lines}\n ]\n}}\n")
 

@@ -46,7 +46,7 @@ def write_result(
     result
         The result.
     folder
-        Where to; existing files are replaced together, once all new ones are complete.
+        The output folder; existing files are replaced together, when all new ones are complete.
     report
         Writes the report of a result into a folder; None: no report.
     texture
@@ -60,9 +60,9 @@ def write_result(
     with folder.staging() as staging:
         for number, component in enumerate(result.components):
             if component.result is not None and not component.connected:
-                own = staging / component_name(number)
-                own.mkdir()
-                _write_files(component.result, own, report, None)
+                component_folder = staging / component_name(number)
+                component_folder.mkdir()
+                _write_files(component.result, component_folder, report, None)
         _write_files(result, staging, report, texture)
 
 
@@ -98,27 +98,27 @@ def _write_model(
             | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
         ),
     )
-    tiled = None
+    tiling = None
     if result.mesh is not None:
-        tiled = _write_mesh(result.mesh, result, folder, texture)
-    if tiled is not None and importlib.util.find_spec("lazrs") is not None:
+        tiling = _write_mesh(result.mesh, result, folder, texture)
+    if tiling is not None and importlib.util.find_spec("lazrs") is not None:
         cloud.save(folder / "cloud.laz")
     if result.changes:
         _write_changes(result, folder / "changes.ply")
-    return tiled
+    return tiling
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
     """Write the surfaces that changed between sessions, in the colours of `CHANGE_COLORS`."""
-    found = [c.change for c in result.changes]
-    counts = [len(change.points) for change in found]
-    colors = np.array([CHANGE_COLORS[change.kind] for change in found], np.uint8)
+    changes = [c.change for c in result.changes]
+    counts = [len(change.points) for change in changes]
+    colors = np.array([CHANGE_COLORS[change.kind] for change in changes], np.uint8)
     write_ply(
         path,
         GeometryRecord(
-            np.concatenate([change.points for change in found]).astype(np.float32),
+            np.concatenate([change.points for change in changes]).astype(np.float32),
             color=np.repeat(colors, counts, axis=0),
-            scalars={"change": np.repeat(np.arange(len(found), dtype=np.int32), counts)},
+            scalars={"change": np.repeat(np.arange(len(changes), dtype=np.int32), counts)},
         ),
     )
 
@@ -143,23 +143,23 @@ def _write_mesh(
     )
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
-    tiled = None
+    tiling = None
     if len(mesh.faces) > tiles.MAX_UNTILED_FACES:
-        tiled = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
+        tiling = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
     if texture is None:
-        shown = tiles.overview(mesh) if tiled is None else tiled.overview
+        displayed = tiles.overview(mesh) if tiling is None else tiling.overview
         write_glb(
             folder / "mesh.glb",
             GeometryRecord(
-                shown.vertices,
-                shown.faces,
-                normals=shown.normals,
-                color=None if shown.color is None else seen_colors(shown.color),
+                displayed.vertices,
+                displayed.faces,
+                normals=displayed.normals,
+                color=None if displayed.color is None else seen_colors(displayed.color),
             ),
             generator=generator,
             **upright,
         )
-        return tiled
+        return tiling
     atlas, image = texture.atlas, png_bytes(texture.image)
     points, normals = (
         values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
@@ -175,4 +175,4 @@ def _write_mesh(
         folder / "mesh.obj",
         GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
     )
-    return tiled
+    return tiling

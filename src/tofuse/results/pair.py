@@ -95,19 +95,19 @@ class PairResult:
     @property
     def runner_up(self) -> Float64 | None:
         """(4, 4) T_target_source of the best rival pose; None where there is none."""
-        other = self.found.runner_up
-        return None if other is None else self.in_files(other)
+        T_rival = self.found.runner_up
+        return None if T_rival is None else self.in_files(T_rival)
 
     @property
     def runner_up_distance(self) -> tuple[float, float] | None:
         """Distance of the runner-up at the source's median point (m), and its angle (rad)."""
-        other = self.found.runner_up
-        if other is None:
+        T_rival = self.found.runner_up
+        if T_rival is None:
             return None
         T = self.found.T_target_source
-        median = np.median(self.source.frame.points.astype(float), axis=0)[None]
-        step = se3.transform(other, median) - se3.transform(T, median)
-        return float(np.linalg.norm(step)), float(se3.angle(se3.inverse(T) @ other))
+        center = np.median(self.source.frame.points.astype(float), axis=0)[None]
+        displacement = se3.transform(T_rival, center) - se3.transform(T, center)
+        return float(np.linalg.norm(displacement)), float(se3.angle(se3.inverse(T) @ T_rival))
 
     @cached_property
     def lever_m(self) -> float:
@@ -131,12 +131,14 @@ class PairResult:
         covariance = self._observed_covariance
         if covariance is None:
             return None, None
-        worst = [float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_MOVE, _TURN)]
-        # In metres both are of similar size; one that is negligible is only rounding error.
-        limit = 1e-12 * max(worst[0], worst[1] * self.lever_m**2)
-        known = worst[0] > limit, worst[1] * self.lever_m**2 > limit
-        move, turn = (float(np.sqrt(max(value, 0.0))) for value in worst)
-        return move if known[0] else None, turn if known[1] else None
+        variances = [
+            float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_TRANSLATION, _ROTATION)
+        ]
+        # In metres both are of similar size; a negligible one is rounding error.
+        limit = 1e-12 * max(variances[0], variances[1] * self.lever_m**2)
+        significant = variances[0] > limit, variances[1] * self.lever_m**2 > limit
+        sigma_m, sigma_rad = (float(np.sqrt(max(value, 0.0))) for value in variances)
+        return sigma_m if significant[0] else None, sigma_rad if significant[1] else None
 
     @property
     def _observed_covariance(self) -> Float64 | None:
@@ -155,22 +157,24 @@ class PairResult:
         values, vectors = np.linalg.eigh(basis.T @ scaled @ basis)
         if not values[0] > 1e-12 * values[-1]:
             return None
-        half = basis @ vectors / np.sqrt(values)
-        return half @ half.T / np.outer(units, units)
+        root = basis @ vectors / np.sqrt(values)
+        return root @ root.T / np.outer(units, units)
 
     @cached_property
     def free_motions(self) -> tuple[Float64, Float64]:
         """Unobservable directions: axes (a, 3) of translations, and axes (b, 3) of rotations."""
-        free = np.asarray(self.found.unobservable, float).reshape(-1, 6)
-        if not len(free):
+        directions = np.asarray(self.found.unobservable, float).reshape(-1, 6)
+        if not len(directions):
             return np.zeros((0, 3)), np.zeros((0, 3))
         # An orthonormal basis in metres, with as many pure translations as possible.
-        _, s, vt = np.linalg.svd(free * np.array([1, 1, 1, *[self.lever_m] * 3]))
+        _, s, vt = np.linalg.svd(directions * np.array([1, 1, 1, *[self.lever_m] * 3]))
         basis = vt[: int((s > 1e-9 * s[0]).sum())]
-        u, turn, _ = np.linalg.svd(basis[:, 3:])
+        u, rotations, _ = np.linalg.svd(basis[:, 3:])
         basis = u.T @ basis
-        turns = np.concatenate([turn, np.zeros(len(basis))])[: len(basis)] > _MAX_ROTATION
-        return _unit(basis[~turns, :3]), _unit(basis[turns, 3:])
+        is_rotation = (
+            np.concatenate([rotations, np.zeros(len(basis))])[: len(basis)] > _MAX_ROTATION
+        )
+        return _unit(basis[~is_rotation, :3]), _unit(basis[is_rotation, 3:])
 
     def aligned(self) -> Float64:
         """(N, 3) points of the source in the coordinates of the target's file, m."""
@@ -180,8 +184,8 @@ class PairResult:
         return points + self.target.center
 
 
-_MOVE, _TURN = slice(0, 3), slice(3, 6)
-# A free direction with less rotation, as a fraction of the whole, counts as a translation.
+_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
+# A free direction with a smaller fraction of rotation counts as a translation.
 _MAX_ROTATION = 0.4
 
 
@@ -191,7 +195,7 @@ def _unit(vectors: Float64) -> Float64:
 
 def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null where unknown."""
-    found = result.found
+    registration = result.found
     sigma_m, sigma_rad = result.sigma
     covariance = result.covariance
     data: dict[str, Any] = plain(
@@ -202,25 +206,25 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "target": _view_json(result.target),
             "guess": result.guess,
             "T_target_source": result.T_target_source,
-            "believed": found.believed,
-            "probability": found.probability,
-            "reason": found.reason,
-            "converged": found.converged,
-            "overlap": found.overlap,
-            "support": found.support,
-            "contradiction": found.contradiction,
-            "margin": found.margin,
+            "believed": registration.believed,
+            "probability": registration.probability,
+            "reason": registration.reason,
+            "converged": registration.converged,
+            "overlap": registration.overlap,
+            "support": registration.support,
+            "contradiction": registration.contradiction,
+            "margin": registration.margin,
             "runner_up": result.runner_up,
-            "unobservable": found.unobservable,
+            "unobservable": registration.unobservable,
             "covariance": None if covariance is None else covariance.ravel(),
             "sigma_m": sigma_m,
             "sigma_rad": sigma_rad,
-            "information": np.asarray(found.information).ravel(),
+            "information": np.asarray(registration.information).ravel(),
             "reference_point_m": result.source.center,
-            "rms_m": found.rms_m,
-            "correspondences": found.correspondences,
-            "points": found.points,
-            "iterations": found.iterations,
+            "rms_m": registration.rms_m,
+            "correspondences": registration.correspondences,
+            "points": registration.points,
+            "iterations": registration.iterations,
             "seconds": round(result.seconds, 4),
             "warnings": [*result.source.view.warnings, *result.target.view.warnings],
         }
@@ -263,7 +267,7 @@ def write_pair(
     result
         The registration.
     folder
-        Where to.
+        The output folder.
     report
         Writes the report of a registration to a path.
 

@@ -1,4 +1,4 @@
-"""The images of a result with their poses, for programs that take both as input."""
+"""The images of a result with their poses, as input for other programs."""
 
 from __future__ import annotations
 
@@ -70,7 +70,9 @@ class PosedImage:
         return f"frame_{self.index:06d}.png"
 
 
-def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> Iterator[PosedImage]:
+def posed_images(
+    folder: Path, every: int, is_supported: Callable[[Camera], bool]
+) -> Iterator[PosedImage]:
     """Yield the images of the main model of a result, in order.
 
     Frames that can't be read, or have neither colour nor amplitude, are left out. Colour that is
@@ -82,7 +84,7 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
         The result.
     every
         Every n-th of the frames with a pose.
-    suits
+    is_supported
         Whether the target format supports a camera's lens model; others are rectified.
 
     Raises
@@ -93,21 +95,21 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
     """
     run = read_run_json(folder / "run.json")
     indices, poses = main_poses(folder, run)
-    chosen = dict(zip(indices[::every], poses[::every], strict=True))
+    selected = dict(zip(indices[::every], poses[::every], strict=True))
     with run_json_checked(folder / "run.json"):
         covariances = {
-            f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in chosen
+            f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in selected
         }
         parts = list(stored_recordings(folder, run))
         correctors = [CameraErrors.made_with(part.config) for part in parts]
     skipped: list[str] = []
     n_images = 0
-    for part, applied in zip(parts, correctors, strict=True):
+    for part, frame_correctors in zip(parts, correctors, strict=True):
         recording = reopen(part, folder)
         renderer = _ImageRenderer(recording)
         camera: Camera | None = None
         rectifier: Rectifier | None = None
-        for frame in _frames(part, recording, chosen, applied):
+        for frame in _frames(part, recording, selected, frame_correctors):
             image = renderer.image(frame)
             if image is None:
                 skipped.append(f"{recording.path}: frame {frame.index}")
@@ -115,24 +117,28 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
             frame = replace(frame, sigma_image=renderer.noise.sigma(frame), color_image=image)
             if rectifier is None or frame.camera != camera:
                 camera = frame.camera
-                rectifier = Rectifier(_image_camera(camera, suits))
-            seen = rectifier(frame)
+                rectifier = Rectifier(_image_camera(camera, is_supported))
+            rectified = rectifier(frame)
             image_camera = rectifier.pinhole
-            if image_camera == camera and (whole := _full_color(recording, frame)) is not None:
-                image_camera = scaled(image_camera, whole.shape[1], whole.shape[0])
-                image = whole
+            if image_camera == camera and (full_color := _full_color(recording, frame)) is not None:
+                image_camera = scaled(image_camera, full_color.shape[1], full_color.shape[0])
+                image = full_color
             else:
-                assert seen.color_image is not None
-                image = seen.color_image
+                assert rectified.color_image is not None
+                image = rectified.color_image
             index = part.first + frame.index
-            assert seen.sigma_image is not None
+            assert rectified.sigma_image is not None
             yield PosedImage(
                 index,
-                seen,
+                rectified,
                 image_camera,
                 image,
-                np.where(seen.valid, seen.sigma_image / ray_lengths(seen.camera), np.float32(0)),
-                chosen[index],
+                np.where(
+                    rectified.valid,
+                    rectified.sigma_image / ray_lengths(rectified.camera),
+                    np.float32(0),
+                ),
+                selected[index],
                 covariances.get(index),
             )
             n_images += 1
@@ -147,12 +153,12 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
 def _frames(
     part: StoredRecording,
     recording: Recording,
-    chosen: dict[int, Float64],
+    selected: dict[int, Float64],
     correctors: Sequence[Corrector],
 ) -> Iterator[RangeFrame]:
     """The chosen readable frames of a recording, with the camera as it was calibrated."""
-    wanted = [k + part.first in chosen for k in recording.indices.tolist()]
-    recording = replace(recording, indices=recording.indices[wanted])
+    is_selected = [k + part.first in selected for k in recording.indices.tolist()]
+    recording = replace(recording, indices=recording.indices[is_selected])
     for item in recording.read_all():
         if isinstance(item, UnreadableFrameError):
             continue
@@ -166,25 +172,25 @@ def _frames(
         yield frame
 
 
-def _image_camera(camera: Camera, suits: Callable[[Camera], bool]) -> Pinhole:
-    """The camera itself if it suits, else a pinhole camera that replaces it."""
-    return camera if isinstance(camera, Pinhole) and suits(camera) else pinhole_of(camera)
+def _image_camera(camera: Camera, is_supported: Callable[[Camera], bool]) -> Pinhole:
+    """The camera itself if it is supported, else an equivalent pinhole camera."""
+    return camera if isinstance(camera, Pinhole) and is_supported(camera) else pinhole_of(camera)
 
 
 def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
-    """The colour of a frame at its recorded resolution; None where that is not above depth's."""
+    """The colour of a frame at its recorded resolution; None if that is not above that of depth."""
     source = recording.source
     if frame.color_image is None or not isinstance(source, FileSource):
         return None
     try:
-        whole = source.whole_color(frame.index)
+        color = source.whole_color(frame.index)
     except InputError:
         return None
-    return None if whole is None or len(whole) <= len(frame.color_image) else whole
+    return None if color is None or len(color) <= len(frame.color_image) else color
 
 
 class _ImageRenderer:
-    """Renders the frames of one recording, with the same white level, and knows their noise."""
+    """Renders the frames of one recording with a common white level, and has its noise model."""
 
     def __init__(self, recording: Recording) -> None:
         self.noise = noise_model_for(recording)
@@ -220,7 +226,7 @@ class ImageFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._whole: list[tuple[str, tuple[int, int]]] = []
+        self._unmasked: list[tuple[str, tuple[int, int]]] = []
         self.masked = False
 
     def write(self, posed: PosedImage) -> None:
@@ -228,16 +234,16 @@ class ImageFolder:
         self._png(IMAGES, posed.name, posed.image)
         self._png(DEPTH, posed.name, _counts(posed.frame.depth, DEPTH_UNIT_M))
         self._png(SIGMA, posed.name, _counts(posed.sigma, SIGMA_UNIT_M))
-        known = posed.image.any(-1)
-        if known.all():
-            self._whole.append((posed.name, known.shape))
+        valid = posed.image.any(-1)
+        if valid.all():
+            self._unmasked.append((posed.name, valid.shape))
         else:
             self.masked = True
-            self._png(MASKS, posed.name, np.where(known, 255, 0).astype(np.uint8))
+            self._png(MASKS, posed.name, np.where(valid, 255, 0).astype(np.uint8))
 
     def finish(self) -> None:
         """Write masks for the other frames as well, if any frame has one."""
-        for name, shape in self._whole if self.masked else ():
+        for name, shape in self._unmasked if self.masked else ():
             self._png(MASKS, name, np.full(shape, 255, np.uint8))
 
     def _png(self, kind: str, name: str, image: NDArray[Any]) -> None:
@@ -250,8 +256,8 @@ def _counts(metres: Float32, unit_m: float) -> UInt16:
     return np.where(counts < _MAX_COUNT, counts, 0).astype(np.uint16)
 
 
-def some_points(folder: Path) -> tuple[Float32, UInt8]:
-    """Return evenly chosen points (N, 3) of the cloud of a result, and their colours (N, 3)."""
+def subsampled_points(folder: Path) -> tuple[Float32, UInt8]:
+    """Return evenly sampled points (N, 3) of a result's cloud, and their colours (N, 3)."""
     ply = read_ply(folder / "cloud.ply")
     step = max(1, -(-len(ply) // _MAX_POINTS))
     points = ply.points[::step].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Ranges of frame indices, both ends included: made, merged, and written as text."""
+"""Ranges of frame indices, both ends included: creation, union, and text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 Range = tuple[int, int]
 
-# Nobody reads a line with more ranges; `run.json` has them all.
+# Maximum number of ranges in a line of text; `run.json` has them all.
 _LISTED = 6
 
 
@@ -26,17 +26,17 @@ def runs(frames: Sequence[int], marked: Sequence[bool]) -> tuple[Range, ...]:
     marked
         One for each of them.
     """
-    has = np.array([False, *marked, False], bool)
-    edges = np.flatnonzero([a != b for a, b in pairwise(has)])
+    padded = np.array([False, *marked, False], bool)
+    edges = np.flatnonzero([a != b for a, b in pairwise(padded)])
     return tuple(
         (int(frames[a]), int(frames[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
     )
 
 
-def runs_of(frames: Sequence[int], chosen: Collection[int]) -> tuple[Range, ...]:
-    """Return the runs, as `runs` does, of those among `frames` whose index is in `chosen`."""
-    indices = set(chosen)
-    return runs(frames, [k in indices for k in frames])
+def runs_of(frames: Sequence[int], selected: Collection[int]) -> tuple[Range, ...]:
+    """Return the runs (see `runs`) of those `frames` whose index is in `selected`."""
+    selected_set = set(selected)
+    return runs(frames, [k in selected_set for k in frames])
 
 
 def union(ranges: Iterable[Range]) -> tuple[Range, ...]:
@@ -66,9 +66,9 @@ def numbers(ranges: Sequence[Range]) -> str:
 
 def in_words(ranges: Sequence[Range]) -> str:
     """Return "frame 20" or "frames 3-9, 20, 31-34"."""
-    return f"{'frame' if is_one(ranges) else 'frames'} {numbers(ranges)}"
+    return f"{'frame' if is_single(ranges) else 'frames'} {numbers(ranges)}"
 
 
-def is_one(ranges: Sequence[Range]) -> bool:
+def is_single(ranges: Sequence[Range]) -> bool:
     """Whether the ranges are a single frame, for the verb that follows."""
     return len(ranges) == 1 and ranges[0][0] == ranges[0][1]

@@ -66,34 +66,34 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
     times = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
     if not times:
         raise ValueError("no frames")
-    several = run.get("sessions") or []
-    alone = {
+    sessions = run.get("sessions") or []
+    single = {
         "name": folder.resolve().name,
         "opening": run["input"]["opening"] or _opening_of_path(run["input"]),
         "config": run["config"],
         "first": 0,
         "count": max(times) + 1,
     }
-    for part in several or [alone]:
+    for part in sessions or [single]:
         first, count = int(part["first"]), int(part["count"])
-        mine = {k - first: t for k, t in times.items() if first <= k < first + count}
+        part_times = {k - first: t for k, t in times.items() if first <= k < first + count}
         yield StoredRecording(
             str(part["name"]),
             Opening.from_dict(part["opening"], folder / "run.json"),
             dict(part["config"]),
             first,
-            None if several else mine,
-            list(mine),
+            None if sessions else part_times,
+            list(part_times),
         )
 
 
-def _opening_of_path(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """How to open the recording of a result written from Python, which states only its path."""
-    return Opening((Path(stated["path"]),)).to_dict()
+def _opening_of_path(recording: Mapping[str, Any]) -> dict[str, Any]:
+    """Return how to open the recording of a result written from Python: only its path is stored."""
+    return Opening((Path(recording["path"]),)).to_dict()
 
 
 def locate_recording(opening: Opening, folder: Path) -> Opening:
-    """Return where a recording is: at the stated path, or next to its result, as of the demo."""
+    """Return the location of a recording: the stored path, or next to its result (demo)."""
     next_to_result = folder / RECORDING
     if all(path.exists() for path in opening.paths) or not next_to_result.is_dir():
         return opening
@@ -126,13 +126,13 @@ def reopen(part: StoredRecording, folder: Path) -> Recording:
                 remedy="put it back, or run `tofuse run` again",
             )
     recording = opening.open()
-    chosen = np.isin(recording.indices, part.frames)
-    same = int(chosen.sum()) == len(part.frames)
-    recording = replace(recording, indices=recording.indices[chosen])
-    if same and part.times is not None:
+    is_part = np.isin(recording.indices, part.frames)
+    matches = int(is_part.sum()) == len(part.frames)
+    recording = replace(recording, indices=recording.indices[is_part])
+    if matches and part.times is not None:
         times = np.array([part.times[k] for k in recording.indices.tolist()])
-        same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_MAX_TIME_DIFFERENCE))
-    if not same:
+        matches = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_MAX_TIME_DIFFERENCE))
+    if not matches:
         raise InputError(
             f"does not match the frames of {recording.path}, which has changed",
             where=folder,

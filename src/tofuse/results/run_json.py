@@ -1,4 +1,4 @@
-"""`run.json`: its content, how it is written, and what other commands read from it."""
+"""`run.json`: its content, writing, and reading by other commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tofuse.results.tiles import TilingSummary
 from tofuse.results.types import Component, FrameRecord, Reason, Reconstruction, SelfCalibration
 
 
-def write_run_json(path: Path, result: Reconstruction, tiled: TilingSummary | None = None) -> None:
+def write_run_json(path: Path, result: Reconstruction, tiling: TilingSummary | None = None) -> None:
     """Write `run.json`, schema 1: SI units and radians, null instead of NaN.
 
     It is written frame by frame, as all frames of a long recording would need much memory.
@@ -36,15 +36,15 @@ def write_run_json(path: Path, result: Reconstruction, tiled: TilingSummary | No
         The new file.
     result
         The result.
-    tiled
+    tiling
         Summary of its tiles, if it has any.
     """
     with path.open("w", encoding="utf-8") as file:
         file.write("{")
-        comma = ""
-        for key, value in _content(result, tiled).items():
-            file.write(f'{comma}\n "{key}": ')
-            comma = ","
+        separator = ""
+        for key, value in _content(result, tiling).items():
+            file.write(f'{separator}\n "{key}": ')
+            separator = ","
             if isinstance(value, Iterator):
                 _write_rows(file, value)
             else:
@@ -53,12 +53,12 @@ def write_run_json(path: Path, result: Reconstruction, tiled: TilingSummary | No
 
 
 def _write_rows(file: TextIO, rows: Iterator[Any]) -> None:
-    """Write a JSON list at the first level, each item as it comes."""
-    before = "["
+    """Write a JSON list at the first level, item by item."""
+    separator = "["
     for row in rows:
-        file.write(f"{before}\n  {_indented(row, 2)}")
-        before = ","
-    file.write("[]" if before == "[" else "\n ]")
+        file.write(f"{separator}\n  {_indented(row, 2)}")
+        separator = ","
+    file.write("[]" if separator == "[" else "\n ]")
 
 
 def _indented(value: Any, level: int) -> str:
@@ -67,7 +67,7 @@ def _indented(value: Any, level: int) -> str:
     return text.replace("\n", "\n" + level * " ")
 
 
-def _content(result: Reconstruction, tiled: TilingSummary | None) -> dict[str, Any]:
+def _content(result: Reconstruction, tiling: TilingSummary | None) -> dict[str, Any]:
     """Return the content; that of `frames` is an iterator."""
     d = result.diagnostics
     return {
@@ -89,7 +89,7 @@ def _content(result: Reconstruction, tiled: TilingSummary | None) -> dict[str, A
         "reasons": reasons_json(d.reasons),
         "frames": (_frame(f, result) for f in d.frames),
         "T_up_world": result.T_up_world,
-        "tiles": _tiles(tiled),
+        "tiles": _tiles(tiling),
         "rig": result.recording.get("rig"),
         "components": [_component(c) for c in result.components],
         "sessions": [
@@ -172,16 +172,16 @@ def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
     }
 
 
-def _tiles(tiled: TilingSummary | None) -> dict[str, Any] | None:
+def _tiles(tiling: TilingSummary | None) -> dict[str, Any] | None:
     """The summary of the tiles; None without tiles."""
-    if tiled is None:
+    if tiling is None:
         return None
     return {
         "tileset": f"{TILES}/{TILESET}",
-        "levels": tiled.levels,
-        "tiles": tiled.tiles,
-        "faces": tiled.faces,
-        "overview_faces": len(tiled.overview.faces),
+        "levels": tiling.levels,
+        "tiles": tiling.tiles,
+        "faces": tiling.faces,
+        "overview_faces": len(tiling.overview.faces),
     }
 
 
@@ -256,31 +256,31 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
     }
 
 
-def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
+def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
     """The self-calibration; None where there was none."""
-    if found is None:
+    if calibration is None:
         return None
     return {
-        "focal": found.focal,
-        "offset_m": found.offset_m,
-        "sigma": dict(found.sigmas),
-        "stated_bound_m": found.bound_m[0],
-        "corrected_bound_m": found.bound_m[1],
+        "focal": calibration.focal,
+        "offset_m": calibration.offset_m,
+        "sigma": dict(calibration.sigmas),
+        "stated_bound_m": calibration.bound_m[0],
+        "corrected_bound_m": calibration.bound_m[1],
     }
 
 
-def _suspicion(s: CalibrationCheck | None) -> dict[str, Any] | None:
+def _suspicion(check: CalibrationCheck | None) -> dict[str, Any] | None:
     """The check of the camera's calibration; None where it was not made."""
-    if s is None:
+    if check is None:
         return None
-    gap = s.gap
+    gap = check.gap
     return {
-        "alarm": s.alarm,
-        "camera": s.errors,
-        "sigma": s.sigmas,
-        "focal_sigma": s.focal_sigma,
-        "focal_motion_m": 0.01 * s.motion["focal"][0] if s.motion else None,
-        "support": s.support,
+        "alarm": check.alarm,
+        "camera": check.errors,
+        "sigma": check.sigmas,
+        "focal_sigma": check.focal_sigma,
+        "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
+        "support": check.support,
         "loop": None
         if gap is None
         else {
@@ -301,8 +301,10 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        whole = value.dtype.kind in "iub" or (value.dtype.kind == "f" and np.isfinite(value).all())
-        return value.tolist() if whole else plain(value.tolist())
+        is_finite = value.dtype.kind in "iub" or (
+            value.dtype.kind == "f" and np.isfinite(value).all()
+        )
+        return value.tolist() if is_finite else plain(value.tolist())
     if isinstance(value, np.generic):
         return plain(value.item())
     if isinstance(value, float) and not np.isfinite(value):
@@ -344,8 +346,8 @@ def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
 
 def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:
     """Return the (6, 6) covariance of the pose of an entry of `frames`; None if it is unknown."""
-    stated = frame["covariance"]
-    C = None if stated is None else np.array(stated, float).reshape(6, 6)
+    values = frame["covariance"]
+    C = None if values is None else np.array(values, float).reshape(6, 6)
     return None if C is None or not np.isfinite(C).all() else C
 
 

@@ -1,4 +1,4 @@
-"""Small images of some frames, taken during a run, so that nothing has to be decoded again."""
+"""Small images of some frames, taken during a run, so that no frame is decoded again."""
 
 from __future__ import annotations
 
@@ -54,19 +54,19 @@ class FrameSample:
             The same frame after the filters of tracking, and after those of the model.
         """
         step = -(-frame.depth.shape[1] // MAX_WIDTH)
-        thin = (slice(None, None, step), slice(None, None, step))
-        fate = np.where(frame.valid[thin], REMOVED, NOTHING).astype(np.uint8)
-        fate[tracked.valid[thin]] = TRACKED
-        fate[kept.valid[thin]] = KEPT
-        # Averaging would invent depths between an edge and what is behind it.
-        depth = np.minimum(frame.z[thin], 6e4).astype(np.float16)
+        subset = (slice(None, None, step), slice(None, None, step))
+        fate = np.where(frame.valid[subset], REMOVED, NOTHING).astype(np.uint8)
+        fate[tracked.valid[subset]] = TRACKED
+        fate[kept.valid[subset]] = KEPT
+        # Averaging would create depths between an edge and its background.
+        depth = np.minimum(frame.z[subset], 6e4).astype(np.float16)
         amplitude, color = frame.amplitude_image, frame.color_image
         return cls(
             frame.index,
             depth,
             fate,
-            None if amplitude is None else amplitude[thin].copy(),
-            None if color is None else color[thin].copy(),
+            None if amplitude is None else amplitude[subset].copy(),
+            None if color is None else color[subset].copy(),
         )
 
 
@@ -98,5 +98,5 @@ class FrameSamples:
     @property
     def all(self) -> tuple[FrameSample, ...]:
         """All samples, in the order of their frames."""
-        both = {sample.index: sample for sample in (*self._even, *self._lost)}
-        return tuple(both[index] for index in sorted(both))
+        samples = {sample.index: sample for sample in (*self._even, *self._lost)}
+        return tuple(samples[index] for index in sorted(samples))

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from tofuse.results.types import Reconstruction, SessionPair
 
-# No model of probabilities can be trusted beyond this.
+# Higher probabilities can't be justified by any model.
 MAX_STATED_PROBABILITY = 0.999
 
 
 def session_sentences(result: Reconstruction) -> list[str]:
     """Return a sentence for each pair of joined sessions, and for each that was not joined."""
     names = [session.name for session in result.sessions]
-    found = []
+    sentences = []
     for pair in result.session_pairs:
         if not pair.joined:
             continue
-        both = f"{names[pair.a]} and {names[pair.b]}"
+        names_of_pair = f"{names[pair.a]} and {names[pair.b]}"
         if pair.links or pair.overlap:
-            found.append(f"{both} overlap: {', '.join(overlap_evidence(pair))}.")
+            sentences.append(f"{names_of_pair} overlap: {', '.join(overlap_evidence(pair))}.")
         else:
-            found.append(f"{both} are in one map, but do not overlap.")
-    found += [
+            sentences.append(f"{names_of_pair} are in one map, but do not overlap.")
+    sentences += [
         f"{s.name} is not joined: no overlap with the first session could be confirmed."
         for s in result.sessions
         if s.T_main_session is None
@@ -28,12 +28,12 @@ def session_sentences(result: Reconstruction) -> list[str]:
     for pair in result.session_pairs:
         count = change_counts(result, pair)
         if count:
-            found.append(f"Between {names[pair.a]} and {names[pair.b]} {count}.")
-    return found
+            sentences.append(f"Between {names[pair.a]} and {names[pair.b]} {count}.")
+    return sentences
 
 
 def change_counts(result: Reconstruction, pair: SessionPair) -> str:
-    """How many surfaces changed: "2 surfaces appeared and 1 vanished"; empty if none did."""
+    """Describe changed surfaces: "2 surfaces appeared and 1 vanished"; empty if none changed."""
     kinds = [c.change.kind for c in result.changes if (c.a, c.b) == (pair.a, pair.b)]
     counts = [(kinds.count(kind), kind) for kind in ("appeared", "vanished") if kind in kinds]
     if not counts:
@@ -46,14 +46,14 @@ def change_counts(result: Reconstruction, pair: SessionPair) -> str:
 
 def overlap_evidence(pair: SessionPair) -> list[str]:
     """Return the evidence for an overlap: "86 % of the views", "8 registrations", ..."""
-    found = [f"{_percent(pair.overlap)} of the views"]
+    evidence = [f"{_percent(pair.overlap)} of the views"]
     if pair.links:
-        found.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
+        evidence.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
     if pair.probability is not None:
-        found.append(f"right with a probability of {probability_text(pair.probability)}")
+        evidence.append(f"right with a probability of {probability_text(pair.probability)}")
     if pair.support is not None:
-        found.append(f"{_percent(pair.support)} of the overlapping measurements agree")
-    return found
+        evidence.append(f"{_percent(pair.support)} of the overlapping measurements agree")
+    return evidence
 
 
 def _percent(fraction: float) -> str:

@@ -1,4 +1,4 @@
-"""Surfaces that are too large for a single file in a browser: an overview, and 3D Tiles."""
+"""Overview and 3D Tiles of surfaces that are too large for a single file in a browser."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TilingSummary:
     levels, tiles
         Number of levels of detail, and of tiles.
     faces
-        Number of triangles of the whole surface.
+        Number of triangles of the full surface.
     overview
         The simplified surface, of at most `OVERVIEW_BYTES` as one glTF file.
     """
@@ -64,20 +64,20 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
         If something can't be written.
     """
     make_folder(folder)
-    below: dict[Place, Tile] = {}
-    coarse = mesh
+    finer: dict[Place, Tile] = {}
+    overview_source = mesh
     number = tiles = 0
     for level in levels(mesh):
         number = level.number
         tiles += len(level.places)
-        below = _parents(_write_level(level, R_up_world, folder), below, level.error_m)
+        finer = _parents(_write_level(level, R_up_world, folder), finer, level.error_m)
         if not _fits(level.mesh):
-            coarse = level.mesh
+            overview_source = level.mesh
         error = level.error_m
-    while len(below) > 1:  # further levels without content, up to a single root
+    while len(finer) > 1:  # further levels without content, up to a single root
         number, error = number + 1, 2 * error
-        below = _parents({}, below, error)
-    (root,) = below.values()
+        finer = _parents({}, finer, error)
+    (root,) = finer.values()
     T = np.eye(4)
     T[:3, :3] = R_up_world
     write_tileset(
@@ -86,22 +86,22 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
         generator=f"tofuse {__version__}",
         extras={"T_up_world": T.tolist()},
     )
-    return TilingSummary(number + 1, tiles, len(mesh.faces), overview(coarse))
+    return TilingSummary(number + 1, tiles, len(mesh.faces), overview(overview_source))
 
 
 def is_tiles(folder: Path) -> bool:
-    """Whether it is a folder `tiles` with nothing but files of `write_tiles`."""
+    """Whether it is a folder `tiles` that contains only files of `write_tiles`."""
     return RESULT.names.is_whole(folder)
 
 
 def overview(mesh: Mesh) -> Mesh:
     """Return the surface, simplified until it fits into `OVERVIEW_BYTES` of glTF."""
     faces = float(OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2))
-    fitting = mesh
-    while not _fits(fitting):
-        fitting = mesh.clustered(int(faces))
+    simplified = mesh
+    while not _fits(simplified):
+        simplified = mesh.clustered(int(faces))
         faces *= 0.9
-    return fitting
+    return simplified
 
 
 def _fits(mesh: Mesh) -> bool:
@@ -132,10 +132,10 @@ def _write_level(level: Level, R_up_world: Float64, folder: Path) -> dict[Place,
 
 
 def _parents(
-    tiles: dict[Place, Tile], below: dict[Place, Tile], error_m: float
+    tiles: dict[Place, Tile], finer: dict[Place, Tile], error_m: float
 ) -> dict[Place, Tile]:
     """Make tiles the parents of those of the next finer level, each within its box."""
-    for (i, j, k), child in below.items():
+    for (i, j, k), child in finer.items():
         place = (i // 2, j // 2, k // 2)
         if place not in tiles:
             tiles[place] = Tile(child.low, child.high, error_m, None, 0)
@@ -144,7 +144,7 @@ def _parents(
         parent.low = np.minimum(parent.low, child.low)
         parent.high = np.maximum(parent.high, child.high)
     for tile in tiles.values():
-        if below and not tile.children:
+        if finer and not tile.children:
             # Simplification moved its content into a neighbour: finer detail here is empty.
             tile.children.append(Tile(tile.low, tile.high, 0.0, None, 0))
     return tiles

@@ -113,7 +113,7 @@ class SelfCalibration:
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Everything that states how far the result can be trusted.
+    """The verdict of a result, and its evidence.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class Diagnostics:
     accuracy
         95 % bounds of the pose errors.
     calibrated
-        The self-calibration; None where the calibration was left as stated.
+        The self-calibration; None if the stated calibration was kept.
     joins
         The links that join the components of the main model.
     """
@@ -249,8 +249,8 @@ class SessionPair:
         Probability that the links which first joined the two are correct, 0 to 1; None where they
         were joined through others.
     overlap
-        Fraction of the views of either that see surfaces which the other sees too; the smaller of
-        the two.
+        Fraction of a session's views that observe surfaces which the other one also observes; the
+        smaller of the two values.
     support
         Fraction of their overlapping measurements that support the final poses, as opposed to
         contradicting them; None where they don't overlap.
@@ -321,8 +321,8 @@ class Reconstruction:
     threads
         The number of threads used.
     components
-        Component 0 is the main one: trajectory, graph, cloud and mesh are of what is connected to
-        it. Empty where the method does not separate components.
+        Component 0 is the main one: trajectory, graph, cloud and mesh contain what is connected
+        to it. Empty where the method does not separate components.
     sessions, session_pairs
         The recordings of a merged map, and the evidence that connects each two of them; empty for
         a run.

@@ -57,7 +57,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "loop_rejected": ("note", "A loop closure given by the user could not be confirmed."),
 }
 
-# What the user can do about a reason, where there is something to do.
+# Advice to the user by reason code, where there is any.
 ADVICE: dict[str, str] = {
     "rig_changed": "Recalibrate the rig: tofuse rig calibrate.",
     "uncertain_rig": "Let the fields of view overlap more, or add a camera, and recalibrate.",

@@ -153,7 +153,7 @@ class _Placer:
             source, target, _AROUND, agreement=self._agreement, distinct_m=self._distinct_m
         )
         for search in (around, Search.of(source, target, _SIDE_BY_SIDE)):
-            match = None if search is None else search.everywhere()
+            match = None if search is None else search.exhaustive()
             if match is not None:
                 poses += [candidate.T_target_source for candidate in match.candidates]
         return np.array(poses).reshape(-1, 4, 4)

@@ -20,7 +20,7 @@ from tofuse.posegraph.build import Measured
 from tofuse.posegraph.joint_alignment import Bodies, refine
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.refinement import followed, pairwise_measurements
-from tofuse.posegraph.submaps import fell
+from tofuse.posegraph.submaps import support_fell
 from tofuse.posegraph.view_store import SampledView, Spacing
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
@@ -233,14 +233,16 @@ def refined(
     if len(used) < 2:
         return RigTrajectory(poses, T_rig_frame, {}, ())
     bodies = Bodies(of, T_rig_frame[frames])
-    start = bodies.views(poses[used])
+    start = bodies.view_poses(poses[used])
     done = refine(views, np.asarray(se3.inverse(start[0]) @ start), _OPTIONS, bodies=bodies)
     count = len(views)
     of_view = source.camera[recording.indices[frames]]
-    if not len(done.pairs) or fell(done.after.of_views(count) - done.before.of_views(count)):
+    if not len(done.pairs) or support_fell(
+        done.after.of_views(count) - done.before.of_views(count)
+    ):
         apart = disagreements_of(views, of_view, start, done.pairs)
         return RigTrajectory(poses, T_rig_frame, apart, ())
-    after = bodies.poses(start[0] @ done.poses)
+    after = bodies.body_poses(start[0] @ done.poses)
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     out = poses.copy()
     out[known] = followed(poses[known], np.searchsorted(known, used), after)
