@@ -125,7 +125,7 @@ def shape_of(mesh: Mesh) -> Surface:
 
 def row(label: str, shape: Surface, truth: Surface, seen: Float64, kept: Float64) -> str:
     """One line of the table."""
-    found = compare_surfaces(shape, truth, seen=kept)
+    found = compare_surfaces(shape, truth, visible=kept)
     recall = (distances(seen, shape) <= found.threshold_m).mean()
     return (
         f"{label:<16} {1e3 * found.accuracy_m:7.1f} {1e3 * found.accuracy_median_m:7.1f} "

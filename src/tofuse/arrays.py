@@ -1,4 +1,4 @@
-"""Types of NumPy arrays, named by what they hold."""
+"""Types of NumPy arrays, named by their element type."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -60,7 +60,7 @@ class _Choices(tuple[object, ...]):
 
 
 class Bounded:
-    """A dataclass that refuses values other than those that its annotations declare.
+    """A dataclass that rejects values outside those that its annotations declare.
 
     A number is declared as ``Annotated[float, Bounds(0, 1)]``, where None is within any bounds, a
     choice as ``Literal``, a tuple or text with content as ``Annotated[str, NotEmpty()]``.
@@ -72,12 +72,12 @@ class Bounded:
     """
 
     def __post_init__(self) -> None:
-        kind: type = type(self)
-        for name, whole, allowed in _declared(kind):
+        cls: type = type(self)
+        for name, is_integer, allowed in _declared(cls):
             value = getattr(self, name)
             if isinstance(allowed, Bounds) and value is None:
                 continue
-            if whole and not isinstance(value, int):
+            if is_integer and not isinstance(value, int):
                 raise ValueError(f"{name} must be a whole number, not {value!r}")
             if value not in allowed:
                 raise ValueError(f"{name} must be {allowed}, not {value!r}")
@@ -86,13 +86,13 @@ class Bounded:
 @functools.cache
 def _declared(cls: type) -> list[tuple[str, bool, Bounds | NotEmpty | _Choices]]:
     """Names of the restricted fields, whether they are whole numbers, and what is allowed."""
-    found: list[tuple[str, bool, Bounds | NotEmpty | _Choices]] = []
+    restrictions: list[tuple[str, bool, Bounds | NotEmpty | _Choices]] = []
     for name, hint in typing.get_type_hints(cls, include_extras=True).items():
         if typing.get_origin(hint) is typing.Literal:
-            found.append((name, False, _Choices(typing.get_args(hint))))
-        found += [
+            restrictions.append((name, False, _Choices(typing.get_args(hint))))
+        restrictions += [
             (name, hint.__origin__ in (int, int | None), extra)
             for extra in getattr(hint, "__metadata__", ())
             if isinstance(extra, Bounds | NotEmpty)
         ]
-    return found
+    return restrictions

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-_LONGEST = 600  # characters of a problem, as text quoted from a file may have any length
+_MAX_LENGTH = 600  # maximum characters of a problem: text quoted from a file may have any length
 
 
 def _clipped(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+    return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 
 
 class TofuseError(Exception):
@@ -42,7 +42,7 @@ class UnreadableFrameError(InputError):
 
 
 class OutputError(TofuseError):
-    """A result can't be written where it was asked for."""
+    """A result can't be written to the requested location."""
 
 
 class RegistrationError(TofuseError):

@@ -38,10 +38,10 @@ def part(kind: str, name: str, *, label: Label = "experimental") -> Callable[[ty
     """
 
     def register(cls: type[T]) -> type[T]:
-        known = _registry.setdefault(kind, {})
-        if name in known and known[name].__qualname__ != cls.__qualname__:
+        parts = _registry.setdefault(kind, {})
+        if name in parts and parts[name].__qualname__ != cls.__qualname__:
             raise ValueError(f"two parts are called {kind} {name!r}")
-        known[name] = cls
+        parts[name] = cls
         cls.part_kind = kind  # type: ignore[attr-defined]
         cls.part_name = name  # type: ignore[attr-defined]
         cls.part_label = label  # type: ignore[attr-defined]
@@ -70,12 +70,12 @@ def name_of(obj: object) -> str:
 def to_dict(obj: Any) -> Any:
     """Turn a configuration (parts, dataclasses, tuples, plain values) into JSON-able data."""
     if dataclasses.is_dataclass(obj) and not isinstance(obj, type):
-        out: dict[str, Any] = {}
+        data: dict[str, Any] = {}
         if hasattr(type(obj), "part_name"):
-            out["part"] = name_of(obj)
+            data["part"] = name_of(obj)
         for field in dataclasses.fields(obj):
-            out[field.name] = to_dict(getattr(obj, field.name))
-        return out
+            data[field.name] = to_dict(getattr(obj, field.name))
+        return data
     if isinstance(obj, list | tuple):
         return [to_dict(item) for item in obj]
     if isinstance(obj, Mapping):
@@ -201,5 +201,5 @@ def _plain(hint: Any, data: Any, where: str) -> Any:
         and not (hint is not bool and isinstance(data, bool))
     ):
         return data
-    wanted = hint.__name__ if isinstance(hint, type) else str(hint)
-    raise InputError(f"is {data!r}", where=where, remedy=f"use a value of type {wanted}")
+    type_name = hint.__name__ if isinstance(hint, type) else str(hint)
+    raise InputError(f"is {data!r}", where=where, remedy=f"use a value of type {type_name}")

@@ -169,9 +169,9 @@ def test_lost_scheduler_falls_back_to_local_execution(batch_benchmark) -> None:
 def test_workers_of_other_versions_are_rejected(
     batch_benchmark, room_recording, tmp_path, monkeypatch, capsys, cluster
 ) -> None:
-    monkeypatch.setattr(pieces, "_program", lambda: ("tofuse 0.0", "numpy 1"))
+    monkeypatch.setattr(pieces, "_environment", lambda: ("tofuse 0.0", "numpy 1"))
     words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--scheduler", cluster]
-    monkeypatch.setattr(DaskExecutor, "_check_workers", _checked_against(pieces._program()))
+    monkeypatch.setattr(DaskExecutor, "_check_workers", _checked_against(pieces._environment()))
     assert main(words) == 2
     output = capsys.readouterr().err
     assert "results would differ: install the same versions there" in output

@@ -310,7 +310,7 @@ def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
 def test_dask_memory_resource_limits_concurrency(monkeypatch) -> None:
     there = [{"nthreads": 4, "resources": {"memory": 200.0}}, {"nthreads": 2, "resources": {}}]
     workers = object.__new__(DaskWorkers)
-    workers._address, workers._running, workers._looked = "tcp://there", set(), -10.0
+    workers._address, workers._running, workers._polled_at = "tcp://there", set(), -10.0
     monkeypatch.setattr(workers, "_workers", lambda: there)
     small, large = (replace(JOBS[0], memory=memory) for memory in (100, 201))
     workers.check(small)
@@ -349,7 +349,7 @@ def test_dask_outcomes_are_translated() -> None:
 
     def handed(status: str, outcome: object = None) -> Future[Record]:
         future: Future[Record] = Future()
-        workers._hand_over(Remote(status, outcome), future)
+        workers._transfer(Remote(status, outcome), future)
         assert future.done()
         return future
 

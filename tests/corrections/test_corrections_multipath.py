@@ -148,11 +148,11 @@ def test_gain_of_flat_wall_follows_from_prior_albedo() -> None:
 def test_gain_is_estimated_from_limited_number_of_images(corner: Seen) -> None:
     estimator = GainEstimator(replace(REFLECTIONS, columns=16, iterations=1))
     used = 0
-    for _ in range(GainEstimator.EVERY * GainEstimator.MOST + 40):
+    for _ in range(GainEstimator.EVERY * GainEstimator.MAX_IMAGES + 40):
         before = len(estimator._bright)
         estimator.add(corner.image)
         used += len(estimator._bright) - before
-    assert used == GainEstimator.MOST
+    assert used == GainEstimator.MAX_IMAGES
 
 
 def test_images_without_depth_or_amplitude_have_no_estimate() -> None:

@@ -158,7 +158,7 @@ def test_unconstrained_directions_are_free(truth) -> None:
 
 def test_uninformative_graph_is_rejected(truth) -> None:
     fit = fitted(measured(truth, stated=np.full(6, 1e3)), DEPTH_M)
-    assert fit.unknowns == 0
+    assert fit.dof == 0
     with pytest.raises(ValueError, match="nothing was measured"):
         deviation(fit, truth)
 
@@ -191,10 +191,10 @@ def test_correction_is_minimal(fit, truth) -> None:
 
     m = np.exp(brentq(left, -30, 30))
     expected = a - a / (1 + m * values)
-    found = problem.smallest(x, allowed)
+    found = problem.smallest_correction(x, allowed)
     assert problem.product(x - found) == pytest.approx(allowed, rel=1e-2)
     assert problem.norm(found) == pytest.approx(np.linalg.norm(expected), rel=1e-3)
-    assert not problem.smallest(x, 2 * problem.product(x)).any()
+    assert not problem.smallest_correction(x, 2 * problem.product(x)).any()
 
 
 def dense(graph):

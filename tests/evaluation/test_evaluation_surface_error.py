@@ -53,7 +53,7 @@ def test_missing_half_is_accurate_but_incomplete() -> None:
     assert found.recall == pytest.approx(0.51, abs=0.01)  # the half and 1 cm
     assert found.fscore == pytest.approx(2 * 0.51 / 1.51, abs=0.01)
     seen = np.array([[0.1, 0.5, 0], [0.3, 0.2, 0]])
-    assert compare_surfaces(half, SQUARE, seen=seen, samples=20_000).recall == 1
+    assert compare_surfaces(half, SQUARE, visible=seen, samples=20_000).recall == 1
     back = compare_surfaces(SQUARE, half, samples=20_000)
     assert back.recall == 1
     assert back.accuracy_p95_m == pytest.approx(0.45, abs=0.01)

@@ -47,13 +47,13 @@ def same(a, b):
 def test_regions_give_same_bytes(room, memory_mb, least) -> None:
     views, poses = room
     options = Fusion(voxel_m=0.03, island=60)
-    whole = fuse_surface(views, poses, options)
+    single_region = fuse_surface(views, poses, options)
     small = replace(options, memory_mb=memory_mb)
     layout = Layout.of(views, poses, 0.03)
     assert len(layout.regions(memory_mb * 1_000_000 // layout.block_bytes)) >= least
-    same(fuse_surface(views, poses, small), whole)
+    same(fuse_surface(views, poses, small), single_region)
     with threads(1):
-        same(fuse_surface(views, poses, small), whole)
+        same(fuse_surface(views, poses, small), single_region)
 
 
 def test_round_robin_colours_and_two_cameras_make_no_seam() -> None:
@@ -89,14 +89,14 @@ def test_each_block_has_one_region_with_its_neighbours(room) -> None:
     layout = Layout.of(views, poses, 0.03)
     place = {block_of(int(key)): k for k, key in enumerate(layout.keys)}
     regions = layout.regions(300)
-    owned = np.concatenate([region.rows[: region.own] for region in regions])
+    owned = np.concatenate([region.rows[: region.owned] for region in regions])
     np.testing.assert_array_equal(np.sort(owned), np.arange(len(layout.keys)))
     for region in regions:
         assert len(region.rows) <= 300
-        assert (np.diff(region.rows[: region.own]) > 0).all()
+        assert (np.diff(region.rows[: region.owned]) > 0).all()
         assert len(np.unique(region.rows)) == len(region.rows)
         contained = set(region.rows.tolist())
-        for row in region.rows[: region.own]:
+        for row in region.rows[: region.owned]:
             i, j, k = block_of(int(layout.keys[row]))
             around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
             near = [place.get((i + a, j + b, k + c)) for a, b, c in around.tolist()]
@@ -104,7 +104,7 @@ def test_each_block_has_one_region_with_its_neighbours(room) -> None:
             assert (region.low < [i, j, k]).all()
             assert (region.high > [i + 1, j + 1, k + 1]).all()
     # Recursive halving: no region is much smaller than the others.
-    sizes = [region.own for region in regions]
+    sizes = [region.owned for region in regions]
     assert min(sizes) > max(sizes) / 5
     assert len(layout.regions(1)) == len(layout.keys)  # regions are at least single blocks
     assert len(layout.regions(len(layout.keys))) == 1
@@ -148,7 +148,7 @@ def test_contributing_views_touch_block() -> None:
         i, j, k = (int(n) for n in rng.integers(-14, 15, 3))
         keys = np.array([block_key(i, j, k + 4)], np.int64)
         layout = Layout(0.02, 0.05, keys, 1, 1)
-        volume = Volume.of(layout, layout.whole())
+        volume = Volume.of(layout, layout.single_region())
         volume.add([view], T[None])
         low = 0.16 * np.array([i, j, k + 4])
         something = bool(volume.weight.any() or volume.free.any())

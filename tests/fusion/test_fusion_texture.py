@@ -128,7 +128,7 @@ def test_atlas_holds_every_triangle_once(plain: bool, monkeypatch) -> None:
         {tuple(np.roll(f, -np.argmin(f))) for f in atlas.vertices[atlas.faces].tolist()},
         {tuple(np.roll(f, -np.argmin(f))) for f in mesh.faces.tolist()},
     )
-    corners = atlas.places[atlas.faces]
+    corners = atlas.texels[atlas.faces]
     assert atlas.size <= 300
     assert corners.min() >= 0
     assert corners.max() <= atlas.size - 1
@@ -158,11 +158,11 @@ def test_texture_has_uniform_exposure() -> None:
     expected = np.exp(np.log(gains).mean()) / gains
     np.testing.assert_allclose(found, np.tile(expected[:, None], 3), rtol=0.01)
     made = textured(mesh, views, POSES, 256)
-    assert made.seen > 0.99
+    assert made.coverage > 0.99
     atlas = made.atlas
     owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
     places = np.zeros((atlas.size, atlas.size, 2), np.float32)
-    draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
+    draw_triangles(atlas.texels[atlas.faces], MARGIN, owner, places)
     inside = (owner != UNOWNED) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
     p = mesh.vertices[atlas.vertices[atlas.faces[owner[inside]]]]
     b, c = places[inside].T[:, :, None]
@@ -189,7 +189,7 @@ def test_occluded_surface_is_not_painted_by_occluder() -> None:
     mesh = sheet(25, 17, 0.05)
     view = TextureView.of(look(np.eye(4), 1.0, hidden=0.2))
     made = textured(mesh, [view], POSES[:1], 256)
-    corners = made.atlas.places[made.atlas.faces].mean(1).round().astype(int)
+    corners = made.atlas.texels[made.atlas.faces].mean(1).round().astype(int)
     x = mesh.vertices[made.atlas.vertices[made.atlas.faces]].mean(1)[:, 0]
     shown = made.image[corners[:, 1], corners[:, 0]]
     assert (shown[x > 0.3] == 9).all()  # the vertices' own colour
@@ -197,7 +197,7 @@ def test_occluded_surface_is_not_painted_by_occluder() -> None:
     assert (shown != 255).any(1).all()
     # From behind, the surface is not seen.
     turned = mesh_of(mesh.vertices, mesh.faces[:, ::-1], -mesh.normals)
-    assert textured(turned, [view], POSES[:1], 256).seen == 0
+    assert textured(turned, [view], POSES[:1], 256).coverage == 0
 
 
 def test_frames_without_channel_give_no_view() -> None:
@@ -220,14 +220,14 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
 
 def test_batched_atlas_holds_every_triangle_once(monkeypatch) -> None:
     pytest.importorskip("xatlas")
-    monkeypatch.setattr(atlas_module, "_BATCH", 100)
+    monkeypatch.setattr(atlas_module, "_MAX_PART", 100)
     wall = sheet(20, 20, 0.05)
     atlas = unwrap(wall, 512)
     np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)
     assert len(np.unique(atlas.vertices)) == len(wall)
     owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
-    draw_triangles(atlas.places[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
-    p = atlas.places[atlas.faces].astype(float)
+    draw_triangles(atlas.texels[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
+    p = atlas.texels[atlas.faces].astype(float)
     b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     own = np.bincount(owner[owner != UNOWNED], minlength=len(p))

@@ -34,8 +34,8 @@ def lens() -> KinectLens:
     """The depth camera of `made_kinect.DEPTH_LENS` in the smallest mode."""
     window = DEPTH_MODES["NFOV_2X2BINNED"]
     p = np.array(DEPTH_LENS)
-    cx, cy = p[:2] * window.whole - window.corner - 0.5
-    fx, fy = p[2:4] * window.whole
+    cx, cy = p[:2] * window.full_size - window.corner - 0.5
+    fx, fy = p[2:4] * window.full_size
     k = {f"k{i}": float(p[3 + i]) for i in range(1, 7)}
     return KinectLens(*window.size, fx, fy, cx, cy, p1=p[13], p2=p[12], metric_radius=1.74, **k)
 

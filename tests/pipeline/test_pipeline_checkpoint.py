@@ -522,7 +522,7 @@ def test_full_disk_preserves_earlier_result(room_recording: Path, tmp_path: Path
 def test_spilled_images_survive_checkpoint_in_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(spill_module, "_PIECE", 1500)
+    monkeypatch.setattr(spill_module, "_PIECE_BYTES", 1500)
     spill: Spill[FrameSample] = Spill(2000, tmp_path)
     rng = np.random.default_rng(0)
     depths = [rng.random((30, 20)).astype(np.float16) for _ in range(8)]

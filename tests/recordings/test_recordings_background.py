@@ -88,11 +88,13 @@ def test_object_includes_pixels_it_always_hides() -> None:
     found = moving_object(frames)
     middle = np.zeros((ROWS, COLUMNS), bool)
     middle[20:45, 34:46] = True
-    assert found.own[middle].all()  # its depth is constant, or nearly so, and it is no background
+    assert found.own[
+        middle
+    ].all()  # its depth is constant, or nearly so, and it is no background
     assert not found.own[:8].any()
     for image, mask in zip(frames, masks, strict=True):
         assert agreement(found.mask(image.z), mask) > 0.97
-    assert 0.85 < found.reach[0] < 1.1 < found.reach[1] < 1.3
+    assert 0.85 < found.depth_range[0] < 1.1 < found.depth_range[1] < 1.3
 
 
 def test_static_objects_in_front_are_background() -> None:

@@ -397,7 +397,7 @@ def test_points_without_colour_are_not_black():
 def test_viewer_contains_model_cameras_and_loops(shown):
     result, extras = room()
     subject = Subject.of(result, extras)
-    R = subject.straight
+    R = subject.R_display_world
     scene = json.loads(shown.scripts[0])
     model = scene["model"]
     points = np.array(scene["low"]) + unpack(model["points"], "<u2", 3) / 65535 * scene["extent"]

@@ -183,7 +183,7 @@ def test_note_decides_where_locks_are_unsupported(tmp_path, monkeypatch) -> None
     def none(_handle: int) -> None:
         raise OSError(38, "no locks available")
 
-    monkeypatch.setattr(locking, "_try", none)
+    monkeypatch.setattr(locking, "_lock_nonblocking", none)
     lock = tmp_path / "lock"
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"],
                           capture_output=True, text=True, check=True)  # fmt: skip
@@ -199,9 +199,9 @@ def test_note_decides_where_locks_are_unsupported(tmp_path, monkeypatch) -> None
         lock.write_text(json.dumps(held))
         if refused:
             with pytest.raises(OutputError, match="another process"):
-                Claim(lock, what="out")
+                Claim(lock, target="out")
         else:
-            Claim(lock, what="out").release()
+            Claim(lock, target="out").release()
 
 
 def test_reader_refuses_running_moves_and_finishes_interrupted_ones(tmp_path, monkeypatch) -> None:

@@ -17,7 +17,7 @@ from tofuse.recordings.rig_source import RigSource
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.moving_rig import _clock, _Together, _too_uncertain
+from tofuse.rigs.moving_rig import _initial_offset, _JointViews, _too_uncertain
 from tofuse.rigs.rig_trajectory import refined
 from tofuse.rigs.run import reconstruct_rig
 
@@ -154,7 +154,7 @@ def test_split_half_reveals_systematic_errors() -> None:
     def tracks(by: np.ndarray) -> dict[int, Track]:
         return {0: Track(times, world), 1: Track(times, world @ mounted() @ se3.exp(by))}
 
-    together = _Together({}, {}, {})
+    together = _JointViews({}, {}, {})
     together._halves = [(tracks(error), tracks(-error))]
     found = together.systematic(1, fit)
     np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)
@@ -172,7 +172,7 @@ def walked(clock: float = 0.0, T: np.ndarray | None = None, seconds: float = 6.0
 
 def clock_between(first: Track, second: Track) -> tuple[float, list[str]]:
     notes: list[str] = []
-    return _clock(cameras(), [first, second], 1, notes), notes
+    return _initial_offset(cameras(), [first, second], 1, notes), notes
 
 
 def test_clocks_an_hour_apart_are_aligned_by_rotations() -> None:

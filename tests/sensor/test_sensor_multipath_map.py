@@ -78,7 +78,7 @@ def test_map_recalls_planes_and_albedo_after_rotation() -> None:
         known.add(surfaces, everywhere(surfaces), T)
     around = OffscreenCells.of(CAMERA.rays(), 1.3)
     assert not around.albedo.any()
-    around.add_known(known, np.eye(4))
+    around.add_reflectors(known, np.eye(4))
     found = around.albedo > 0
     sides = np.abs(around.rays[:, 0]) > 0.6
     assert found[sides & (np.abs(around.rays[:, 1]) < 0.3)].all()

@@ -57,7 +57,7 @@ def test_scattered_light_is_removed() -> None:
     own = own_light()
     light = measured(own, (0.03, 0.04))
     before = np.abs(np.angle(light * own.conj()))
-    after = np.abs(np.angle(Scattering(WIDTHS, (0.03, 0.04)).removed(light) * own.conj()))
+    after = np.abs(np.angle(Scattering(WIDTHS, (0.03, 0.04)).without_scatter(light) * own.conj()))
     wall = np.abs(own) < 100
     assert np.median(before[wall]) > 0.04
     assert np.median(after[wall]) < 0.03 * np.median(before[wall])

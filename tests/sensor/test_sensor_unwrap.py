@@ -24,7 +24,7 @@ from tofuse.sensor.models import SPEED_OF_LIGHT
 from tofuse.sensor.unwrap import (
     UnwrapOptions,
     _Blocks,
-    _with_surfaces_moved,
+    _shift_surfaces,
     count_periods,
     on_surface,
 )
@@ -149,12 +149,12 @@ def test_surface_part_off_by_one_period_is_corrected() -> None:
     wrong[50, 30] = 0
     unary = np.zeros((*range_m.shape, 3), np.float32)
     unary[:] = 0.01 * np.arange(3)  # a small cost per period
-    found = _with_surfaces_moved(blocks, unary, wrong, PERIOD, UnwrapOptions())
+    found = _shift_surfaces(blocks, unary, wrong, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(found, true)
     # If everything is off, only the cost of periods, or the amplitude, decides.
-    nearer = _with_surfaces_moved(blocks, unary, true + 1, PERIOD, UnwrapOptions())
+    nearer = _shift_surfaces(blocks, unary, true + 1, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(nearer, true)
-    farther = _with_surfaces_moved(blocks, -unary, true, PERIOD, UnwrapOptions())
+    farther = _shift_surfaces(blocks, -unary, true, PERIOD, UnwrapOptions())
     np.testing.assert_array_equal(farther, true + 1)
 
 

@@ -1,1 +1,1 @@
-"""What `import tofuse` offers that needs more than one room: results that know what to do."""
+"""The part of the Python interface that uses several rooms: results with methods."""

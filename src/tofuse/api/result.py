@@ -50,7 +50,7 @@ class Result(Reconstruction):
     Attributes
     ----------
     source
-        The recording that it was made from; None for a result that was loaded.
+        The recording; None for a result that was loaded.
     fitted
         The configuration after its parts were fitted to the recording, if known.
     """
@@ -61,23 +61,23 @@ class Result(Reconstruction):
     @classmethod
     def of(
         cls,
-        found: Reconstruction,
+        reconstruction: Reconstruction,
         source: Recording | None = None,
         fitted: Config | None = None,
     ) -> Self:
-        """Make a result of a reconstruction, such as that of `Mapper.finish`.
+        """Make a result of a reconstruction, for example that of `Mapper.finish`.
 
         Parameters
         ----------
-        found
+        reconstruction
             The reconstruction.
         source
-            The recording that it was made from, if known.
+            The recording, if known.
         fitted
             The configuration after its parts were fitted to the recording, if known.
         """
-        own = {f.name: getattr(found, f.name) for f in fields(Reconstruction)}
-        return cls(**own, source=source, fitted=fitted)
+        values = {f.name: getattr(reconstruction, f.name) for f in fields(Reconstruction)}
+        return cls(**values, source=source, fitted=fitted)
 
     @property
     def accuracy(self) -> str:
@@ -138,19 +138,19 @@ class Result(Reconstruction):
         InputError
             If there is no reference, or it does not match the frames.
         """
-        known = reference
-        if known is None:
-            known = None if self.source is None else self.source.reference
-        if known is None:
+        poses = reference
+        if poses is None:
+            poses = None if self.source is None else self.source.reference
+        if poses is None:
             raise InputError(
                 "has no reference poses",
                 where="the recording" if self.source else "the loaded result",
                 remedy="pass a reference",
             )
-        given = known if isinstance(known, str | Path) else np.asarray(known, float)
+        poses_or_path = poses if isinstance(poses, str | Path) else np.asarray(poses, float)
         return evaluate(
             self.trajectory,
-            given,
+            poses_or_path,
             recording=self.source,
             reference_error_m=reference_error_m,
             config=self.config,
@@ -177,9 +177,9 @@ class Result(Reconstruction):
 
         with tempfile.TemporaryDirectory(prefix="tofuse-") as folder:
             self.save(Path(folder) / "result")
-            shown = read_content(Path(folder) / "result")
+            content = read_content(Path(folder) / "result")
         server = serve(port)
-        ResultView(server, shown)
+        ResultView(server, content)
         if open_browser:
             webbrowser.open(address(server))
         return server
@@ -285,14 +285,14 @@ def reconstruct(
             where="recording",
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
-    with _shown(progress) as seen:
-        fitted = adapted(_configuration(config, recording), recording, threads, seen)
+    with _with_terminal(progress) as display:
+        fitted = adapted(_configuration(config, recording), recording, threads, display)
         turning = any(isinstance(part, Foreground) for part in fitted.filters)
         findings = quick_findings(recording, fitted, turning=turning)
-        found = reconstruct_recording(
-            recording, fitted, seed=seed, threads=threads, loops=loops, progress=seen
+        reconstruction = reconstruct_recording(
+            recording, fitted, seed=seed, threads=threads, loops=loops, progress=display
         )
-    return Result.of(with_findings(found, findings, turning=turning), recording, fitted)
+    return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
 
 
 def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
@@ -335,14 +335,14 @@ def merge(
     InputError
         If a folder is not a result, or its recording is missing or has changed.
     """
-    with _shown(progress) as seen:
-        found = merge_results(
-            results, tolerance_m=tolerance_m, seed=seed, threads=threads, progress=seen
+    with _with_terminal(progress) as display:
+        merged = merge_results(
+            results, tolerance_m=tolerance_m, seed=seed, threads=threads, progress=display
         )
-    return Result.of(found)
+    return Result.of(merged)
 
 
-def _shown(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
+def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
     return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
 
 
@@ -356,11 +356,13 @@ def load(folder: str | Path) -> Result:
     """
     from tofuse.viewer.view_file import read_view_file
 
-    found = load_result(folder)
-    kept = read_view_file(Path(folder))
-    if kept is not None:
-        before = found.diagnostics.sequential
-        for k, frame in enumerate(found.diagnostics.frames):
-            before[k] = kept.before.get(frame.index, np.nan)
-        found = replace(found, diagnostics=replace(found.diagnostics, sequential=before))
-    return Result.of(found)
+    reconstruction = load_result(folder)
+    view_file = read_view_file(Path(folder))
+    if view_file is not None:
+        sequential = reconstruction.diagnostics.sequential
+        for k, frame in enumerate(reconstruction.diagnostics.frames):
+            sequential[k] = view_file.before.get(frame.index, np.nan)
+        reconstruction = replace(
+            reconstruction, diagnostics=replace(reconstruction.diagnostics, sequential=sequential)
+        )
+    return Result.of(reconstruction)

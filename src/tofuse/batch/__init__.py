@@ -1,1 +1,1 @@
-"""Many recordings as jobs of their own, that can be resumed: here, or on a Dask cluster."""
+"""Many recordings as separate, resumable jobs: on this machine, or on a Dask cluster."""

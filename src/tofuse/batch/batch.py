@@ -29,10 +29,10 @@ def pending(jobs: Sequence[Job], folder: BatchFolder, *, overwrite: bool) -> lis
     OutputError
         If one of them would replace other files; see `BatchFolder.check`.
     """
-    left = [job for job in jobs if not folder.finished(job)]
-    for job in left:
+    remaining = [job for job in jobs if not folder.finished(job)]
+    for job in remaining:
         folder.check(job, overwrite=overwrite)
-    return left
+    return remaining
 
 
 def status_of(jobs: Sequence[Job], folder: BatchFolder) -> int:
@@ -46,7 +46,7 @@ def status_of(jobs: Sequence[Job], folder: BatchFolder) -> int:
 
 def run_batch(
     jobs: Sequence[Job],
-    left: Sequence[Job],
+    remaining: Sequence[Job],
     folder: BatchFolder,
     workers: Workers,
     *,
@@ -55,11 +55,11 @@ def run_batch(
     ended: OnEnded,
     note: Callable[[str], None],
 ) -> None:
-    """Run the jobs that are `left`, and update the table of all `jobs`.
+    """Run the `remaining` jobs, and update the table of all `jobs`.
 
     Parameters
     ----------
-    jobs, left
+    jobs, remaining
         All jobs of the batch, and those to be run.
     folder
         The output folder.
@@ -68,7 +68,7 @@ def run_batch(
     threads
         Number of threads of each job.
     retries
-        How often a job is restarted whose process or worker was killed.
+        Number of restarts of a job whose process or worker was killed.
     ended
         Called with each job that has ended.
     note
@@ -81,62 +81,62 @@ def run_batch(
     OutputError
         If a record or the table can't be written.
     """
-    for job in left:
+    for job in remaining:
         workers.check(job)
-    for job in left:  # earlier outcomes no longer count
+    for job in remaining:  # earlier outcomes no longer count
         record = folder.record(job)
         if record is not None and record.ended:
             folder.write(job, replace(record, state="waiting"))
     write_table(jobs, folder)
-    waiting = deque(Task(job, str(folder.path), threads) for job in left)
+    queue = deque(Task(job, str(folder.path), threads) for job in remaining)
     running: dict[Future[Record], Task] = {}
     killed: Counter[str] = Counter()
     idle_since = monotonic()
-    while waiting or running:
-        while waiting and workers.accepts(waiting[0]):
-            task = waiting.popleft()
+    while queue or running:
+        while queue and workers.accepts(queue[0]):
+            task = queue.popleft()
             running[workers.start(task)] = task
         if running:
             idle_since = monotonic()
             done, _ = wait(running, _POLL_S, FIRST_COMPLETED)
         else:
             if monotonic() - idle_since > _NO_WORKER_S:
-                note(f"no worker is available for {waiting[0].job.name}: waiting for one")
+                note(f"no worker is available for {queue[0].job.name}: waiting for one")
                 idle_since = inf
             sleep(_POLL_S)
             done = set()
         for future in done:
             task = running.pop(future)
             if future.cancelled():
-                waiting.append(task)
+                queue.append(task)
                 continue
             record = _completed(future.result(), task.job, folder)
             if record.state == "killed":
                 killed[task.job.name] += 1
                 if killed[task.job.name] <= retries:
                     note(f"{task.job.name}: {record.reason}; restarting it")
-                    waiting.append(task)
+                    queue.append(task)
                     continue
-                record = _given_up(record, killed[task.job.name])
+                record = _failed(record, killed[task.job.name])
             if folder.record(task.job) != record:
                 folder.write(task.job, record)
             write_table(jobs, folder)
             ended(task.job, record)
-        if (gone := workers.lost()) is not None:
-            write_table(jobs, folder)  # workers may have finished some meanwhile
-            raise gone
+        if (error := workers.lost()) is not None:
+            write_table(jobs, folder)  # workers may have finished jobs meanwhile
+            raise error
 
 
 def _completed(record: Record, job: Job, folder: BatchFolder) -> Record:
     """Complete the record of a worker that could not write it."""
     if record.key:
         return record
-    before = folder.record(job)
-    starts = 1 if before is None else before.starts
+    previous = folder.record(job)
+    starts = 1 if previous is None else previous.starts
     return replace(record, key=job.key(folder.path), starts=starts)
 
 
-def _given_up(record: Record, times: int) -> Record:
-    again = f", {times} times" if times > 1 else ""
-    reason = f"{record.reason}{again}; was there enough memory?"
+def _failed(record: Record, times: int) -> Record:
+    attempts = f", {times} times" if times > 1 else ""
+    reason = f"{record.reason}{attempts}; was there enough memory?"
     return replace(record, state="failed", reason=reason)

@@ -31,7 +31,7 @@ def connect(address: str, remedy: str) -> Any:
         import dask
     except ImportError as error:
         raise _not_installed(remedy) from error
-    # It would log errors that are reported here. Read when distributed is imported.
+    # Dask would log errors that are reported here. It reads this when distributed is imported.
     levels = {"distributed": "critical", "distributed.client": "critical"}
     with dask.config.set({"logging": levels}):
         try:
@@ -39,9 +39,9 @@ def connect(address: str, remedy: str) -> Any:
         except ImportError as error:
             raise _not_installed(remedy) from error
     client: Any = distributed.Client
-    wanted = _from_file(address) if os.path.isfile(address) else address
+    target = _from_file(address) if os.path.isfile(address) else address
     try:
-        return client(wanted, timeout=TIMEOUT_S, set_as_default=False, name="tofuse")
+        return client(target, timeout=TIMEOUT_S, set_as_default=False, name="tofuse")
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             "no Dask scheduler answers",
@@ -51,7 +51,7 @@ def connect(address: str, remedy: str) -> Any:
 
 
 def cannot_deserialize(error: BaseException) -> bool:
-    """Whether a scheduler or worker could not load what a task is made of."""
+    """Whether a scheduler or worker could not load the objects of a task."""
     return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
 
 

@@ -35,8 +35,8 @@ class DaskWorkers(Workers):
         self._address = address
         self._client: Any = connect(address, "use --workers to stay on this machine")
         self._running: set[Future[Record]] = set()
-        self._seen: list[dict[str, Any]] = []
-        self._looked = -_POLL_S
+        self._worker_infos: list[dict[str, Any]] = []
+        self._polled_at = -_POLL_S
 
     def check(self, job: Job) -> None:
         """See `Workers`. A cluster without workers may get some later."""
@@ -57,9 +57,9 @@ class DaskWorkers(Workers):
         Dask counts a queued task as failed whenever its worker dies, even if it had not started.
         """
         self._running = {f for f in self._running if not f.done()}
-        if monotonic() - self._looked >= _POLL_S:
-            self._seen, self._looked = self._workers(), monotonic()
-        return len(self._running) < sum(_slots(worker, task.job) for worker in self._seen)
+        if monotonic() - self._polled_at >= _POLL_S:
+            self._worker_infos, self._polled_at = self._workers(), monotonic()
+        return len(self._running) < sum(_slots(worker, task.job) for worker in self._worker_infos)
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
@@ -72,7 +72,7 @@ class DaskWorkers(Workers):
             resources={} if memory is None else {"memory": memory},
         )
         future: Future[Record] = Future()
-        remote.add_done_callback(lambda done: self._hand_over(done, future))
+        remote.add_done_callback(lambda done: self._transfer(done, future))
         self._running.add(future)
         return future
 
@@ -96,7 +96,7 @@ class DaskWorkers(Workers):
         except OSError:  # `lost` reports it
             return []
 
-    def _hand_over(self, remote: Any, future: Future[Record]) -> None:
+    def _transfer(self, remote: Any, future: Future[Record]) -> None:
         """Copy the outcome of a remote future to a local one."""
         try:
             self._outcome(remote, future)
@@ -129,7 +129,7 @@ class DaskWorkers(Workers):
 
 
 def _slots(worker: dict[str, Any], job: Job) -> int:
-    """The number of jobs like this that a worker can run at a time."""
+    """The number of such jobs that a worker can run at a time."""
     threads = int(worker["nthreads"])
     if job.memory is None:
         return threads

@@ -14,7 +14,7 @@ from tofuse.files.atomic import make_folder, write_text
 
 _UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folder`
 
-_TEXTS = ("key", "state", "host", "run", "verdict", "reason")
+_TEXT_FIELDS = ("key", "state", "host", "run", "verdict", "reason")
 
 State = Literal["waiting", "running", "done", "failed", "killed"]
 
@@ -39,7 +39,7 @@ class Record:
     run
         Digest of its `run.json`.
     verdict, reason
-        The verdict and its most severe reason, or why there is no result.
+        The verdict and its most severe reason, or the reason for no result.
     position_m, relative
         95 % bound of the pose errors, in m and over the model's diagonal; None if not bounded.
     frames, posed
@@ -95,8 +95,8 @@ class BatchFolder:
             raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
         make_folder(self.path)
         # Hidden files may be of another process that prepares it at the same time.
-        there = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
-        if there - {self.jobs.name} and not {self.jobs.name, self.csv.name} <= there:
+        names = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
+        if names - {self.jobs.name} and not {self.jobs.name, self.csv.name} <= names:
             raise OutputError(
                 "is not empty and contains no earlier batch",
                 where=self.path,
@@ -195,12 +195,12 @@ class BatchFolder:
 def _record_of(data: Any) -> Record:
     if not isinstance(data, dict):
         raise ValueError("it is not a table")
-    known = {f.name for f in fields(Record)}
-    record = Record(**{name: value for name, value in data.items() if name in known})
+    field_names = {f.name for f in fields(Record)}
+    record = Record(**{name: value for name, value in data.items() if name in field_names})
     if record.state not in get_args(State):
         raise ValueError("its state is not known")
     for name, value in vars(record).items():
-        kinds = str if name in _TEXTS else int if name == "starts" else int | float | None
-        if not isinstance(value, kinds):
+        types = str if name in _TEXT_FIELDS else int if name == "starts" else int | float | None
+        if not isinstance(value, types):
             raise ValueError(f"its {name} is {value!r}")
     return record

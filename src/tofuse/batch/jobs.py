@@ -18,7 +18,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import name_order, parse_toml, read_head, read_text
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 
-RESERVED = ("batch.csv", "batch.html", "jobs")  # other names in the output folder
+RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
 # Other files are recordings if they are binary, or a reader recognises them.
 _LISTS = (".csv", ".toml", ".txt")
 _HEAD_BYTES = 4096
@@ -70,10 +70,10 @@ def _stamps(path: Path, out: Path) -> list[Stamp]:
         return stamps_in(path, out)
     if not os.path.isfile(path):
         return []
-    own = path.name.split(".")[0]
-    beside = sorted(p for p in path.parent.iterdir() if p.name.split(".")[0] == own)
-    beside += [path.parent / name for name in _SIDECARS]
-    return [stamp(p) for p in beside if p.is_file()]
+    stem = path.name.split(".")[0]
+    siblings = sorted(p for p in path.parent.iterdir() if p.name.split(".")[0] == stem)
+    siblings += [path.parent / name for name in _SIDECARS]
+    return [stamp(p) for p in siblings if p.is_file()]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class _Row:
     options: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_jobs(given: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, ...]:
+def read_jobs(paths: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, ...]:
     """Return the jobs of recordings, globs of recordings, and lists.
 
     A list is a table (.csv, .toml), or text with one path or glob per line; relative ones refer to
@@ -94,7 +94,7 @@ def read_jobs(given: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, 
 
     Parameters
     ----------
-    given
+    paths
         Paths of lists and of recordings, and globs of recordings.
     run_arguments
         Converts the options of a row to arguments of `tofuse run`; it also gets the folder that
@@ -107,33 +107,33 @@ def read_jobs(given: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, 
     """
     jobs: dict[str, Job] = {}  # by the name in lower case, as some systems ignore case
     seen: set[tuple[object, ...]] = set()
-    for base, row in (each for path in given for each in _rows(path)):
+    for base, row in (each for path in paths for each in _rows(path)):
         options = dict(row.options)
         name, memory = options.pop("name", ""), options.pop("memory", "")
-        wanted = _bytes_of(memory, row.where) if memory else None
+        memory_bytes = _bytes_of(memory, row.where) if memory else None
         arguments = run_arguments(options, base, row.where)
-        found = _matches(row, base)
-        if name and len(found) > 1:
+        matches = _matches(row, base)
+        if name and len(matches) > 1:
             raise InputError(
-                f"{row.pattern} matches {len(found)} recordings, but there is one name, {name}",
+                f"{row.pattern} matches {len(matches)} recordings, but there is one name, {name}",
                 where=row.where,
                 remedy="leave out the name, or list the recordings one by one",
             )
-        for recording in found:
-            same = os.path.realpath(recording), arguments, name
-            if same in seen:
+        for recording in matches:
+            identity = os.path.realpath(recording), arguments, name
+            if identity in seen:
                 continue
-            called = _check_name(name, jobs, row.where) if name else _unique_name(recording, jobs)
-            seen.add(same)
-            jobs[called.lower()] = Job(called, recording, arguments, wanted)
+            job_name = _check_name(name, jobs, row.where) if name else _unique_name(recording, jobs)
+            seen.add(identity)
+            jobs[job_name.lower()] = Job(job_name, recording, arguments, memory_bytes)
     if not jobs:
-        names = ", ".join(map(str, given))
+        names = ", ".join(map(str, paths))
         raise InputError("lists no recording", where=names, remedy="add a path or glob per line")
     return tuple(jobs.values())
 
 
 def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
-    """Yield the rows of a list, or one for a recording or glob, and what they are relative to."""
+    """Yield the rows of a list, or one for a recording or glob, and the base of relative paths."""
     if not _is_list(path):
         yield Path.cwd(), _Row(str(path), str(path))
         return
@@ -169,21 +169,21 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
         raise InputError(
             f"is not a table ({error})", where=path, remedy="check the file"
         ) from error
-    head = [cell.strip() for cell in lines[0]] if lines else []
-    if len(set(head)) != len(head) or "" in head:
-        names = ", ".join(head)
+    header = [cell.strip() for cell in lines[0]] if lines else []
+    if len(set(header)) != len(header) or "" in header:
+        names = ", ".join(header)
         raise InputError(
             f"has the column names {names}", where=path, remedy="name each column once"
         )
     for k, cells in enumerate(lines[1:]):
         where = f"{path}: row {k + 1}"
-        if len(cells) != len(head):
+        if len(cells) != len(header):
             raise InputError(
-                f"has {len(cells)} cells, but there are {len(head)} columns",
+                f"has {len(cells)} cells, but there are {len(header)} columns",
                 where=where,
                 remedy="use one cell per column, and quote cells that contain a comma",
             )
-        yield _row(dict(zip(head, (cell.strip() for cell in cells), strict=True)), where)
+        yield _row(dict(zip(header, (cell.strip() for cell in cells), strict=True)), where)
 
 
 def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
@@ -225,15 +225,15 @@ def _matches(row: _Row, base: Path) -> list[str]:
     path = os.path.join(base, pattern)
     if not has_magic(pattern) or os.path.exists(path):
         return [str(Path(path))]
-    every = glob(os.path.join(escape(str(base)), pattern), recursive=True)
-    found = sorted(map(Path, every), key=_path_order)
-    if not found:
+    matches = glob(os.path.join(escape(str(base)), pattern), recursive=True)
+    paths = sorted(map(Path, matches), key=_path_order)
+    if not paths:
         raise InputError(
             f"nothing matches {row.pattern}",
             where=row.where,
             remedy=f"check the pattern; relative ones refer to {base}",
         )
-    return [str(p) for p in found]
+    return [str(p) for p in paths]
 
 
 def _path_order(path: Path) -> list[list[tuple[int, int, str]]]:
@@ -254,7 +254,7 @@ def _check_name(name: str, taken: Iterable[str], where: str) -> str:
 
 
 def _unique_name(recording: str, taken: Iterable[str]) -> str:
-    """The recording's own name, made unique by the folders above it, or a number.
+    """The recording's name, made unique by the folders above it, or a number.
 
     Recordings that are appended to a list don't change earlier names.
     """
@@ -275,7 +275,7 @@ def _unique_name(recording: str, taken: Iterable[str]) -> str:
 
 
 def _safe(name: str) -> str:
-    """The name with characters replaced that are special in a path, a page or a shell."""
+    """The name with characters replaced that are special in a path, in HTML or in a shell."""
     name = re.sub(r"[^\w.-]+", "_", name)[-_MAX_NAME_LENGTH:]
     return re.sub(r"^[.-]+|[.]+$", "_", name) or "_"
 

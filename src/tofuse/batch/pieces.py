@@ -22,9 +22,9 @@ from tofuse.kernels.threads import serial_chunks
 R = TypeVar("R")
 
 _POLL_S = 1.0  # interval at which the scheduler and its workers are checked
-_CHUNK = 4  # small pieces that are sent together: each takes a fraction of a second
-_QUEUED = 2  # tasks per thread of the workers, so that the next one is there when one is done
-_MAX_ATTEMPTS = 3  # to send a piece, before it is done locally
+_CHUNK = 4  # small pieces per task: each takes a fraction of a second
+_TASKS_PER_THREAD = 2  # so that the next one is present when one is done
+_MAX_ATTEMPTS = 3  # to submit a piece, before it is done locally
 
 # Packages whose version influences results.
 _PACKAGES = ("numpy", "scipy", "numba")
@@ -59,8 +59,8 @@ class DaskExecutor(Executor):
     def __init__(self, address: str, notify: Callable[[str], None]) -> None:
         self._address, self._notify = address, notify
         self._client: Any = connect(address, "leave it out")
-        self._given_up = False
-        self._looked, self._threads = -_POLL_S, 0
+        self._abandoned = False
+        self._polled_at, self._threads = -_POLL_S, 0
         self.n_remote = 0
         try:
             self._check_workers()
@@ -72,73 +72,77 @@ class DaskExecutor(Executor):
         self, function: Callable[..., R], count: int, arguments: Arguments, *, large: bool = False
     ) -> list[R]:
         """See `Executor.map`."""
-        found: dict[int, R] = {}
-        if not self._given_up:
-            together = 1 if large else _CHUNK
-            parts = [range(a, min(a + together, count)) for a in range(0, count, together)]
-            found = self._spread(function, parts, arguments, 1 if large else _QUEUED)
-            self.n_remote += len(found)
-        left = [k for k in range(count) if k not in found]
+        results: dict[int, R] = {}
+        if not self._abandoned:
+            chunk = 1 if large else _CHUNK
+            parts = [range(a, min(a + chunk, count)) for a in range(0, count, chunk)]
+            results = self._run_on_cluster(
+                function, parts, arguments, 1 if large else _TASKS_PER_THREAD
+            )
+            self.n_remote += len(results)
+        remaining = [k for k in range(count) if k not in results]
         # An error of a piece is raised here as well.
-        here = LocalExecutor().map(function, len(left), lambda k: arguments(left[k]), large=large)
-        found |= dict(zip(left, here, strict=True))
-        return [found[k] for k in range(count)]
+        local_results = LocalExecutor().map(
+            function, len(remaining), lambda k: arguments(remaining[k]), large=large
+        )
+        results |= dict(zip(remaining, local_results, strict=True))
+        return [results[k] for k in range(count)]
 
     def close(self) -> None:
         """Disconnect from the cluster."""
         self._client.close(timeout=TIMEOUT_S)
 
-    def _spread(
+    def _run_on_cluster(
         self,
         function: Callable[..., R],
         parts: list[range],
         arguments: Arguments,
-        waiting: int,
+        tasks_per_thread: int,
     ) -> dict[int, R]:
         """The results that the cluster returns, by number of the piece."""
-        found: dict[int, R] = {}
-        todo = deque((k, 1) for k in range(len(parts)))
+        results: dict[int, R] = {}
+        queue = deque((k, 1) for k in range(len(parts)))
         running: dict[int, tuple[int, Any]] = {}
-        ended: SimpleQueue[int] = SimpleQueue()
-        while todo or running:
-            slots = waiting * self._slots()
+        finished: SimpleQueue[int] = SimpleQueue()
+        while queue or running:
+            slots = tasks_per_thread * self._slots()
             if not slots:
-                self._give_up()
+                self._abandon()
                 break
             try:
-                while todo and len(running) < slots:
-                    part, times = todo.popleft()
-                    future = self._submitted(function, [arguments(k) for k in parts[part]])
-                    running[part] = times, future
-                    future.add_done_callback(lambda _, part=part: ended.put(part))
-                part = ended.get(timeout=_POLL_S)
+                while queue and len(running) < slots:
+                    part, attempt = queue.popleft()
+                    future = self._submit(function, [arguments(k) for k in parts[part]])
+                    running[part] = attempt, future
+                    future.add_done_callback(lambda _, part=part: finished.put(part))
+                part = finished.get(timeout=_POLL_S)
             except Empty:
                 continue
-            except _LOST:
-                self._give_up()
+            except _DISCONNECTED:
+                self._abandon()
                 break
-            times, future = running.pop(part)
+            attempt, future = running.pop(part)
             if future.status == "finished":
-                results = self._result(future)
-                found |= dict(zip(parts[part], results, strict=True)) if results else {}
+                values = self._result(future)
+                results |= dict(zip(parts[part], values, strict=True)) if values else {}
             elif future.status == "error":
-                self._give_up(f"a worker failed ({self._error(future)})")
+                self._abandon(f"a worker failed ({self._error(future)})")
                 break
-            elif times < _MAX_ATTEMPTS:  # its worker died with its arguments
-                todo.append((part, times + 1))
-        return found
+            elif attempt < _MAX_ATTEMPTS:  # its worker died with its arguments
+                queue.append((part, attempt + 1))
+        return results
 
-    def _submitted(self, function: Callable[..., R], pieces: list[tuple[Any, ...]]) -> Any:
-        """A future of what some pieces return."""
+    def _submit(self, function: Callable[..., R], pieces: list[tuple[Any, ...]]) -> Any:
+        """A future of the results of pieces."""
         # Arguments go to a worker, and not into the scheduler's memory.
-        (sent,) = self._client.scatter([pieces], hash=False)
-        return self._client.submit(_run_pieces, function, sent, _program(), pure=False)
+        (remote_pieces,) = self._client.scatter([pieces], hash=False)
+        return self._client.submit(_run_pieces, function, remote_pieces, _environment(), pure=False)
 
     def _result(self, future: Any) -> list[Any] | None:
         """The result of a future; None if it was lost with its worker."""
         try:
             return cast("list[Any]", future.result(timeout=TIMEOUT_S))
-        except Exception:  # whatever it is: the piece is done locally
+        except Exception:  # of any kind: the piece is done locally
             return None
 
     def _error(self, future: Any) -> str:
@@ -149,57 +153,59 @@ class DaskExecutor(Executor):
         """The number of pieces that the workers can do at a time; 0 without workers."""
         if self._client.status != "running":
             return 0
-        if monotonic() - self._looked >= _POLL_S:
+        if monotonic() - self._polled_at >= _POLL_S:
             try:
                 workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
             except OSError:
                 return 0
-            self._looked, self._threads = monotonic(), sum(int(w["nthreads"]) for w in workers)
+            self._polled_at, self._threads = monotonic(), sum(int(w["nthreads"]) for w in workers)
         return self._threads
 
-    def _give_up(self, problem: str = "") -> None:
-        self._given_up = True
-        gone = self._client.status != "running"
-        problem = problem or ("the scheduler " + ("disappeared" if gone else "has no workers"))
+    def _abandon(self, problem: str = "") -> None:
+        self._abandoned = True
+        disconnected = self._client.status != "running"
+        problem = problem or (
+            "the scheduler " + ("disappeared" if disconnected else "has no workers")
+        )
         self._notify(f"{self._address}: {problem}; {_FALLBACK}")
 
     def _check_workers(self) -> None:
         """Refuse workers that would give different results."""
         try:
-            programs = self._client.run(_program)
+            environments = self._client.run(_environment)
         except Exception as error:
-            if not cannot_deserialize(error) and not isinstance(error, _LOST):
+            if not cannot_deserialize(error) and not isinstance(error, _DISCONNECTED):
                 raise
-            programs = {self._address: ("no tofuse",)}
-        for worker, program in programs.items():
-            for here, there in zip(_program(), program, strict=False):
-                if here != there:
+            environments = {self._address: ("no tofuse",)}
+        for worker, environment in environments.items():
+            for local, remote in zip(_environment(), environment, strict=False):
+                if local != remote:
                     raise InputError(
-                        f"a worker has {there}, but this machine has {here}",
+                        f"a worker has {remote}, but this machine has {local}",
                         where=str(worker),
                         remedy="results would differ: install the same versions there",
                     )
 
 
 # Errors if a cluster disappears between two requests.
-_LOST = (OSError, RuntimeError, ValueError)
+_DISCONNECTED = (OSError, RuntimeError, ValueError)
 
 
 @cache
-def _program() -> tuple[str, ...]:
-    """What determines the bytes of a result, apart from its input."""
+def _environment() -> tuple[str, ...]:
+    """Versions and platform: what determines the bytes of a result, apart from its input."""
     packages = [f"{name} {version(name)}" for name in _PACKAGES]
     return f"tofuse {__version__}", *packages, platform.machine()
 
 
 def _run_pieces(
-    function: Callable[..., R], pieces: list[tuple[Any, ...]], program: tuple[str, ...]
+    function: Callable[..., R], pieces: list[tuple[Any, ...]], environment: tuple[str, ...]
 ) -> list[R]:
-    """Do some pieces in the process of a worker."""
-    if program != _program():  # the worker joined after the check
+    """Do pieces in the process of a worker."""
+    if environment != _environment():  # the worker joined after the check
         raise InputError("a worker has another version", where=platform.node())
     _one_blas_thread()
-    with serial_chunks():  # other threads of the worker have pieces of their own
+    with serial_chunks():  # the other threads of the worker do other pieces
         return [function(*arguments) for arguments in pieces]
 
 

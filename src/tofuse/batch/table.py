@@ -78,22 +78,22 @@ def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
         If they can't be written; earlier ones are unchanged then.
     """
     with locked(folder.lock("-table")):
-        known = [(job, folder.record(job)) for job in jobs]
-        ended = [(job, record) for job, record in known if record is not None and record.ended]
+        records = [(job, folder.record(job)) for job in jobs]
+        ended = [(job, record) for job, record in records if record is not None and record.ended]
         write_text(folder.csv, _csv(ended))
-        running = sum(record is not None and record.state == "running" for _, record in known)
+        running = sum(record is not None and record.state == "running" for _, record in records)
         write_text(folder.html, _html(ended, len(jobs), running, folder))
 
 
 def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
-    text = io.StringIO()
-    out = csv.writer(text, lineterminator="\n")
-    out.writerow(COLUMNS)
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(COLUMNS)
     for job, record in ended:
-        facts = {**vars(record), "name": job.name, "recording": job.recording}
-        facts["options"] = " ".join(job.arguments)
-        out.writerow(["" if facts[c] is None else facts[c] for c in COLUMNS])
-    return text.getvalue()
+        values = {**vars(record), "name": job.name, "recording": job.recording}
+        values["options"] = " ".join(job.arguments)
+        writer.writerow(["" if values[c] is None else values[c] for c in COLUMNS])
+    return buffer.getvalue()
 
 
 def _html(
@@ -160,6 +160,6 @@ def duration(seconds: float) -> str:
     """Return a duration as text: "4.2 s", "3 min 20 s", "2 h 5 min"."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, remainder = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {remainder} s"

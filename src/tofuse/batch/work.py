@@ -31,7 +31,7 @@ _NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
 
 @dataclass(frozen=True)
 class Task:
-    """A job, and how to run it.
+    """A job, and the parameters of its run.
 
     Attributes
     ----------
@@ -76,10 +76,10 @@ def work(task: Task, on_start: Callable[[subprocess.Popen[bytes]], None] | None 
             f"{platform.node()} has tofuse {__version__}, not {task.version}: install that version"
         )
     with locked(folder.lock(job.name)) as handle:
-        before = folder.record(job)
-        if before is not None and folder.finished(job):
-            return before
-        record = Record(job.key(folder.path), "running", _count_starts(before), platform.node())
+        previous = folder.record(job)
+        if previous is not None and folder.finished(job):
+            return previous
+        record = Record(job.key(folder.path), "running", _count_starts(previous), platform.node())
         folder.write(job, record)
         process = _start_process(task, folder, handle)
         with process:
@@ -117,10 +117,10 @@ def _refused(reason: str) -> Record:
     return Record("", "failed", host=platform.node(), reason=reason)
 
 
-def _count_starts(before: Record | None) -> int:
+def _count_starts(previous: Record | None) -> int:
     """Number of starts of a job since it ended last, including this one."""
-    on_its_way = before is not None and before.state in ("running", "killed")
-    return before.starts + 1 if before is not None and on_its_way else 1
+    in_progress = previous is not None and previous.state in ("running", "killed")
+    return previous.starts + 1 if previous is not None and in_progress else 1
 
 
 def _outcome(record: Record, status: int, output: bytes, folder: BatchFolder, job: Job) -> Record:
@@ -144,14 +144,14 @@ def _outcome(record: Record, status: int, output: bytes, folder: BatchFolder, jo
 
 def _done(record: Record, result: dict[str, Any], run: str) -> Record:
     accuracy, counts = result["accuracy"], result["frames"]
-    known = accuracy["assessed"] and accuracy["position_m"] is not None
+    bounded = accuracy["assessed"] and accuracy["position_m"] is not None
     return replace(
         record,
         run=run,
         verdict=result["verdict"],
         reason=result["reasons"][0]["text"] if result["reasons"] else "",
-        position_m=accuracy["position_m"] if known else None,
-        relative=accuracy["relative"] if known else None,
+        position_m=accuracy["position_m"] if bounded else None,
+        relative=accuracy["relative"] if bounded else None,
         frames=sum(counts.values()) - counts["skipped"],
         posed=result["posed"],
         seconds=result["seconds"],

@@ -1,4 +1,4 @@
-"""What runs the jobs: a protocol, and the processes of this machine."""
+"""Workers that run the jobs: a protocol, and the processes of this machine."""
 
 from __future__ import annotations
 
@@ -96,11 +96,11 @@ class LocalWorkers(Workers):
 
 
 def machine_memory() -> int | None:
-    """Return the memory limit of this process in bytes; None where not known."""
+    """Return the memory limit of this process in bytes; None if unknown."""
     if sys.platform == "win32":
         return None
-    found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:  # of a container
-        return min(found, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+        return min(physical, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     except (OSError, ValueError):
-        return found
+        return physical

@@ -13,12 +13,13 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.recordings.frames import RangeFrame
 
-# Small images are enlarged to this many columns, as the detector needs large squares.
+# Small images are enlarged to this width, by at most this factor, as the detector needs large
+# squares.
 _COLUMNS = 640
-_MOST = 4
-_DARKEST, _BRIGHTEST = 1.0, 99.0  # percentiles that become black and white
+_MAX_SCALE = 4
+_BLACK_PERCENTILE, _WHITE_PERCENTILE = 1.0, 99.0  # mapped to black and white
 # Size of the window of local contrast, relative to the image's width.
-_LOCAL = 0.25
+_WINDOW = 0.25
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,10 @@ class Board:
         InputError
             If the text has another form.
         """
-        found = re.fullmatch(r"\s*(\d{1,3})\s*x\s*(\d{1,3})\s*:\s*([\d.eE+-]{1,20})\s*", text)
+        match = re.fullmatch(r"\s*(\d{1,3})\s*x\s*(\d{1,3})\s*:\s*([\d.eE+-]{1,20})\s*", text)
         try:
-            if found:
-                return cls(int(found[1]), int(found[2]), float(found[3]))
+            if match:
+                return cls(int(match[1]), int(match[2]), float(match[3]))
         except ValueError:
             pass
         raise InputError(
@@ -90,7 +91,7 @@ class Board:
 def board_image(frame: RangeFrame, channel: str) -> Float32 | None:
     """Return the image (H, W) of a frame to detect a board in, "amplitude" or "color", or None.
 
-    Colour that is not registered to depth belongs to another lens and is not used.
+    Colour that is not registered to depth is from another lens and is not used.
     """
     if channel == "color":
         image = frame.color_image
@@ -108,7 +109,7 @@ def find_corners(image: Float32, board: Board) -> Float64 | None:
     enlarged and searched by the detector of Duda and Frese (2018), which refines corners to a
     fraction of a pixel.
     """
-    scale = int(np.clip(np.ceil(_COLUMNS / image.shape[1]), 1, _MOST))
+    scale = int(np.clip(np.ceil(_COLUMNS / image.shape[1]), 1, _MAX_SCALE))
     for stretched in (_stretch_contrast(image), _stretch_contrast(_flatten_illumination(image))):
         large = cv2.resize(stretched, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         found, corners = cv2.findChessboardCornersSB(
@@ -123,10 +124,10 @@ def find_corners(image: Float32, board: Board) -> Float64 | None:
 
 
 def _stretch_contrast(image: Float32) -> UInt8:
-    known = image[np.isfinite(image) & (image > 0)]
-    if known.size == 0:
+    valid = image[np.isfinite(image) & (image > 0)]
+    if valid.size == 0:
         return np.zeros(image.shape, np.uint8)
-    low, high = np.percentile(known, [_DARKEST, _BRIGHTEST])
+    low, high = np.percentile(valid, [_BLACK_PERCENTILE, _WHITE_PERCENTILE])
     level = (np.nan_to_num(image) - low) / max(high - low, 1e-9)
     return (np.clip(level, 0, 1) * 255).astype(np.uint8)
 
@@ -134,5 +135,5 @@ def _stretch_contrast(image: Float32) -> UInt8:
 def _flatten_illumination(image: Float32) -> Float32:
     """Divide by the local mean, which compensates the falloff of the illumination."""
     bright = np.maximum(np.nan_to_num(image), 0) + 1.0
-    around = cv2.GaussianBlur(bright, (0, 0), _LOCAL * image.shape[1] / 2)
-    return np.asarray(bright / around, np.float32)
+    local_mean = cv2.GaussianBlur(bright, (0, 0), _WINDOW * image.shape[1] / 2)
+    return np.asarray(bright / local_mean, np.float32)

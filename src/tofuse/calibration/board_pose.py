@@ -1,4 +1,4 @@
-"""Pose of a checkerboard seen by a calibrated camera."""
+"""Pose of a checkerboard in the frame of a calibrated camera."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64,
     if not np.isfinite(rays).all():
         return None
     points = board.points.astype(float)
-    seen = rays.astype(float)
+    observed = rays.astype(float)
     try:
-        found, rvec, tvec = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        found, rvec, tvec = cv2.solvePnP(points, observed, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
         if not found:
             return None
-        rvec, tvec = cv2.solvePnPRefineLM(points, seen, np.eye(3), None, rvec, tvec)
+        rvec, tvec = cv2.solvePnPRefineLM(points, observed, np.eye(3), None, rvec, tvec)
     except cv2.error:
         return None
     T = pose_of(rvec, tvec)
-    missed = camera.project(se3.transform(T, points)) - corners
-    rms = float(np.sqrt((missed**2).sum(1).mean()))
+    errors = camera.project(se3.transform(T, points)) - corners
+    rms = float(np.sqrt((errors**2).sum(1).mean()))
     return (T, rms) if np.isfinite(rms) else None
 
 

@@ -17,7 +17,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
-_KEPT = (
+_METADATA = (
     "depth_unit_m",
     "depth_kind",
     "frame_rate_hz",
@@ -29,15 +29,15 @@ _KEPT = (
 
 def recording_fields(recording: Recording) -> dict[str, Any]:
     """Return the fields of camera.json that describe a recording's images, without the lens."""
-    own = Path(recording.path) / "camera.json"
-    if is_folder(Path(recording.path)) and is_file(own):
-        return {key: value for key, value in read_json(own).items() if key not in _LENS}
-    known = {key: recording.metadata.get(key) for key in _KEPT}
-    found = {key: value for key, value in known.items() if value is not None}
+    path = Path(recording.path) / "camera.json"
+    if is_folder(Path(recording.path)) and is_file(path):
+        return {key: value for key, value in read_json(path).items() if key not in _LENS}
+    metadata = {key: recording.metadata.get(key) for key in _METADATA}
+    present = {key: value for key, value in metadata.items() if value is not None}
     frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)
     if frame is not None:
-        found.setdefault("depth_kind", frame.depth_kind)
-    return found
+        present.setdefault("depth_kind", frame.depth_kind)
+    return present
 
 
 def write_camera_json(
@@ -70,8 +70,10 @@ def write_camera_json(
     path = Path(path)
     table = path.with_name("rays.npy")
     files = [table, path] if isinstance(camera, RayTable) else [path]
-    if not overwrite and (there := [file for file in files if file.exists()]):
-        raise OutputError("exists already", where=there[0], remedy="use --overwrite to replace it")
+    if not overwrite and (existing := [file for file in files if file.exists()]):
+        raise OutputError(
+            "exists already", where=existing[0], remedy="use --overwrite to replace it"
+        )
     if table.exists() and table not in files:
         raise OutputError(
             "would override the lens that is written to the same folder",

@@ -24,13 +24,13 @@ from tofuse.geometry.cameras import Camera
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.sensor.depth_correction import DepthCorrection
 
-_KNOT_M = 0.04
+_KNOT_SPACING_M = 0.04
 _MAX_KNOTS = 200
-_PIXELS = 6000  # used for the curve; offsets are estimated from all pixels
+_CURVE_PIXELS = 6000  # used for the curve; offsets are estimated from all pixels
 _ROUNDS = 8
 _HUBER = 2.0  # standard deviations
-# Prior standard deviations in m: of the curve, of its second differences, of the offsets; and of
-# the curve's mean and slope without any known pose.
+# Prior standard deviations in m: of the curve, its second differences and the offsets; and of the
+# curve's mean and slope without any known pose.
 _CURVE_M, _BEND_M, _OFFSET_M = 0.1, 0.004, 0.02
 # While planes are estimated with known board poses, pixel offsets are nearly free: otherwise the
 # priors of thousands of pixels would outweigh the poses.
@@ -39,7 +39,7 @@ _MEAN_M, _SLOPE = 0.002, 0.001
 _FLOOR_M = 0.001  # lower limit of the noise
 _MIN_SPREAD_M = 0.3
 _MAX_SHAPE_M = 0.004  # standard deviation of the curve without mean and slope
-_SMOOTH = 1 / 50  # width of the blur, relative to the image's width
+_BLUR_WIDTH = 1 / 50  # width of the blur, relative to the image's width
 
 
 @dataclass(frozen=True)
@@ -107,26 +107,26 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     camera
         Of the views.
     where
-        Name of the recording, for error messages.
+        Name of the recording in error messages.
 
     Raises
     ------
     InputError
         If the planes' ranges vary too little, or the curve is too uncertain.
     """
-    everything = np.concatenate([view.measured_m for view in views])
-    low, high = (float(v) for v in np.quantile(everything, [0.005, 0.995]))
+    ranges = np.concatenate([view.measured_m for view in views])
+    low, high = (float(v) for v in np.quantile(ranges, [0.005, 0.995]))
     if high - low < _MIN_SPREAD_M:
         raise InputError(
             f"shows planes from {low:.2f} to {high:.2f} m only",
             where=where,
             remedy="record a wall from several distances, over the range that is to be corrected",
         )
-    count = int(np.clip(np.ceil((high - low) / _KNOT_M), 4, _MAX_KNOTS)) + 1
+    count = int(np.clip(np.ceil((high - low) / _KNOT_SPACING_M), 4, _MAX_KNOTS)) + 1
     knots = np.linspace(low, high, count)
     shape = camera.height, camera.width
-    thinned = [_subsampled(view, shape) for view in views]
-    state = _solve(thinned, knots)
+    subsampled = [_subsampled(view, shape) for view in views]
+    state = _solve(subsampled, knots)
     if not state.shape_sigma < _MAX_SHAPE_M:
         raise InputError(
             f"shows {len(views)} planes, which determine the curve only to "
@@ -135,15 +135,15 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
             remedy="record a wall from 20 places or more, at all distances, tilted to all sides",
         )
     residuals = _residuals(views, knots, state)
-    offsets = _offsets(views, residuals, shape)
+    offsets = _pixel_offsets(views, residuals, shape)
     # The mean of the offsets is part of the curve.
-    seen = np.unique(np.concatenate([view.pixels for view in views]))
-    mean = float(offsets.ravel()[seen].mean())
+    observed = np.unique(np.concatenate([view.pixels for view in views]))
+    mean = float(offsets.ravel()[observed].mean())
     offsets -= mean
     curve = state.curve + mean
     after = [r - offsets.ravel()[v.pixels] - mean for r, v in zip(residuals, views, strict=True)]
-    flat = np.zeros_like(curve)
-    before = _residuals(views, knots, _fit_planes(thinned, knots, flat))
+    zero_curve = np.zeros_like(curve)
+    before = _residuals(views, knots, _fit_planes(subsampled, knots, zero_curve))
     constant, scale = state.sigma
     return DepthFit(
         DepthCorrection(knots, curve, offsets.astype(np.float32)),
@@ -152,26 +152,26 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
         (low, high),
         _robust_rms(np.concatenate(before)),
         _robust_rms(np.concatenate(after)),
-        _patches(views, before, shape),
-        _patches(views, after, shape),
+        _patch_rms(views, before, shape),
+        _patch_rms(views, after, shape),
         constant,
         scale,
-        tuple(_warnings(views, len(seen) / (shape[0] * shape[1]))),
+        tuple(_warnings(views, len(observed) / (shape[0] * shape[1]))),
     )
 
 
-def compose(first: DepthCorrection, then: DepthCorrection) -> DepthCorrection:
+def compose(first: DepthCorrection, second: DepthCorrection) -> DepthCorrection:
     """Return the composition of two corrections, the second applied after the first.
 
     The first one's offsets change the range at which the second is evaluated by millimetres, which
     is neglected.
     """
-    ends = [then.range_m[0], then.range_m[-1]]
-    back = then.range_m + np.interp(then.range_m, first.range_m, first.bias_m)
-    knots = np.unique(np.concatenate([first.range_m, back, ends]))
+    ends = [second.range_m[0], second.range_m[-1]]
+    before_first = second.range_m + np.interp(second.range_m, first.range_m, first.bias_m)
+    knots = np.unique(np.concatenate([first.range_m, before_first, ends]))
     bias = np.interp(knots, first.range_m, first.bias_m)
-    bias = bias + np.interp(knots - bias, then.range_m, then.bias_m)
-    a, b = first.pixel_bias_m, then.pixel_bias_m
+    bias = bias + np.interp(knots - bias, second.range_m, second.bias_m)
+    a, b = first.pixel_bias_m, second.pixel_bias_m
     pixel = b if a is None else a if b is None else a + b
     return DepthCorrection(knots, bias, pixel)
 
@@ -188,7 +188,7 @@ class _State:
 
 def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
     """Return the view on every n-th row and column, the same in all views."""
-    step = max(1, round(float(np.sqrt(shape[0] * shape[1] / _PIXELS))))
+    step = max(1, round(float(np.sqrt(shape[0] * shape[1] / _CURVE_PIXELS))))
     row, column = np.divmod(view.pixels, shape[1])
     keep = (row % step == step // 2) & (column % step == step // 2)
     return PlaneView(
@@ -213,77 +213,77 @@ def _solve(
     fixed: Float64 | None = None,
 ) -> _State:
     """Run Gauss-Newton over planes and curve, unless the curve is `fixed`."""
-    many = len(knots)
+    knot_count = len(knots)
     counts = [len(view.pixels) for view in views]
     measured = np.concatenate([view.measured_m for view in views])
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
-    rays = np.concatenate([view.directions for view in views])
-    which = np.repeat(np.arange(len(views)), counts)
+    directions = np.concatenate([view.directions for view in views])
+    view_of = np.repeat(np.arange(len(views)), counts)
     pixels, pixel = np.unique(np.concatenate([view.pixels for view in views]), return_inverse=True)
     start = np.stack([view.plane for view in views])
-    planes, curve = start.copy(), np.zeros(many) if fixed is None else fixed.copy()
+    planes, curve = start.copy(), np.zeros(knot_count) if fixed is None else fixed.copy()
     offsets = np.zeros(len(pixels))
-    prior = _prior(knots, posed=_has_known_pose(views))
-    believed = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
-    size = many + 3 * len(views)
+    prior = _prior(knots, has_pose=_has_known_pose(views))
+    offset_sigma = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
+    size = knot_count + 3 * len(views)
     n = len(measured)
     scale = 1.0
     for _ in range(_ROUNDS):
-        true = 1 / np.einsum("nc,nc->n", planes[which], rays)
-        left, fraction = _interval(_measured_of_true(true, knots, curve), knots)
-        bias = curve[left] * (1 - fraction) + curve[left + 1] * fraction
+        true = 1 / np.einsum("nc,nc->n", planes[view_of], directions)
+        knot, fraction = _interval(_measured_of_true(true, knots, curve), knots)
+        bias = curve[knot] * (1 - fraction) + curve[knot + 1] * fraction
         residual = measured - true - bias - offsets[pixel]
         scale = max(_robust_rms(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
         weight *= np.minimum(1, _HUBER * scale * sigma / np.maximum(np.abs(residual), 1e-12))
         # Columns: two knots, three parameters of the plane. d(true) = -true^2 ray . d(plane).
-        slope = -(true**2)[:, None] * rays
-        columns = np.stack([left, left + 1, *(many + 3 * which + a for a in range(3))], 1)
+        slope = -(true**2)[:, None] * directions
+        columns = np.stack([knot, knot + 1, *(knot_count + 3 * view_of + a for a in range(3))], 1)
         values = np.concatenate([np.stack([1 - fraction, fraction], 1), slope], 1)
         A = csr_array((values.ravel(), columns.ravel(), np.arange(0, 5 * n + 1, 5)), (n, size))
         AtW = (diags_array(weight) @ A).T.tocsr()
         normal = (AtW @ A).toarray()
         # The offsets are solved for afterwards.
         target = residual + offsets[pixel]
-        right = AtW @ target
+        rhs = AtW @ target
         by_pixel = csr_array((weight, (pixel, np.arange(n))), (len(pixels), n))
-        total = by_pixel.sum(1) + 1 / believed**2
+        total = by_pixel.sum(1) + 1 / offset_sigma**2
         if fixed is None:
             coupled = by_pixel @ A
             normal -= (coupled.T @ (diags_array(1 / total) @ coupled)).toarray()
-            alone = (by_pixel @ target) / total
-            right -= coupled.T @ alone
-            # Their mean is part of the curve and fixed to 0, by the Sherman-Morrison formula.
+            own_offsets = (by_pixel @ target) / total
+            rhs -= coupled.T @ own_offsets
+            # The mean of the offsets is part of the curve and fixed to 0 (Sherman-Morrison).
             mean_weight = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
-            together = coupled.T @ (1 / total)
-            normal += mean_weight * np.outer(together, together)
-            right += mean_weight * together * alone.sum()
-            normal[:many, :many] += prior
-            right[:many] -= prior @ curve
+            coupled_mean = coupled.T @ (1 / total)
+            normal += mean_weight * np.outer(coupled_mean, coupled_mean)
+            rhs += mean_weight * coupled_mean * own_offsets.sum()
+            normal[:knot_count, :knot_count] += prior
+            rhs[:knot_count] -= prior @ curve
         for k, view in enumerate(views):
-            own = slice(many + 3 * k, many + 3 * k + 3)
-            normal[own, own] += view.information
-            right[own] += view.information @ (start[k] - planes[k])
-        free = slice(0, None) if fixed is None else slice(many, None)
+            block = slice(knot_count + 3 * k, knot_count + 3 * k + 3)
+            normal[block, block] += view.information
+            rhs[block] += view.information @ (start[k] - planes[k])
+        free = slice(0, None) if fixed is None else slice(knot_count, None)
         step = np.zeros(size)
         # Scale the columns, as those of planes and curve have different units.
         unit = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-12))
         scaled = normal[free, free] * unit[:, None] * unit
-        step[free] = unit * np.linalg.solve(scaled + 1e-10 * np.eye(len(unit)), unit * right[free])
-        curve = curve + step[:many]
-        planes = planes + step[many:].reshape(-1, 3)
+        step[free] = unit * np.linalg.solve(scaled + 1e-10 * np.eye(len(unit)), unit * rhs[free])
+        curve = curve + step[:knot_count]
+        planes = planes + step[knot_count:].reshape(-1, 3)
         if fixed is None:
-            alone = (by_pixel @ (target - A @ step)) / total
-            offsets = alone - mean_weight * alone.sum() / total
-    covariance = np.zeros((many, many))
+            own_offsets = (by_pixel @ (target - A @ step)) / total
+            offsets = own_offsets - mean_weight * own_offsets.sum() / total
+    covariance = np.zeros((knot_count, knot_count))
     if fixed is None:
         inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
-        covariance = (inverse * unit[:, None] * unit)[:many, :many]
-    weights = (np.bincount(left, minlength=many) + 1e-9).astype(np.float64)
-    rest = np.eye(many) - _mean_and_slope_basis(knots) @ _mean_and_slope_projector(
-        knots, np.ones(many)
+        covariance = (inverse * unit[:, None] * unit)[:knot_count, :knot_count]
+    weights = (np.bincount(knot, minlength=knot_count) + 1e-9).astype(np.float64)
+    shape_projector = np.eye(knot_count) - _mean_and_slope_basis(knots) @ _mean_and_slope_projector(
+        knots, np.ones(knot_count)
     )
-    variances = np.diag(rest @ covariance @ rest.T)
+    variances = np.diag(shape_projector @ covariance @ shape_projector.T)
     shape_sigma = float(np.sqrt(max(np.average(variances, weights=weights), 0)))
     return _State(curve, planes, _mean_and_slope_sigma(knots, weights, covariance), shape_sigma)
 
@@ -318,10 +318,10 @@ def _measured_of_true(true: Float64, knots: Float64, curve: Float64) -> Float64:
 
 
 def _interval(measured: Float64, knots: Float64) -> tuple[Intp, Float64]:
-    """Return the knot before each range (N,), and its fraction of the interval to the next one."""
-    place = (measured - knots[0]) / (knots[1] - knots[0])
-    left = np.clip(np.floor(place), 0, len(knots) - 2).astype(np.intp)
-    return left, np.clip(place - left, 0, 1)
+    """Return the knot before each range (N,), and the range's fraction of the knot interval."""
+    position = (measured - knots[0]) / (knots[1] - knots[0])
+    knot = np.clip(np.floor(position), 0, len(knots) - 2).astype(np.intp)
+    return knot, np.clip(position - knot, 0, 1)
 
 
 def _has_known_pose(views: Sequence[PlaneView]) -> bool:
@@ -329,14 +329,19 @@ def _has_known_pose(views: Sequence[PlaneView]) -> bool:
     return any(float(np.trace(view.information)) > 1 for view in views)
 
 
-def _prior(knots: Float64, *, posed: bool) -> Float64:
-    """Return the prior information (K, K) of a curve: small, smooth, and unless `posed` level."""
-    many = len(knots)
-    bend = np.diff(np.eye(many), 2, axis=0)
-    information = np.eye(many) / (_CURVE_M**2 * many) + bend.T @ bend / _BEND_M**2
-    if not posed:
-        level = _mean_and_slope_projector(knots, np.ones(many)) / np.array([[_MEAN_M], [_SLOPE]])
-        information += level.T @ level
+def _prior(knots: Float64, *, has_pose: bool) -> Float64:
+    """Return the prior information (K, K) of a curve: small, smooth, and level without a pose."""
+    knot_count = len(knots)
+    second_difference = np.diff(np.eye(knot_count), 2, axis=0)
+    information = (
+        np.eye(knot_count) / (_CURVE_M**2 * knot_count)
+        + second_difference.T @ second_difference / _BEND_M**2
+    )
+    if not has_pose:
+        mean_and_slope = _mean_and_slope_projector(knots, np.ones(knot_count)) / np.array(
+            [[_MEAN_M], [_SLOPE]]
+        )
+        information += mean_and_slope.T @ mean_and_slope
     return np.asarray(information)
 
 
@@ -350,12 +355,13 @@ def _residuals(views: Sequence[PlaneView], knots: Float64, state: _State) -> lis
     return out
 
 
-def _offsets(
+def _pixel_offsets(
     views: Sequence[PlaneView], residuals: Sequence[Float64], shape: tuple[int, int]
 ) -> Float64:
     """Estimate the offsets (H, W): a smooth part over the image, and a shrunken part per pixel.
 
-    The shrinkage follows from how much more pixels differ than by their noise (empirical Bayes).
+    The shrinkage follows from the variance between pixels in excess of their noise (empirical
+    Bayes).
     """
     size = shape[0] * shape[1]
     sums, weights = np.zeros(size), np.zeros(size)
@@ -363,37 +369,37 @@ def _offsets(
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
     scale = max(_robust_rms(joined / sigma), 0.1)
     for view, residual in zip(views, residuals, strict=True):
-        own = np.hypot(view.sigma_m, _FLOOR_M) * scale
+        sigmas = np.hypot(view.sigma_m, _FLOOR_M) * scale
         # The residual contains the offset, so the outlier threshold is large.
-        far = 3 * _OFFSET_M + 3 * own
-        weight = np.where(np.abs(residual) < far, 1 / own**2, 0)
+        max_residual = 3 * _OFFSET_M + 3 * sigmas
+        weight = np.where(np.abs(residual) < max_residual, 1 / sigmas**2, 0)
         np.add.at(sums, view.pixels, weight * residual)
         np.add.at(weights, view.pixels, weight)
     sums, weights = sums.reshape(shape), weights.reshape(shape)
     mean = np.divide(sums, weights, out=np.zeros(shape), where=weights > 0)
-    smooth = _blur_and_fill(sums, weights, max(2.0, _SMOOTH * shape[1]))
-    seen = weights > 0
-    apart = (mean - smooth)[seen]
-    limit = 3 * max(_robust_rms(apart), 1e-6)
-    typical = np.abs(apart) < limit
-    variance = float(np.mean(apart[typical] ** 2 - 1 / weights[seen][typical]))
-    own_weight = np.zeros(shape)
+    smooth = _blur_and_fill(sums, weights, max(2.0, _BLUR_WIDTH * shape[1]))
+    observed = weights > 0
+    deviation = (mean - smooth)[observed]
+    limit = 3 * max(_robust_rms(deviation), 1e-6)
+    inliers = np.abs(deviation) < limit
+    variance = float(np.mean(deviation[inliers] ** 2 - 1 / weights[observed][inliers]))
+    pixel_weight = np.zeros(shape)
     if variance > 0:
-        own_weight[seen] = variance / (variance + 1 / weights[seen])
-    return np.asarray(smooth + own_weight * (mean - smooth))
+        pixel_weight[observed] = variance / (variance + 1 / weights[observed])
+    return np.asarray(smooth + pixel_weight * (mean - smooth))
 
 
 def _blur_and_fill(sums: Float64, weights: Float64, width: float) -> Float64:
     """Blur a weighted mean, with increasing widths where there is no data."""
     out = np.zeros(sums.shape)
     missing = np.ones(sums.shape, bool)
-    least = 1e-3 * float(weights.max())
+    min_weight = 1e-3 * float(weights.max())
     while missing.any() and width < 4 * max(sums.shape):
         total = cv2.GaussianBlur(weights, (0, 0), width)
         blurred = cv2.GaussianBlur(sums, (0, 0), width)
-        new = missing & (total > least)
-        out[new] = blurred[new] / total[new]
-        missing &= ~new
+        filled = missing & (total > min_weight)
+        out[filled] = blurred[filled] / total[filled]
+        missing &= ~filled
         width *= 2
     return out
 
@@ -403,7 +409,7 @@ def _robust_rms(values: Float64) -> float:
     return float(np.median(np.abs(values))) / MEDIAN_OF_NORMAL
 
 
-def _patches(
+def _patch_rms(
     views: Sequence[PlaneView], residuals: Sequence[Float64], shape: tuple[int, int]
 ) -> float:
     """Return the rms of the medians over patches of a tenth of the image's width."""

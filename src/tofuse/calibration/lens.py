@@ -27,21 +27,21 @@ from tofuse.geometry.cameras import (
 from tofuse.recordings.recording import Recording
 
 MIN_VIEWS = 4
-_SEARCHED = 160  # maximum number of frames in which the board is searched
-_USED = 40  # maximum number of views
-_MOVED_PX = 3.0  # smallest motion of a corner between distinct views
-_WORSE = 3.0  # ratio to the median view's residual at which a view is an outlier
+_MAX_FRAMES = 160  # maximum number of frames in which the board is searched
+_MAX_VIEWS = 40  # maximum number of views
+_MIN_MOTION_PX = 3.0  # of the corner that moves most between distinct views
+_OUTLIER_RATIO = 3.0  # ratio to the median view's residual at which a view is an outlier
 _MIN_OUTLIER_PX = 0.3
 _MIN_SPREAD = np.radians(6)  # of the board's normals
 _MAX_SIGMA = 0.01  # of the focal length
-_COVERED = 0.5
+_MIN_COVERED = 0.5
 _CELLS = 8
 _INTRINSIC = ("fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """A frame in which the board was found.
+    """A frame in which the board was detected.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class LensFit:
     left_out
         Frames that were not used, each with the reason.
     covered
-        Fraction of the image that was covered by corners.
+        Fraction of the image covered by corners.
     warnings
         For the user, one line each.
     """
@@ -139,9 +139,9 @@ def board_views(
     views: list[BoardView] = []
     left_out: list[tuple[int, str]] = []
     camera: Camera | None = None
-    for item in recording.images(_SEARCHED):
-        seen = board_image(item, image)
-        if seen is None:
+    for item in recording.images(_MAX_FRAMES):
+        grey = board_image(item, image)
+        if grey is None:
             other = "color" if image == "amplitude" else "amplitude"
             raise InputError(
                 f"frame {item.index} has no {image} on the pixels of its depth",
@@ -149,7 +149,7 @@ def board_views(
                 remedy=f"use --image {other}, or record it",
             )
         camera = camera or item.camera
-        corners = find_corners(seen, board)
+        corners = find_corners(grey, board)
         if corners is None:
             left_out.append((item.index, "the board was not found"))
         else:
@@ -187,29 +187,29 @@ def calibrate_lens(
             remedy=f"use one of {', '.join(MODELS)}",
         )
     views, left_out, before = board_views(recording, board, image)
-    found = len(views)
-    views, same = _distinct(views)
-    left_out += [(k, "is like another view") for k in same]
-    _check_count(recording, board, views, found)
+    detected = len(views)
+    views, similar = _distinct(views)
+    left_out += [(k, "is like another view") for k in similar]
+    _check_count(recording, board, views, detected)
     size = before.width, before.height
     while True:
         fit = _fit_lens(model, views, board, size, recording.path)
         rms = fit.rms_by_view
         worst = int(np.argmax(rms))
-        limit = max(_WORSE * float(np.median(rms)), _MIN_OUTLIER_PX)
+        limit = max(_OUTLIER_RATIO * float(np.median(rms)), _MIN_OUTLIER_PX)
         if rms[worst] <= limit or len(views) <= MIN_VIEWS:
             break
         left_out.append((views[worst].index, f"misses by {rms[worst]:.2f} px"))
         del views[worst]
     _check_spread(recording, fit)
     covered = _covered(views, size)
-    own = [board_pose(before, view.corners, board) for view in views]
-    misses = [pose[1] for pose in own if pose is not None]
+    original_poses = [board_pose(before, view.corners, board) for view in views]
+    original_errors = [pose[1] for pose in original_poses if pose is not None]
     return LensFit(
         fit.camera,
         fit.sigma,
         _rms(rms),
-        _rms(np.array(misses)) if misses else float("nan"),
+        _rms(np.array(original_errors)) if original_errors else float("nan"),
         tuple(view.index for view in views),
         tuple(float(r) for r in rms),
         tuple(sorted(left_out)),
@@ -229,32 +229,32 @@ class _Fit:
 
 def _distinct(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
     """Return at most 40 evenly spaced distinct views, and the frames of the others."""
-    kept: list[BoardView] = []
-    same: list[int] = []
+    distinct: list[BoardView] = []
+    similar: list[int] = []
     for view in views:
-        if any(np.abs(view.corners - k.corners).max() < _MOVED_PX for k in kept):
-            same.append(view.index)
+        if any(np.abs(view.corners - k.corners).max() < _MIN_MOTION_PX for k in distinct):
+            similar.append(view.index)
         else:
-            kept.append(view)
-    if len(kept) > _USED:
-        chosen = set(np.linspace(0, len(kept) - 1, _USED).round().astype(int).tolist())
-        same += [view.index for k, view in enumerate(kept) if k not in chosen]
-        kept = [view for k, view in enumerate(kept) if k in chosen]
-    return kept, same
+            distinct.append(view)
+    if len(distinct) > _MAX_VIEWS:
+        chosen = set(np.linspace(0, len(distinct) - 1, _MAX_VIEWS).round().astype(int).tolist())
+        similar += [view.index for k, view in enumerate(distinct) if k not in chosen]
+        distinct = [view for k, view in enumerate(distinct) if k in chosen]
+    return distinct, similar
 
 
-def _check_count(recording: Recording, board: Board, views: list[BoardView], found: int) -> None:
+def _check_count(recording: Recording, board: Board, views: list[BoardView], detected: int) -> None:
     if len(views) >= MIN_VIEWS:
         return
     name = f"{board.columns} x {board.rows} inner corners"
-    if found == 0:
+    if detected == 0:
         raise InputError(
-            f"shows no board of {name} in {min(len(recording), _SEARCHED)} frames",
+            f"shows no board of {name} in {min(len(recording), _MAX_FRAMES)} frames",
             where=recording.path,
             remedy="check --board; have all of the board in view, matt, with a white margin",
         )
     raise InputError(
-        f"shows the board from {len(views)} distinct viewpoints (in {found} frames); at least "
+        f"shows the board from {len(views)} distinct viewpoints (in {detected} frames); at least "
         f"{MIN_VIEWS} are needed",
         where=recording.path,
         remedy="record it from 15 places or more, tilted to all sides and all over the image",
@@ -265,12 +265,12 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
     normals = np.stack([T[:3, 2] * np.sign(T[2, 2]) for T in fit.poses])
     mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
     spread = float(np.sqrt((np.arccos(np.clip(normals @ mean, -1, 1)) ** 2).mean()))
-    known = max(fit.sigma["fx"] / fit.camera.fx, fit.sigma["fy"] / fit.camera.fy)
-    if spread < _MIN_SPREAD or not known < _MAX_SIGMA:
+    relative_sigma = max(fit.sigma["fx"] / fit.camera.fx, fit.sigma["fy"] / fit.camera.fy)
+    if spread < _MIN_SPREAD or not relative_sigma < _MAX_SIGMA:
         raise InputError(
             f"shows the board from {len(fit.poses)} viewpoints too similar (tilts differ by "
             f"{np.degrees(spread):.0f} degrees rms, the focal length is known to "
-            f"{100 * known:.2g} %)",
+            f"{100 * relative_sigma:.2g} %)",
             where=recording.path,
             remedy="tilt it by 20 to 40 degrees to all sides, near and far; check --board",
         )
@@ -278,19 +278,19 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> float:
     """Return the fraction of a grid's cells that lie within the corners of a view."""
-    seen = np.zeros((_CELLS, _CELLS), bool)
+    covered = np.zeros((_CELLS, _CELLS), bool)
     v, u = (np.mgrid[0:_CELLS, 0:_CELLS] + 0.5) / _CELLS
     for view in views:
         hull = cv2.convexHull(view.corners.astype(np.float32))
-        for i, j in np.ndindex(seen.shape):
+        for i, j in np.ndindex(covered.shape):
             at = (float(u[i, j] * size[0]), float(v[i, j] * size[1]))
-            seen[i, j] |= cv2.pointPolygonTest(hull, at, False) >= 0
-    return float(seen.mean())
+            covered[i, j] |= cv2.pointPolygonTest(hull, at, False) >= 0
+    return float(covered.mean())
 
 
 def _warnings(fit: _Fit, covered: float, views: int) -> list[str]:
     out = []
-    if covered < _COVERED:
+    if covered < _MIN_COVERED:
         out.append(
             f"corners cover {100 * covered:.0f} % of the image: the lens is extrapolated "
             "elsewhere; record the board near the borders too"
@@ -306,7 +306,7 @@ def _rms(values: Float64) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-_FREE = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
+_NO_RATIONAL = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
 # Flags that fix coefficients to 0, and the names of the free ones; the last variant is the full
 # one.
 _VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
@@ -333,13 +333,13 @@ def _fit_lens(
     """Fit a lens to views, selecting the variant with the smallest information criterion."""
     try:
         if model == "fisheye":
-            return _fisheye(views, board, size)
+            return _fit_fisheye(views, board, size)
         count = 2 * sum(len(view.corners) for view in views)
         best: tuple[float, _Fit] | None = None
         for flags, names in _VARIANTS[model]:
-            fit = _opencv(model, flags, names, views, board, size)
-            numbers = len(_INTRINSIC) + len(names) + 6 * len(views)
-            score = count * np.log(fit.squares / count) + numbers * np.log(count)
+            fit = _fit_opencv(model, flags, names, views, board, size)
+            parameters = len(_INTRINSIC) + len(names) + 6 * len(views)
+            score = count * np.log(fit.squares / count) + parameters * np.log(count)
             if best is None or score < best[0]:
                 best = score, fit
     except (cv2.error, InputError, np.linalg.LinAlgError) as error:
@@ -352,7 +352,7 @@ def _fit_lens(
     return best[1]
 
 
-def _opencv(
+def _fit_opencv(
     model: str,
     flags: int,
     names: tuple[str, ...],
@@ -360,14 +360,14 @@ def _opencv(
     board: Board,
     size: tuple[int, int],
 ) -> _Fit:
-    free = flags if model == "rational" else flags | _FREE
+    all_flags = flags if model == "rational" else flags | _NO_RATIONAL
     out = cv2.calibrateCameraExtended(
         [board.points] * len(views),
         [view.corners.astype(np.float32) for view in views],
         size,
         np.eye(3),
         np.zeros(8),
-        flags=free,
+        flags=all_flags,
     )
     K, distortion, rvecs, tvecs, deviations = out[1], out[2].ravel(), out[3], out[4], out[5].ravel()
     classes: dict[str, type[Pinhole]] = {
@@ -393,8 +393,8 @@ def _evaluate(
     views: Sequence[BoardView],
     board: Board,
 ) -> _Fit:
-    missed = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
-    squares = np.array([(m**2).sum() for m in missed])
+    errors = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
+    squares = np.array([(m**2).sum() for m in errors])
     return _Fit(camera, sigma, poses, np.sqrt(squares / len(board.points)), float(squares.sum()))
 
 
@@ -402,13 +402,13 @@ def _reprojection_errors(camera: Pinhole, T: Float64, view: BoardView, board: Bo
     return camera.project(se3.transform(T, board.points.astype(float))) - view.corners
 
 
-def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
+def _fit_fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
     """Run least squares over lens and poses, initialised by a lens with one radial coefficient.
 
-    OpenCV's own needs a good initial value, and gives no standard deviations.
+    OpenCV's function needs a good initial value, and returns no standard deviations.
     """
     flags, names = _VARIANTS["brown"][1]
-    start = _opencv("brown", flags, names, views, board, size)
+    start = _fit_opencv("brown", flags, names, views, board, size)
     order = names_of("fisheye")
     lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), 0.0, 0.0, 0.0, 0.0])
     # Parameters are scaled to steps of similar effect: pixels, ratios, radians.
@@ -421,7 +421,7 @@ def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) ->
         steps = x[8:].reshape(-1, 6)
         return [T @ se3.exp(step) for T, step in zip(start.poses, steps, strict=True)]
 
-    def missed(x: Float64) -> Float64:
+    def errors(x: Float64) -> Float64:
         camera = camera_of(x)
         parts = [
             _reprojection_errors(camera, T, v, board)
@@ -429,24 +429,24 @@ def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) ->
         ]
         return np.concatenate(parts).ravel()
 
-    def slopes(x: Float64) -> Float64:
-        base, step = missed(x), 1e-6
+    def jacobian(x: Float64) -> Float64:
+        base, step = errors(x), 1e-6
         J = np.zeros((base.size, x.size))
         for k in range(8):
-            J[:, k] = (missed(x + step * np.eye(x.size)[k]) - base) / step
+            J[:, k] = (errors(x + step * np.eye(x.size)[k]) - base) / step
         rows = 2 * len(board.points)
         # A pose affects the corners of its own view only, so all poses are perturbed at once.
         for axis in range(6):
-            moved = x.copy()
-            moved[8 + axis :: 6] += step
-            change = ((missed(moved) - base) / step).reshape(-1, rows)
+            perturbed = x.copy()
+            perturbed[8 + axis :: 6] += step
+            derivatives = ((errors(perturbed) - base) / step).reshape(-1, rows)
             for view in range(len(views)):
-                J[view * rows : (view + 1) * rows, 8 + 6 * view + axis] = change[view]
+                J[view * rows : (view + 1) * rows, 8 + 6 * view + axis] = derivatives[view]
         return J
 
-    found = least_squares(missed, np.zeros(8 + 6 * len(views)), jac=slopes, method="lm")
-    freedom = max(found.fun.size - found.x.size, 1)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)[:8, :8] * 2 * found.cost / freedom
+    solution = least_squares(errors, np.zeros(8 + 6 * len(views)), jac=jacobian, method="lm")
+    freedom = max(solution.fun.size - solution.x.size, 1)
+    covariance = np.linalg.inv(solution.jac.T @ solution.jac)[:8, :8] * 2 * solution.cost / freedom
     deviations = np.sqrt(np.diag(covariance)) * scale
     sigma = dict(zip(order, deviations.tolist(), strict=True))
-    return _evaluate(camera_of(found.x), sigma, poses_of(found.x), views, board)
+    return _evaluate(camera_of(solution.x), sigma, poses_of(solution.x), views, board)

@@ -1,9 +1,9 @@
 """Reading lenses from the calibration files of other programs.
 
-All of these count pixels from 0 at the centre of the first one, as tofuse does: Bouguet's toolbox
-takes 1 off MATLAB's coordinates before it calibrates, OpenCV and ROS start there, and a CalLab file
-says which origin it has. A lens that none of the models here describes (skew, thin prism, tilted
-sensor) becomes a table of rays, exactly.
+All of these have pixel coordinate 0 at the centre of the first pixel, as tofuse does: Bouguet's
+toolbox subtracts 1 from MATLAB's coordinates before calibration, OpenCV and ROS use this origin,
+and a CalLab file states its origin. A lens that none of the models here describes (skew, thin
+prism, tilted sensor) is converted to a table of rays, exactly.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from tofuse.geometry.cameras import (
 )
 from tofuse.recordings.camera_file import checked_lens
 
-_LIMIT = 64 << 20
+_MAX_BYTES = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
-# Largest displacement of a pixel by skew that is neglected.
-_NO_SKEW_PX = 0.005
+# Maximum displacement of a pixel by skew that is neglected.
+_MAX_SKEW_PX = 0.005
 _MATLAB = ("fc", "cc", "alpha_c", "kc", "nx", "ny")
 _CALLAB = ("A", "k1", "k2", "k3", "p1", "p2", "width", "height")
 _ROS_MODELS = {
@@ -81,7 +81,7 @@ def read_lens_file(path: str | Path, index: int | None = None) -> LensFile:
     path = Path(path)
     if path.suffix.lower() == ".mat":
         return _bouguet(_mat_values(path), path)
-    text = read_text(path, limit=_LIMIT)
+    text = read_text(path, limit=_MAX_BYTES)
     if re.search(r"^\s*camera\.(\d+\.)?A\s*=", text, re.MULTILINE):
         return _callab(text, index, path)
     if re.search(r"^\s*fc\s*=", text, re.MULTILINE):
@@ -94,20 +94,20 @@ def _m_values(text: str) -> dict[str, list[float]]:
     plain = re.sub(r"%.*", "", text)
     out = {}
     for name in _MATLAB:
-        found = re.search(rf"^\s*{name}\s*=\s*(\[[^\]]*\]|{_NUMBER})", plain, re.MULTILINE)
-        if found:
-            out[name] = _numbers(found[1])
+        match = re.search(rf"^\s*{name}\s*=\s*(\[[^\]]*\]|{_NUMBER})", plain, re.MULTILINE)
+        if match:
+            out[name] = _numbers(match[1])
     return out
 
 
 def _mat_values(path: Path) -> dict[str, list[float]]:
     from scipy.io import loadmat
 
-    read_bytes(path, limit=_LIMIT)
+    read_bytes(path, limit=_MAX_BYTES)
     try:
         data = loadmat(str(path), variable_names=_MATLAB)
         return {n: np.asarray(data[n], float).ravel().tolist() for n in _MATLAB if n in data}
-    except Exception as error:  # a parser of a binary format: anything may come out
+    except Exception as error:  # a parser of a binary format may raise anything
         raise InputError(
             f"can't be read as a .mat file ({error})",
             where=path,
@@ -135,7 +135,7 @@ def _bouguet(values: dict[str, list[float]], path: Path) -> LensFile:
 
 
 def _callab(text: str, index: int | None, path: Path) -> LensFile:
-    """Version 2, which explains itself in its comments."""
+    """Read version 2, whose files document the format in their comments."""
     plain = re.sub(r"#.*", "", text)
     pairs: dict[str, str] = {
         key: value.strip() for key, value in re.findall(r"^\s*([\w.]+)\s*=(.*)$", plain, re.M)
@@ -168,25 +168,27 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
                 remedy=f"use --index {' or '.join(map(str, cameras))}",
             )
         prefix = f"camera.{chosen}."
-    own = {k.removeprefix(prefix): _numbers(v) for k, v in pairs.items() if k.startswith(prefix)}
-    strange = [k for k, v in own.items() if re.fullmatch(r"[a-z]\d", k) and any(v)]
-    strange = [k for k in strange if k not in _CALLAB]
-    if strange:
+    fields = {k.removeprefix(prefix): _numbers(v) for k, v in pairs.items() if k.startswith(prefix)}
+    unknown = [k for k, v in fields.items() if re.fullmatch(r"[a-z]\d", k) and any(v)]
+    unknown = [k for k in unknown if k not in _CALLAB]
+    if unknown:
         raise InputError(
-            f"has unknown coefficients {', '.join(strange)}",
+            f"has unknown coefficients {', '.join(unknown)}",
             where=path,
             remedy="calibrate with radial and tangential distortion alone",
         )
-    matrix = own.get("A", [])
+    matrix = fields.get("A", [])
     if len(matrix) != 9:
         raise InputError(
             "is not a 3x3 matrix", where=f"{path}: {prefix}A", remedy="write nine numbers"
         )
-    width, height = (_one(own, name, f"{path}: {prefix}{name}") for name in ("width", "height"))
+    width, height = (
+        _single_number(fields, name, f"{path}: {prefix}{name}") for name in ("width", "height")
+    )
     size = _size(width, height, path)
     shift = 0.5 if origin == "corner" else 0.0
     pinhole = [matrix[0], matrix[4], matrix[2] - shift, matrix[5] - shift]
-    k = [own.get(n, [0.0])[0] if own.get(n) else 0.0 for n in DISTORTION_ORDER["brown"]]
+    k = [fields.get(n, [0.0])[0] if fields.get(n) else 0.0 for n in DISTORTION_ORDER["brown"]]
     camera, warnings = _lens("brown", pinhole, matrix[1], k, size, path)
     return LensFile(camera, "callab", warnings)
 
@@ -208,23 +210,23 @@ def _opencv(text: str, path: Path) -> LensFile:
         "dist_coeffs", "D",
     )  # fmt: skip
     k = _array(text, names) or []
-    both = _array(text, ("image_size", "imageSize", "resolution")) or []
+    image_size = _array(text, ("image_size", "imageSize", "resolution")) or []
     width = _scalar(text, ("image_width", "image_Width", "imageWidth", "width"))
     height = _scalar(text, ("image_height", "image_Height", "imageHeight", "height"))
-    if width is None and height is None and len(both) == 2:
-        width, height = both
+    if width is None and height is None and len(image_size) == 2:
+        width, height = image_size
     if width is None or height is None:
         raise InputError(
             "doesn't state the image size",
             where=path,
             remedy="add image_width and image_height",
         )
-    word = re.search(r"""distortion_model["']?\s*:\s*["']?(\w+)""", text)
-    is_ros = word is not None
-    model = _ROS_MODELS.get(word[1].lower()) if word else None
-    if word and model is None:
+    distortion_model = re.search(r"""distortion_model["']?\s*:\s*["']?(\w+)""", text)
+    is_ros = distortion_model is not None
+    model = _ROS_MODELS.get(distortion_model[1].lower()) if distortion_model else None
+    if distortion_model and model is None:
         raise InputError(
-            f"is {word[1]!r:.40}",
+            f"is {distortion_model[1]!r:.40}",
             where=f"{path}: distortion_model",
             remedy=f"use one of {', '.join(_ROS_MODELS)}",
         )
@@ -237,13 +239,13 @@ def _opencv(text: str, path: Path) -> LensFile:
 
 
 def _array(text: str, names: tuple[str, ...]) -> list[float] | None:
-    """Return the numbers of the first of these names, in YAML, JSON or XML; None without any."""
+    """Return the numbers of the first of these keys in YAML, JSON or XML; None if there is none."""
     for name in names:
         xml = re.search(rf"<{name}\b[^>]*>(.*?)</{name}>", text, re.DOTALL)
         if xml:
             data = re.search(r"<data>(.*?)</data>", xml[1], re.DOTALL)
             return _numbers(data[1] if data else xml[1])
-        # Up to the next key that begins a line, or a closing brace; then after `data:`, if any.
+        # Everything after the key; then everything after `data:`, if present.
         yaml = re.search(rf"""(?:^|[{{,])\s*["']?{name}["']?\s*:(.*)""", text, re.M | re.DOTALL)
         if yaml:
             body = yaml[1]
@@ -260,11 +262,11 @@ def _array(text: str, names: tuple[str, ...]) -> list[float] | None:
 
 def _scalar(text: str, names: tuple[str, ...]) -> float | None:
     for name in names:
-        found = re.search(rf"""<{name}>\s*({_NUMBER})\s*</""", text) or re.search(
+        match = re.search(rf"""<{name}>\s*({_NUMBER})\s*</""", text) or re.search(
             rf"""(?:^|[{{,])\s*["']?{name}["']?\s*:\s*({_NUMBER})\b""", text, re.MULTILINE
         )
-        if found:
-            return _number(found[1])
+        if match:
+            return _number(match[1])
     return None
 
 
@@ -276,11 +278,11 @@ def _number(text: str) -> float:
     return float(text.replace("d", "e").replace("D", "e"))
 
 
-def _one(values: dict[str, list[float]], name: str, where: str) -> float:
-    found = values.get(name, [])
-    if len(found) != 1:
+def _single_number(values: dict[str, list[float]], name: str, where: str) -> float:
+    numbers = values.get(name, [])
+    if len(numbers) != 1:
         raise InputError("is missing", where=where, remedy="use a number")
-    return found[0]
+    return numbers[0]
 
 
 def _size(width: float, height: float, path: Path) -> tuple[int, int]:
@@ -299,7 +301,7 @@ def _lens(
     size: tuple[int, int],
     path: Path,
 ) -> tuple[Camera, tuple[str, ...]]:
-    """Make a lens of fx, fy, cx, cy and coefficients in OpenCV's order."""
+    """Build a lens from fx, fy, cx, cy and coefficients in OpenCV's order."""
     values = dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True))
     order = DISTORTION_ORDER[model]
     values |= dict(zip(order, k, strict=False))
@@ -323,7 +325,7 @@ def _lens(
     if any(extra):
         table = _opencv_rays(camera, skew, k)
         return table, ("thin prism or tilted sensor: the lens becomes a table of rays",)
-    if abs(skew) * size[1] / camera.fy > _NO_SKEW_PX:
+    if abs(skew) * size[1] / camera.fy > _MAX_SKEW_PX:
         if not abs(skew) <= camera.fx:
             raise InputError(f"is {skew}", where=f"{path}: skew", remedy="use 0, or pixels")
         return _skewed_rays(camera, skew), (
@@ -333,7 +335,7 @@ def _lens(
 
 
 def _normalised(camera: Pinhole, skew: float) -> Float64:
-    """(H, W, 2) distorted x/z, y/z of the pixels: u = fx x + skew y + cx, v = fy y + cy."""
+    """Return (H, W, 2) distorted x/z, y/z: u = fx x + skew y + cx, v = fy y + cy."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
     y = (v - camera.cy) / camera.fy
     return np.stack([(u - camera.cx - skew * y) / camera.fx, y], -1)
@@ -344,14 +346,16 @@ def _skewed_rays(camera: Pinhole, skew: float) -> RayTable:
 
 
 def _opencv_rays(camera: Pinhole, skew: float, k: list[float]) -> RayTable:
-    """Rays of a lens with up to 14 coefficients, of which OpenCV knows the meaning."""
-    full = _Full(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, tuple(k))
-    return RayTable(full._undistort(_normalised(camera, skew)).astype(np.float32))
+    """Return the rays of a lens with up to 14 coefficients of OpenCV's model."""
+    lens = _OpenCVLens(
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, tuple(k)
+    )
+    return RayTable(lens._undistort(_normalised(camera, skew)).astype(np.float32))
 
 
 @dataclass(frozen=True)
-class _Full(Pinhole):
-    """A lens of all of OpenCV's coefficients."""
+class _OpenCVLens(Pinhole):
+    """A lens with all of OpenCV's distortion coefficients."""
 
     coefficients: tuple[float, ...] = ()
 
@@ -360,6 +364,6 @@ class _Full(Pinhole):
 
     def _distort(self, xy: Float64) -> Float64:
         points = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1).reshape(-1, 1, 3)
-        given = np.array([*self.coefficients, *([0.0] * (14 - len(self.coefficients)))])
-        out = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), given)[0]
+        coefficients = np.array([*self.coefficients, *([0.0] * (14 - len(self.coefficients)))])
+        out = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0]
         return np.asarray(out, float).reshape(xy.shape)

@@ -24,12 +24,12 @@ from tofuse.sensor.noise import AmplitudeLaw, ConfidenceLaw, Law, NoiseModel, Ra
 MIN_FRAMES = 3
 _MIN_PIXELS = 40  # in a bin
 _BINS = 30
-_LINEAR = 0.25  # fraction of the ceiling up to which the law is valid without phase wrapping
+_MAX_LINEAR = 0.25  # fraction of the ceiling up to which the law is valid without phase wrapping
 _MAX_RANGE_M = 200.0
 _MAX_NOISE_M = 5.0
-_WORSE = 1.03  # ratio to the best law's misfit up to which a law is equivalent
-_GOOD = 0.2
-_MOST = (0.02, 0.98)
+_EQUIVALENT_RATIO = 1.03  # ratio to the best law's misfit up to which a law is equivalent
+_MAX_LOG_ERROR = 0.2
+_RANGE_QUANTILES = (0.02, 0.98)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class NoiseFit:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Pixels that are valid in every frame of a static stretch; (N,) each.
+    """Pixels that are valid in every frame of a static segment; (N,) each.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class _Samples:
     freedom
         Its degrees of freedom.
     range_m
-        Mean over the stretch.
+        Mean over the segment.
     counts
         Mean raw amplitude, before division by the falloff; NaN where there is none.
     level
@@ -130,16 +130,16 @@ class _Samples:
     slant: Float64
     before: Float64
 
-    def typical(self) -> Float64:
-        """Return variances scaled so that their median, not their mean, is unbiased."""
-        values, where = np.unique(self.freedom, return_inverse=True)
-        return self.variance / (chi2.median(values) / values)[where]
+    def median_unbiased(self) -> Float64:
+        """Return variances scaled so that their median instead of their mean is unbiased."""
+        values, index = np.unique(self.freedom, return_inverse=True)
+        return self.variance / (chi2.median(values) / values)[index]
 
 
 def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     """Fit a noise model to the static segments of a recording.
 
-    In each stretch of at least three frames the variance over time of each pixel's range is
+    In each segment of at least three frames the variance over time of each pixel's range is
     computed, and the medians of these over bins of raw amplitude, confidence and range, which are
     robust to flickering edges. The laws are fitted to the bins by robust least squares of relative
     errors.
@@ -147,9 +147,9 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     Parameters
     ----------
     recording
-        Images; at least three frames at one place, better ten or more at several distances.
+        Images; at least three frames of a static camera, better ten or more at several distances.
     name
-        Of the model; by default that of the camera's family.
+        Name of the model; by default that of the camera's family.
 
     Raises
     ------
@@ -163,8 +163,8 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     prior = noise_model_for(recording)
     stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= MIN_FRAMES]
     if not stretches:
-        raise _not_still(recording)
-    samples = _concatenate([_pixels(recording, a, b, prior) for a, b in stretches])
+        raise _not_static_error(recording)
+    samples = _concatenate([_segment_samples(recording, a, b, prior) for a, b in stretches])
     if len(samples.variance) < 10 * _MIN_PIXELS:
         raise InputError(
             f"has {len(samples.variance)} pixels that are valid throughout a static stretch",
@@ -193,7 +193,7 @@ def _first_frame(recording: Recording) -> Frame:
     return frame
 
 
-def _not_still(recording: Recording) -> InputError:
+def _not_static_error(recording: Recording) -> InputError:
     if len(recording) < MIN_FRAMES:
         return InputError(
             f"has {len(recording)} frames; at least {MIN_FRAMES} are needed",
@@ -208,7 +208,7 @@ def _not_still(recording: Recording) -> InputError:
 
 
 class _Moments:
-    """Incremental mean and variance of each pixel over the frames of a stretch (Welford 1962)."""
+    """Incremental mean and variance of each pixel over the frames of a segment (Welford 1962)."""
 
     def __init__(self, first: RangeFrame) -> None:
         shape = first.depth.shape
@@ -216,13 +216,13 @@ class _Moments:
         self.frames = 0
         self.mean, self.moment, self.before = (np.zeros(shape) for _ in range(3))
         self.counts, self.level = np.zeros(shape), np.zeros(shape)
-        # Intermittently valid pixels are at the detection limit or at edges, and are left out.
-        self.always = np.isfinite(self.slant)
+        # Intermittently valid pixels are at the detection limit or at edges, and are excluded.
+        self.valid = np.isfinite(self.slant)
 
     def add(self, frame: RangeFrame, prior: NoiseModel) -> None:
         """Add the next frame."""
         self.frames += 1
-        self.always &= frame.valid
+        self.valid &= frame.valid
         distance = frame.radial_range.astype(float)
         step = distance - self.mean
         self.mean += step / self.frames
@@ -234,19 +234,19 @@ class _Moments:
 
     def samples(self) -> _Samples:
         """Return the pixels that were valid in all frames."""
-        n, ok = self.frames, self.always
+        n, valid = self.frames, self.valid
         return _Samples(
-            self.moment[ok] / (n - 1),
-            np.full(int(ok.sum()), n - 1.0),
-            self.mean[ok],
-            self.counts[ok] / n,
-            np.rint(self.level[ok] / n),
-            self.slant[ok],
-            self.before[ok] / n,
+            self.moment[valid] / (n - 1),
+            np.full(int(valid.sum()), n - 1.0),
+            self.mean[valid],
+            self.counts[valid] / n,
+            np.rint(self.level[valid] / n),
+            self.slant[valid],
+            self.before[valid] / n,
         )
 
 
-def _pixels(recording: Recording, start: int, stop: int, prior: NoiseModel) -> _Samples:
+def _segment_samples(recording: Recording, start: int, stop: int, prior: NoiseModel) -> _Samples:
     moments: _Moments | None = None
     for frame in recording.select(start, stop):
         assert isinstance(frame, RangeFrame)
@@ -266,10 +266,10 @@ def _raw_counts(frame: RangeFrame) -> Float64:
     if frame.amplitude_image is None:
         return np.full(frame.depth.shape, np.nan)
     counts = frame.amplitude_image.astype(float)
-    good = (counts > 0) & (counts < SATURATED_AMPLITUDE) & frame.valid
+    valid = (counts > 0) & (counts < SATURATED_AMPLITUDE) & frame.valid
     if frame.amplitude_kind == "range_compensated":
-        counts = counts / np.where(good, frame.radial_range.astype(float) ** 2, 1)
-    return np.where(good, counts, np.nan)
+        counts = counts / np.where(valid, frame.radial_range.astype(float) ** 2, 1)
+    return np.where(valid, counts, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,15 +285,15 @@ class _Binned:
 
 def _bin(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
     """Return the medians of the pixels whose key lies between consecutive edges."""
-    typical = samples.typical()
-    place = np.searchsorted(edges, key, side="right") - 1
+    variances = samples.median_unbiased()
+    bin_of = np.searchsorted(edges, key, side="right") - 1
     rows = []
     for k in range(len(edges) - 1):
-        inside = place == k
+        inside = bin_of == k
         if inside.sum() < _MIN_PIXELS:
             continue
-        variance = float(np.median(typical[inside]))
-        if (typical[inside] > 0).mean() < 0.9:  # depth so coarse that many pixels never change
+        variance = float(np.median(variances[inside]))
+        if (variances[inside] > 0).mean() < 0.9:  # quantisation: many pixels never change
             variance = float(samples.variance[inside].mean())
         if variance > 0:
             centre, before = np.median(key[inside]), np.median(samples.before[inside])
@@ -309,7 +309,7 @@ def _quantile_edges(key: Float64, *, log: bool) -> Float64:
     return np.geomspace(low, high, _BINS + 1) if log else np.linspace(low, high, _BINS + 1)
 
 
-def _nonnegative(columns: Float64, target: Float64, pixels: Float64) -> Float64:
+def _nonnegative_fit(columns: Float64, target: Float64, pixels: Float64) -> Float64:
     """Fit ``columns @ x`` to `target` (K,) with non-negative x, minimising relative errors.
 
     Least squares with Huber weights on the log ratio; bins are weighted by their pixels, up to
@@ -322,9 +322,9 @@ def _nonnegative(columns: Float64, target: Float64, pixels: Float64) -> Float64:
     for _ in range(12):
         w = base * np.sqrt(weights) / target
         x = nnls(columns / scale * w[:, None], target * w)[0] / scale
-        off = np.abs(np.log(np.maximum(columns @ x, 1e-30) / target))
-        limit = 1.5 * max(float(np.median(off)) / MEDIAN_OF_NORMAL, 1e-3)
-        weights = limit / np.maximum(off, limit)
+        errors = np.abs(np.log(np.maximum(columns @ x, 1e-30) / target))
+        limit = 1.5 * max(float(np.median(errors)) / MEDIAN_OF_NORMAL, 1e-3)
+        weights = limit / np.maximum(errors, limit)
     return x
 
 
@@ -334,16 +334,16 @@ def _fit_amplitude(
     """Return the law and the bins it was fitted to; None without amplitude."""
     with np.errstate(invalid="ignore"):
         key = samples.counts * samples.slant**-falloff
-    lit = np.isfinite(key) & (key > 0)
-    if lit.sum() < 10 * _MIN_PIXELS:
+    valid = np.isfinite(key) & (key > 0)
+    if valid.sum() < 10 * _MIN_PIXELS:
         return None
-    bins = _bin(np.where(lit, key, -1), samples, _quantile_edges(key[lit], log=True))
-    bins = _select(bins, bins.variance < (_LINEAR * ceiling) ** 2)
+    bins = _bin(np.where(valid, key, -1), samples, _quantile_edges(key[valid], log=True))
+    bins = _select(bins, bins.variance < (_MAX_LINEAR * ceiling) ** 2)
     if len(bins.centre) < 3:
         return None
     amplitude = bins.centre
     columns = np.stack([np.ones_like(amplitude), 1 / amplitude, 1 / amplitude**2], 1)
-    floor2, shot2, dark2 = _nonnegative(columns, bins.variance, bins.pixels)
+    floor2, shot2, dark2 = _nonnegative_fit(columns, bins.variance, bins.pixels)
     if shot2 == 0 and dark2 == 0:
         return None
     law = AmplitudeLaw(math.sqrt(shot2), math.sqrt(dark2), math.sqrt(floor2), falloff)
@@ -351,25 +351,27 @@ def _fit_amplitude(
 
 
 def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
-    known = np.isfinite(samples.level)
-    if known.sum() < 10 * _MIN_PIXELS:
+    valid = np.isfinite(samples.level)
+    if valid.sum() < 10 * _MIN_PIXELS:
         return None
-    top = int(samples.level[known].max())
-    edges: Float64 = np.arange(top + 2, dtype=float) - 0.5
-    key = np.where(known, samples.level, -1)
+    max_level = int(samples.level[valid].max())
+    edges: Float64 = np.arange(max_level + 2, dtype=float) - 0.5
+    key = np.where(valid, samples.level, -1)
     best: tuple[float, ConfidenceLaw] | None = None
     bins = _bin(key, samples, edges)
     if len(bins.centre) < 2:
         return None
     for power in (0.0, 1.0, 2.0):
-        at_one = replace(samples, variance=samples.variance / samples.range_m ** (2 * power))
-        found = _bin(key, at_one, edges)
-        table = np.interp(np.arange(top + 1), found.centre, np.sqrt(found.variance))
+        at_1_m = replace(samples, variance=samples.variance / samples.range_m ** (2 * power))
+        bins_at_1_m = _bin(key, at_1_m, edges)
+        table = np.interp(
+            np.arange(max_level + 1), bins_at_1_m.centre, np.sqrt(bins_at_1_m.variance)
+        )
         # Enforce monotony: higher levels have less noise.
         table = np.minimum(np.minimum.accumulate(table), _MAX_NOISE_M)
         law = ConfidenceLaw(tuple(float(f"{v:.4g}") for v in table), power)
-        sigma = table[np.clip(np.nan_to_num(samples.level), 0, top).astype(int)]
-        score = _misfit(samples, (sigma * samples.range_m**power) ** 2, known)
+        sigma = table[np.clip(np.nan_to_num(samples.level), 0, max_level).astype(int)]
+        score = _log_misfit(samples, (sigma * samples.range_m**power) ** 2, valid)
         if best is None or score < 0.99 * best[0]:
             best = score, law
     assert best is not None
@@ -379,13 +381,13 @@ def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
 def _fit_range(samples: _Samples) -> tuple[RangeLaw, _Binned]:
     bins = _bin(samples.range_m, samples, _quantile_edges(samples.range_m, log=False))
     if len(bins.centre) == 0:
-        everything = np.array([samples.range_m.min(), np.nextafter(samples.range_m.max(), np.inf)])
-        bins = _bin(samples.range_m, samples, everything)
+        edges = np.array([samples.range_m.min(), np.nextafter(samples.range_m.max(), np.inf)])
+        bins = _bin(samples.range_m, samples, edges)
     columns = np.stack([np.ones_like(bins.centre), bins.centre**2], 1)
     if not _has_range_variation(samples):
         # a and b are not separable; the quadratic law is conservative for farther surfaces.
         columns[:, 0] = 0
-    a, b = _nonnegative(columns, np.sqrt(bins.variance), bins.pixels)
+    a, b = _nonnegative_fit(columns, np.sqrt(bins.variance), bins.pixels)
     return RangeLaw(min(float(a), _MAX_NOISE_M), min(float(b), 1.0)), bins
 
 
@@ -393,15 +395,15 @@ def _select(bins: _Binned, mask: Bool) -> _Binned:
     return _Binned(**{f.name: getattr(bins, f.name)[mask] for f in fields(_Binned)})
 
 
-def _misfit(samples: _Samples, predicted: Float64, where: Bool) -> float:
+def _log_misfit(samples: _Samples, predicted: Float64, mask: Bool) -> float:
     """Return the median absolute difference between pixels' log variances and the prediction.
 
     It is above 0 even for a perfect law, due to the small number of frames.
     """
-    ok = where & (samples.variance > 0) & (predicted > 0)
-    if not ok.any():
+    valid = mask & (samples.variance > 0) & (predicted > 0)
+    if not valid.any():
         return math.inf
-    return float(np.median(np.abs(np.log(samples.typical()[ok] / predicted[ok]))))
+    return float(np.median(np.abs(np.log(samples.median_unbiased()[valid] / predicted[valid]))))
 
 
 def _fit(
@@ -412,13 +414,13 @@ def _fit(
     stretches: Sequence[tuple[int, int]],
 ) -> NoiseFit:
     ceiling = prior.ceiling_m
-    period = recording.metadata.get("ambiguity_m")
-    if isinstance(period, int | float) and 0 < period <= _MAX_RANGE_M:
-        ceiling = float(period) / math.sqrt(12)
+    ambiguity = recording.metadata.get("ambiguity_m")
+    if isinstance(ambiguity, int | float) and 0 < ambiguity <= _MAX_RANGE_M:
+        ceiling = float(ambiguity) / math.sqrt(12)
     range_law, range_bins = _fit_range(samples)
-    everywhere = np.ones(len(samples.variance), bool)
-    far = (range_law.a + range_law.b * samples.range_m**2) ** 2
-    least = _misfit(samples, far, everywhere)
+    all_pixels = np.ones(len(samples.variance), bool)
+    variance = (range_law.a + range_law.b * samples.range_m**2) ** 2
+    best_misfit = _log_misfit(samples, variance, all_pixels)
     law: Law = "range"
     bins, predicted = range_bins, (range_law.a + range_law.b * range_bins.centre**2) ** 2
 
@@ -427,18 +429,20 @@ def _fit(
     if table is not None:
         confidence, levels = table
         sigma = np.array(confidence.sigma_m)
-        of_pixel = sigma[np.clip(np.nan_to_num(samples.level), 0, len(sigma) - 1).astype(int)]
-        known = np.isfinite(samples.level)
-        score = _misfit(samples, (of_pixel * samples.range_m**confidence.power) ** 2, known)
-        if score > _WORSE * least:
+        pixel_sigma = sigma[np.clip(np.nan_to_num(samples.level), 0, len(sigma) - 1).astype(int)]
+        valid_level = np.isfinite(samples.level)
+        score = _log_misfit(
+            samples, (pixel_sigma * samples.range_m**confidence.power) ** 2, valid_level
+        )
+        if score > _EQUIVALENT_RATIO * best_misfit:
             confidence = None
         else:
-            least, law, bins = min(least, score), "confidence", levels
+            best_misfit, law, bins = min(best_misfit, score), "confidence", levels
             mean_range = [
                 float(np.median(samples.range_m[samples.level == k])) for k in levels.centre
             ]
-            of_bin = sigma[levels.centre.astype(int)] * np.array(mean_range) ** confidence.power
-            predicted = of_bin**2
+            bin_sigma = sigma[levels.centre.astype(int)] * np.array(mean_range) ** confidence.power
+            predicted = bin_sigma**2
 
     amplitude = None
     for falloff in _falloffs(recording, prior):
@@ -446,13 +450,13 @@ def _fit(
         if fitted is None:
             continue
         counts = samples.counts * samples.slant**-falloff
-        seen = np.isfinite(counts) & (counts > 0)
+        valid = np.isfinite(counts) & (counts > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            score = _misfit(samples, _signal_part(fitted[0], counts), seen)
-        if score <= (_WORSE if amplitude is None else 0.99) * least:
-            least, law, bins = min(least, score), "amplitude", fitted[1]
+            score = _log_misfit(samples, _amplitude_variance(fitted[0], counts), valid)
+        if score <= (_EQUIVALENT_RATIO if amplitude is None else 0.99) * best_misfit:
+            best_misfit, law, bins = min(best_misfit, score), "amplitude", fitted[1]
             amplitude = fitted[0]
-            predicted = _signal_part(amplitude, bins.centre)
+            predicted = _amplitude_variance(amplitude, bins.centre)
 
     model = NoiseModel(
         name,
@@ -489,13 +493,13 @@ def _falloffs(recording: Recording, prior: NoiseModel) -> list[float]:
     return [4.0 if prior.amplitude is None else prior.amplitude.falloff, 0.0]
 
 
-def _signal_part(law: AmplitudeLaw, counts: Float64) -> Float64:
+def _amplitude_variance(law: AmplitudeLaw, counts: Float64) -> Float64:
     return law.floor**2 + law.shot**2 / counts + (law.dark / counts) ** 2
 
 
 def _has_range_variation(samples: _Samples) -> bool:
     """Whether the pixels' ranges vary enough to determine how noise grows with range."""
-    low, high = np.quantile(samples.range_m, _MOST)
+    low, high = np.quantile(samples.range_m, _RANGE_QUANTILES)
     return bool(high >= 1.5 * low)
 
 
@@ -508,8 +512,8 @@ def _warnings(recording: Recording, samples: _Samples, frames: int, error: float
     if frames < len(recording):
         out.append(f"{frames} of {len(recording)} frames are in static segments")
     if not _has_range_variation(samples):
-        low, high = np.quantile(samples.range_m, _MOST)
+        low, high = np.quantile(samples.range_m, _RANGE_QUANTILES)
         out.append(f"ranges of {low:.2f} to {high:.2f} m only: the noise at others is extrapolated")
-    if error > _GOOD:
+    if error > _MAX_LOG_ERROR:
         out.append(f"the law describes the noise to {100 * (math.exp(error) - 1):.0f} % only")
     return out

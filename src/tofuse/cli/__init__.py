@@ -44,9 +44,9 @@ def console() -> int:
 
 def prepare_process() -> None:
     """Set environment variables that libraries read when they are loaded."""
-    # BLAS is limited to one thread anyway, but reserves memory for more; if that fails, it hangs.
+    # BLAS is limited to one thread later, but reserves memory for more; if that fails, it hangs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Otherwise it prints several lines for a damaged image, beside the message of this program.
+    # Otherwise it prints several lines for a damaged image, besides the message of this program.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
@@ -62,18 +62,18 @@ def ended_by_signals() -> Iterator[None]:
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     is_main = threading.current_thread() is threading.main_thread()
     # Signals that are ignored (nohup) stay ignored. Only the main thread may set handlers.
-    wanted = [n for n in numbers if is_main and signal.getsignal(n) == signal.SIG_DFL]
-    before = {number: signal.signal(number, end) for number in wanted}
-    hook, sys.unraisablehook = sys.unraisablehook, _resending(sys.unraisablehook)
+    handled = [n for n in numbers if is_main and signal.getsignal(n) == signal.SIG_DFL]
+    previous = {number: signal.signal(number, end) for number in handled}
+    hook, sys.unraisablehook = sys.unraisablehook, _resending_hook(sys.unraisablehook)
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _resending(hook: Unraisable) -> Unraisable:
+def _resending_hook(hook: Unraisable) -> Unraisable:
     """Return a hook that resends a signal if Python discards the exception of its handler.
 
     Exceptions in finalizers and weak reference callbacks are discarded, and those may run at any
@@ -88,7 +88,7 @@ def _resending(hook: Unraisable) -> Unraisable:
         else:
             signal.raise_signal(number)
 
-    def discarded(error: sys.UnraisableHookArgs) -> None:
+    def on_unraisable(error: sys.UnraisableHookArgs) -> None:
         if isinstance(error.exc_value, KeyboardInterrupt | Ended):
             number = getattr(error.exc_value, "number", int(signal.SIGINT))
             # `threading.Thread` takes locks that the main thread may hold at this point.
@@ -96,7 +96,7 @@ def _resending(hook: Unraisable) -> Unraisable:
         else:
             hook(error)
 
-    return discarded
+    return on_unraisable
 
 
 def report_bugs(command: Callable[[], int]) -> int:
@@ -138,15 +138,15 @@ def _status_after_output(status: int, out: object) -> int:
     if error is None:
         return status
     if out is not None:
-        _print_error(f"some output could not be printed ({_why(error)}); the result is in {out}")
+        _print_error(f"some output could not be printed ({_reason(error)}); the result is in {out}")
         return status
     if isinstance(error, BrokenPipeError):
         return _BROKEN_PIPE
-    _print_error(f"standard output: can't be written ({_why(error)})")
+    _print_error(f"standard output: can't be written ({_reason(error)})")
     return 2
 
 
-def _why(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
@@ -154,7 +154,7 @@ def _print_error(text: str) -> None:
     print("tofuse: " + " ".join(text.split()), file=sys.stderr)
 
 
-def _unwrapped(command: Callable[[], int]) -> int:
+def _run_unwrapped(command: Callable[[], int]) -> int:
     """Run a command; a signal that arrived during a call of compiled code is raised as itself."""
     from tofuse.errors import Ended
 
@@ -176,7 +176,7 @@ def run_command(command: Callable[[], int]) -> int:
 
     with safe_streams():
         try:
-            return _unwrapped(command)
+            return _run_unwrapped(command)
         except TofuseError as error:
             _print_error(str(error))
             return 2

@@ -28,45 +28,45 @@ def batch(arguments: argparse.Namespace) -> int:
     """Do all pending jobs, and print a summary."""
     jobs = read_jobs(arguments.recordings, run_arguments)
     jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
-    chosen = _chosen(jobs, arguments)
+    selected = _selected(jobs, arguments)
     folder = BatchFolder(arguments.out.absolute())
-    left = pending(chosen, folder, overwrite=arguments.overwrite)
+    remaining = pending(selected, folder, overwrite=arguments.overwrite)
     if arguments.print_jobs:
-        for job in left:
+        for job in remaining:
             print(_command_line(arguments, job))
         return 0
-    if not left:
+    if not remaining:
         write_table(jobs, folder)  # the list may have changed
     else:
         try:
-            _run(arguments, jobs, left, folder)
+            _run(arguments, jobs, remaining, folder)
         except (KeyboardInterrupt, Ended) as error:
-            done = sum(r is not None and r.state == "done" for r in map(folder.record, chosen))
+            done = sum(r is not None and r.state == "done" for r in map(folder.record, selected))
             print(
-                f"tofuse: interrupted, {done} of {len(chosen)} recordings are done; run the same "
+                f"tofuse: interrupted, {done} of {len(selected)} recordings are done; run the same "
                 "command again to resume",
                 file=sys.stderr,
             )
             return 128 + error.number if isinstance(error, Ended) else 130
         except TofuseError as error:
-            if status_of(chosen, folder) == 2:
+            if status_of(selected, folder) == 2:
                 raise
             print(f"tofuse: {error}", file=sys.stderr)  # there are results: status 3, not 2
-    return _print_summary(chosen, folder, as_json=arguments.json)
+    return _print_summary(selected, folder, as_json=arguments.json)
 
 
-def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
+def _selected(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
     """The jobs of --only, or all."""
     if arguments.only is None:
         return list(jobs)
     names = [job.name for job in jobs]
     for name in arguments.only:
         if name not in names:
-            near = get_close_matches(name, names, 1)
+            suggestions = get_close_matches(name, names, 1)
             raise InputError(
                 f"there is no job {name}",
                 where="--only",
-                remedy=f"did you mean {near[0]}?" if near else "see --print-jobs",
+                remedy=f"did you mean {suggestions[0]}?" if suggestions else "see --print-jobs",
             )
     return [job for job in jobs if job.name in arguments.only]
 
@@ -82,13 +82,16 @@ def _command_line(arguments: argparse.Namespace, job: Job) -> str:
 
 
 def _run(
-    arguments: argparse.Namespace, jobs: Sequence[Job], left: Sequence[Job], folder: BatchFolder
+    arguments: argparse.Namespace,
+    jobs: Sequence[Job],
+    remaining: Sequence[Job],
+    folder: BatchFolder,
 ) -> None:
-    workers, threads = _workers(arguments, len(left))
+    workers, threads = _workers(arguments, len(remaining))
     try:
         folder.prepare()
         with progress_for(as_json=arguments.json) as progress:
-            progress.stage("jobs", len(left))
+            progress.stage("jobs", len(remaining))
 
             def ended(job: Job, record: Record) -> None:
                 progress.advance()
@@ -97,7 +100,7 @@ def _run(
 
             run_batch(
                 jobs,
-                left,
+                remaining,
                 folder,
                 workers,
                 threads=threads,
@@ -120,25 +123,25 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
     return LocalWorkers(count), arguments.threads or max(1, usable_cores() // count)
 
 
-def _print_summary(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
+def _print_summary(selected: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
     """Print a summary, and return the exit status."""
     from tofuse.cli.commands import VERDICT_COLORS, make_console
 
-    records = {job.name: folder.record(job) for job in chosen}
+    records = {job.name: folder.record(job) for job in selected}
     verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
     failed = {n: r.reason for n, r in records.items() if r is not None and r.state == "failed"}
-    done, status = sum(verdicts.values()), status_of(chosen, folder)
+    done, status = sum(verdicts.values()), status_of(selected, folder)
     if status == 2 and failed:
         name, reason = next(iter(failed.items()))
         raise InputError(
-            f"none of {len(chosen)} recordings gave a result; {name}: {reason}", where=folder.html
+            f"none of {len(selected)} recordings gave a result; {name}: {reason}", where=folder.html
         )
     if as_json:
         emit(
             {
                 "event": "result",
                 "out": str(folder.path),
-                "jobs": len(chosen),
+                "jobs": len(selected),
                 "done": done,
                 "failed": len(failed),
                 "verdicts": dict(verdicts),
@@ -152,7 +155,7 @@ def _print_summary(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool)
         if verdicts[v]
     ]
     verdict_counts = f": {', '.join(counts)}" if counts else ""
-    console.print(f"{done} of {len(chosen)} recordings have a result{verdict_counts}")
+    console.print(f"{done} of {len(selected)} recordings have a result{verdict_counts}")
     for name, reason in list(failed.items())[:_MAX_LISTED]:
         console.print(f"  {name}: {reason}", markup=False)
     if len(failed) > _MAX_LISTED:

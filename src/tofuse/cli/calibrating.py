@@ -38,12 +38,12 @@ def lens(arguments: argparse.Namespace) -> Summary:
         f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
         f"own intrinsics: {fit.before_px:.3f})"
     )
-    lines += [f"left out: frame {frame} {why}" for frame, why in fit.left_out[:_MAX_LISTED]]
+    lines += [f"left out: frame {frame} {reason}" for frame, reason in fit.left_out[:_MAX_LISTED]]
     if len(fit.left_out) > _MAX_LISTED:
         lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
     if arguments.out is not None:
-        about = recording_fields(recording)
-        write_camera_json(arguments.out, fit.camera, about, overwrite=arguments.overwrite)
+        metadata = recording_fields(recording)
+        write_camera_json(arguments.out, fit.camera, metadata, overwrite=arguments.overwrite)
         lines.append(f"written to {arguments.out}")
     return fit.to_dict(), lines, list(fit.warnings)
 
@@ -51,7 +51,7 @@ def lens(arguments: argparse.Namespace) -> Summary:
 def depth(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate depth``."""
     recording = Opening.of(arguments.inputs, arguments).open()
-    earlier = _earlier_correction(arguments, recording)
+    previous = _previous_correction(arguments, recording)
     if arguments.board is not None:
         board = Board.parse(arguments.board)
         views, camera = board_planes(recording, board, arguments.image, wall=arguments.wall)
@@ -75,58 +75,58 @@ def depth(arguments: argparse.Namespace) -> Summary:
         f"{100 * fit.scale_sigma:.2f} %",
     ]
     if arguments.out is not None:
-        whole = fit.correction if earlier is None else compose(earlier, fit.correction)
+        correction = fit.correction if previous is None else compose(previous, fit.correction)
         make_folder(arguments.out.parent)
-        with replacing(arguments.out) as part:
-            whole.save(part)
+        with replacing(arguments.out) as temporary:
+            correction.save(temporary)
         lines.append(f"written to {arguments.out}")
-        if earlier is not None:
+        if previous is not None:
             lines.append("it includes the correction that the recording already had")
     return fit.to_dict(), lines, list(fit.warnings)
 
 
-def _earlier_correction(
+def _previous_correction(
     arguments: argparse.Namespace, recording: Recording
 ) -> DepthCorrection | None:
     """Return the correction that was applied when the recording was read."""
     if not recording.metadata.get("corrected"):
         return None
-    own = Path(recording.path) / "correction.npz"
-    if len(arguments.inputs) != 1 or not own.is_file():
+    path = Path(recording.path) / "correction.npz"
+    if len(arguments.inputs) != 1 or not path.is_file():
         raise InputError(
             "is already corrected, each input by its own correction",
             where=recording.path,
             remedy="pass one folder, or move its correction.npz away",
         )
-    return read_correction(own)
+    return read_correction(path)
 
 
 def import_lens(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
         raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
-    found = read_lens_file(arguments.inputs[0], arguments.index)
-    about: dict[str, Any] = {}
-    warnings = list(found.warnings)
+    lens_file = read_lens_file(arguments.inputs[0], arguments.index)
+    metadata: dict[str, Any] = {}
+    warnings = list(lens_file.warnings)
     if arguments.recording is None:
         warnings.append(
             "depth is assumed to be z in mm; pass --recording to take it from a recording"
         )
     else:
         recording = open_recording(arguments.recording)
-        about = recording_fields(recording)
-    fields = camera_fields(found.camera)
+        metadata = recording_fields(recording)
+    fields = camera_fields(lens_file.camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
-    if isinstance(found.camera, RayTable):
-        near = found.camera.fit
-        lines.append(f"about a pinhole of f {near.fx:.2f}, {near.fy:.2f} px")
-    lines.append(f"read as a file of {found.format}")
+    if isinstance(lens_file.camera, RayTable):
+        pinhole = lens_file.camera.fit
+        lines.append(f"about a pinhole of f {pinhole.fx:.2f}, {pinhole.fy:.2f} px")
+    lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:
         written = write_camera_json(
-            arguments.out, found.camera, about, overwrite=arguments.overwrite
+            arguments.out, lens_file.camera, metadata, overwrite=arguments.overwrite
         )
         lines += [f"written to {path}" for path in written]
-    return {"format": found.format, "warnings": warnings} | fields, lines, warnings
+    return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
 
 
 def _board(arguments: argparse.Namespace) -> Board:

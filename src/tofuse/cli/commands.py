@@ -38,13 +38,15 @@ _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
-def from_arguments(kind: type[_Options], arguments: argparse.Namespace, **others: Any) -> _Options:
+def from_arguments(
+    cls: type[_Options], arguments: argparse.Namespace, **overrides: Any
+) -> _Options:
     """Make a dataclass of options from the arguments with the names of its fields.
 
-    Fields without an argument keep their defaults; `others` override both.
+    Fields without an argument keep their defaults; `overrides` override both.
     """
-    names = [f.name for f in fields(kind) if hasattr(arguments, f.name)]
-    return kind(**{name: getattr(arguments, name) for name in names} | others)
+    names = [f.name for f in fields(cls) if hasattr(arguments, f.name)]
+    return cls(**{name: getattr(arguments, name) for name in names} | overrides)
 
 
 def make_console() -> Console:
@@ -76,9 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.into is not None:
         return _run_into(arguments, options)
     if arguments.view:
-        return _run_in_view(arguments, options)
-    for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
-        if given:
+        return _run_live(arguments, options)
+    for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
+        if is_set:
             raise InputError("requires --view", where=name, remedy="pass --view as well")
     with _run_progress(arguments) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
@@ -158,12 +160,12 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
     with _run_progress(arguments) as progress:
-        found = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
-    print_result(found.result, arguments.out, as_json=arguments.json)
-    return exit_status(found.result)
+        rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
+    print_result(rig_result.result, arguments.out, as_json=arguments.json)
+    return exit_status(rig_result.result)
 
 
-def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
+def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
     from tofuse.pipeline.progress import CombinedProgress
     from tofuse.pipeline.run import exit_status
@@ -259,23 +261,25 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     with _progress_unless_json(arguments) as progress:
-        found = calibrate_rig(
+        calibration = calibrate_rig(
             arguments.inputs,
             motion=arguments.motion,
             format=arguments.format,
             threads=arguments.threads,
             progress=progress,
         )
-    write_rig(arguments.out, found.rig)
+    write_rig(arguments.out, calibration.rig)
     if arguments.json:
-        emit({**found.rig.to_dict(), "how": found.how, "notes": list(found.notes)})
-        return rigging.exit_status(found)
+        emit(
+            {**calibration.rig.to_dict(), "how": calibration.how, "notes": list(calibration.notes)}
+        )
+        return rigging.exit_status(calibration)
     console = make_console()
-    for table in rigging.tables(found.rig):
+    for table in rigging.tables(calibration.rig):
         console.print(table)
-    _print_warnings(console, rigging.notes(found))
-    console.print(f"from {found.how}; see {arguments.out}", markup=False)
-    return rigging.exit_status(found)
+    _print_warnings(console, rigging.notes(calibration))
+    console.print(f"from {calibration.how}; see {arguments.out}", markup=False)
+    return rigging.exit_status(calibration)
 
 
 def rig_check(arguments: argparse.Namespace) -> int:
@@ -284,10 +288,10 @@ def rig_check(arguments: argparse.Namespace) -> int:
     from tofuse.recordings.rig import read_rig
     from tofuse.rigs.calibrate import check
 
-    stated = read_rig(arguments.rig)
+    rig = read_rig(arguments.rig)
     with _progress_unless_json(arguments) as progress:
-        found, cameras = check(
-            stated,
+        calibration, cameras = check(
+            rig,
             arguments.inputs,
             motion=arguments.motion,
             format=arguments.format,
@@ -300,7 +304,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     console = make_console()
     for line in rigging.check_lines(cameras):
         console.print(line, markup=False)
-    _print_warnings(console, found.notes)
+    _print_warnings(console, calibration.notes)
     return rigging.check_status(cameras)
 
 
@@ -312,19 +316,21 @@ def judge(arguments: argparse.Namespace) -> int:
     _check_overwrite(arguments)
     options = from_arguments(JudgeOptions, arguments)
     with _progress_unless_json(arguments) as progress:
-        found = judge_files([arguments.recording], arguments.trajectory, options, progress)
-    status = 3 if found.verdict == "failed" else 0
+        judgement = judge_files([arguments.recording], arguments.trajectory, options, progress)
+    status = 3 if judgement.verdict == "failed" else 0
     if arguments.json:
-        emit({**plain(found.to_dict()), "out": None if options.out is None else str(options.out)})
+        emit(
+            {**plain(judgement.to_dict()), "out": None if options.out is None else str(options.out)}
+        )
         return status
     console = make_console()
-    console.print(f"[bold {VERDICT_COLORS[found.verdict]}]{found.verdict}[/]")
-    _print_reasons(console, found.reasons)
-    console.print(sentence(found, arguments.trajectory.name), markup=False)
-    pairs = (("given", found.consistency), ("refined", found.refined_consistency))
+    console.print(f"[bold {VERDICT_COLORS[judgement.verdict]}]{judgement.verdict}[/]")
+    _print_reasons(console, judgement.reasons)
+    console.print(sentence(judgement, arguments.trajectory.name), markup=False)
+    consistencies = (("given", judgement.consistency), ("refined", judgement.refined_consistency))
     texts = [
         f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
-        for name, c in pairs
+        for name, c in consistencies
         if c is not None
     ]
     if texts:
@@ -412,8 +418,8 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
-    closed = sum(p.accepted for p in d.loops)
-    parts.append(f"{closed} loop{'' if closed == 1 else 's'} closed")
+    closures = sum(p.accepted for p in d.loops)
+    parts.append(f"{closures} loop{'' if closures == 1 else 's'} closed")
     parts.append(f"{len(result.cloud):,} points")
     console.print(", ".join(parts), markup=False)
     console.print(f"see {out / 'report.html'}", markup=False)
@@ -476,22 +482,22 @@ def inspect(arguments: argparse.Namespace) -> int:
     from tofuse.recordings.opening import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
-    found = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
+    inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
     if arguments.sheet is not None:
-        found.save_sheet(arguments.sheet)
+        inspection.save_sheet(arguments.sheet)
     if arguments.json:
-        emit(found.to_dict())
+        emit(inspection.to_dict())
         return 0
     console = make_console()
-    width = max(map(len, found.facts))
-    for name, value in found.facts.items():
+    width = max(map(len, inspection.facts))
+    for name, value in inspection.facts.items():
         console.print(f"[bold]{name:<{width}}[/]  {escaped(value)}")
-    _print_warnings(console, found.notes)
-    for finding in found.findings:
+    _print_warnings(console, inspection.notes)
+    for finding in inspection.findings:
         color = _SEVERITY_COLORS[finding.severity]
         console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
         console.print(f"  {escaped(finding.remedy)}")
-    if not found.findings:
+    if not inspection.findings:
         console.print("[green]No problems found.[/]")
     if arguments.sheet is not None:
         console.print(f"see {escaped(str(arguments.sheet))}")
@@ -506,12 +512,12 @@ def convert(arguments: argparse.Namespace) -> int:
 
     recording = Opening.of(arguments.inputs, arguments).open()
     if arguments.to == "native":
-        done = convert_recording(recording, arguments.out)
+        conversion = convert_recording(recording, arguments.out)
     else:
-        done = convert_to(recording, arguments.out, arguments.to)
+        conversion = convert_to(recording, arguments.out, arguments.to)
     console = make_console()
-    console.print(f"{done.frames} frames in {escaped(str(done.folder))}")
-    _print_warnings(console, (*recording.warnings, *done.warnings))
+    console.print(f"{conversion.frames} frames in {escaped(str(conversion.folder))}")
+    _print_warnings(console, (*recording.warnings, *conversion.warnings))
     return 0
 
 
@@ -538,7 +544,7 @@ def record(arguments: argparse.Namespace) -> int:
         progress_for(as_json=False) as progress,
     ):
         progress.stage("recording (Ctrl-C stops)", arguments.frames)
-        done = record_stream(
+        recorded = record_stream(
             stream,
             arguments.out,
             seconds=arguments.seconds,
@@ -546,29 +552,31 @@ def record(arguments: argparse.Namespace) -> int:
             stopped=stopped.is_set,
             progress=lambda _: progress.advance(),
         )
-    console.print(f"{done.frames} frames in {escaped(str(done.folder))}")
-    if done.dropped:
-        console.print(f"[yellow]warning:[/] {done.dropped} frames dropped: the disk was too slow")
-    if done.ended_by != "asked":
-        console.print(f"[yellow]warning:[/] {escaped(done.ended_by)}")
+    console.print(f"{recorded.frames} frames in {escaped(str(recorded.folder))}")
+    if recorded.dropped:
+        console.print(
+            f"[yellow]warning:[/] {recorded.dropped} frames dropped: the disk was too slow"
+        )
+    if recorded.ended_by != "asked":
+        console.print(f"[yellow]warning:[/] {escaped(recorded.ended_by)}")
     return 0
 
 
 @contextmanager
 def _stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets, for an orderly end; a second one ends at once."""
+    """Yield an event that Ctrl-C or SIGTERM sets; a second signal terminates the process."""
     event = threading.Event()
 
-    def ask(number: int, frame: object) -> None:
-        signal.signal(number, before[number])
+    def request_stop(number: int, frame: object) -> None:
+        signal.signal(number, previous[number])
         event.set()
 
     numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
-    before = {number: signal.signal(number, ask) for number in numbers}
+    previous = {number: signal.signal(number, request_stop) for number in numbers}
     try:
         yield event
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
@@ -633,13 +641,13 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from tofuse.evaluation.trajectory import MAX_GAP_S
     from tofuse.pipeline.evaluating import evaluate as evaluate_poses
 
-    found = evaluate_poses(
+    evaluation = evaluate_poses(
         arguments.estimate,
         arguments.reference,
         recording=arguments.recording,
         reference_error_m=arguments.reference_error,
     )
-    data, error, interval = found.to_dict(), found.error, found.ate_interval_m
+    data, error, interval = evaluation.to_dict(), evaluation.error, evaluation.ate_interval_m
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
@@ -661,7 +669,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
             angle = r.to_dict()["rotation_rms_deg"]
             value = f"{r.translation_rms_m:.4f} m, {angle:.3f} deg"
         table.add_row(f"RPE over {r.frames} frame{'' if r.frames == 1 else 's'}", value)
-    if found.consistency is not None:
+    if evaluation.consistency is not None:
         m = data["map_consistency"]
         value = "no two images overlap enough"
         if m["rms_m"] is not None:
@@ -683,27 +691,27 @@ def optimize(arguments: argparse.Namespace) -> int:
         part = {"part": arguments.optimiser}
         config = changed(config, {"optimiser": part}, where="--optimiser")
     graph = read_g2o(arguments.input)
-    done = config.optimiser.optimise(graph)
-    write_g2o(arguments.out, done.graph)
+    solution = config.optimiser.optimise(graph)
+    write_g2o(arguments.out, solution.graph)
     print(
         f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
-        f"to {done.graph.chi2():.6g} in {max(len(done.objective) - 1, 0)} iterations"
-        + ("" if done.converged else " (not converged)")
+        f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
+        + ("" if solution.converged else " (not converged)")
     )
-    if done.weights is not None and (done.weights < 0.5).any():
-        left_out = done.weights < 0.5
+    if solution.weights is not None and (solution.weights < 0.5).any():
+        left_out = solution.weights < 0.5
         count = int(left_out.sum())
-        before, after = graph.chi2(~left_out), done.graph.chi2(~left_out)
+        before, after = graph.chi2(~left_out), solution.graph.chi2(~left_out)
         print(
             f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with "
             f"the others; squared error of the others {before:.6g} to {after:.6g}"
         )
-    for piece in done.parts if len(done.parts) > 1 else ():
+    for piece in solution.parts if len(solution.parts) > 1 else ():
         print(
             f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
             f"objective {piece.before:.6g} to {piece.after:.6g}"
         )
-    if not done.improved:
+    if not solution.improved:
         print("no improvement: the poses are those of the input")
     return 0
 

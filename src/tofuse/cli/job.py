@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Sequence
 
-_PICTURE = (336, 210)  # pixels
+_PICTURE_SIZE = (336, 210)  # pixels
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -56,7 +56,9 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    write_bytes(picture, encode(render_thumbnail(make_scene(result, rows), _PICTURE), jpeg=True))
+    write_bytes(
+        picture, encode(render_thumbnail(make_scene(result, rows), _PICTURE_SIZE), jpeg=True)
+    )
     print_result(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})
     return exit_status(result)

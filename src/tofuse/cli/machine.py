@@ -9,8 +9,8 @@ from tofuse.errors import InputError
 # The smallest run needs 1.2 GB of address space with two threads, most of it for libraries. A
 # compiler that gets no memory aborts the process, which can't be caught.
 _MIN_BYTES = 1792 << 20
-_EACH_THREAD_BYTES = 72 << 20  # its stack and the C library's arena
-_COUNTED_THREADS = 2
+_BYTES_PER_THREAD = 72 << 20  # its stack and the C library's arena
+_INCLUDED_THREADS = 2
 
 
 def check_machine(threads: int | None = None) -> None:
@@ -33,7 +33,7 @@ def check_machine(threads: int | None = None) -> None:
         from tofuse.kernels.cores import usable_cores
 
         threads = usable_cores()
-    needed = _MIN_BYTES + _EACH_THREAD_BYTES * max(0, threads - _COUNTED_THREADS)
+    needed = _MIN_BYTES + _BYTES_PER_THREAD * max(0, threads - _INCLUDED_THREADS)
     if limit < needed:
         raise InputError(
             f"not enough memory: the address space is limited to {limit / 1e9:.1f} GB, and "

@@ -92,32 +92,32 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
         """Parse; each command reports its own unknown options. No command at all is ``--help``."""
-        found, unknown = self.parse_known_args(args, namespace)
-        if not hasattr(found, "command") and not unknown:
-            found.parser.print_help()
+        arguments, unknown = self.parse_known_args(args, namespace)
+        if not hasattr(arguments, "command") and not unknown:
+            arguments.parser.print_help()
             sys.exit(0)
         if unknown:
-            command: Parser = getattr(found, "parser", self)
+            command: Parser = getattr(arguments, "parser", self)
             command.refuse(unknown)
-        return found
+        return arguments
 
     def refuse(self, unknown: Sequence[str]) -> NoReturn:
         """Report an unknown option, with the most similar known one."""
         word = unknown[0].partition("=")[0]
-        self.error(f"unknown option {word}" + _meant(word, self._option_string_actions))
+        self.error(f"unknown option {word}" + _suggestion(word, self._option_string_actions))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
             name = action.metavar or "/".join(action.option_strings) or action.dest
             kind = "unknown command" if name == "COMMAND" else f"{name}: unknown value"
-            hint = _meant(str(value), choices) or f" (one of {', '.join(choices)})"
+            hint = _suggestion(str(value), choices) or f" (one of {', '.join(choices)})"
             raise argparse.ArgumentError(None, f"{kind} {value!r}{hint}")
 
 
-def _meant(word: str, known: Iterable[str]) -> str:
-    near = get_close_matches(word, list(known), 1)
-    return f" (did you mean {near[0]}?)" if near else ""
+def _suggestion(word: str, candidates: Iterable[str]) -> str:
+    suggestions = get_close_matches(word, list(candidates), 1)
+    return f" (did you mean {suggestions[0]}?)" if suggestions else ""
 
 
 class _Help(argparse.HelpFormatter):
@@ -265,8 +265,8 @@ def _source(p: Any) -> None:
 
 
 def _selection(p: Any) -> None:
-    p.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
-    p.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
+    p.add_argument("--start", type=_integer, default=0, metavar="I", help="first frame (0)")
+    p.add_argument("--end", type=_integer, metavar="I", help="stop before this frame")
     p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
 
 
@@ -316,12 +316,12 @@ def _inputs(p: Any) -> None:
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
 
 
-def _json(p: Any, what: str = "print the result as JSON") -> None:
-    p.add_argument("--json", action="store_true", help=what)
+def _json(p: Any, purpose: str = "print the result as JSON") -> None:
+    p.add_argument("--json", action="store_true", help=purpose)
 
 
-def _overwrite(p: Any, what: str = "an existing result in --out") -> None:
-    p.add_argument("--overwrite", action="store_true", help=f"replace {what}")
+def _overwrite(p: Any, purpose: str = "an existing result in --out") -> None:
+    p.add_argument("--overwrite", action="store_true", help=f"replace {purpose}")
 
 
 def _threads(p: Any) -> None:
@@ -336,8 +336,8 @@ def _method(p: Any) -> None:
     p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
 
 
-def _tolerance(p: Any, what: str, default: str = "0.5 %% of the model, at least 10mm") -> None:
-    text = f"accuracy required of {what}, e.g. 30mm ({default})"
+def _tolerance(p: Any, purpose: str, default: str = "0.5 %% of the model, at least 10mm") -> None:
+    text = f"accuracy required of {purpose}, e.g. 30mm ({default})"
     p.add_argument("--tolerance", type=_length, metavar="LENGTH", help=text)
 
 
@@ -669,7 +669,7 @@ def _calibrate(commands: Any) -> None:
     g.add_argument(
         "--recording", metavar="REC", help="take depth unit and kind from this recording"
     )
-    g.add_argument("--index", type=_whole, metavar="N", help="camera index in a CalLab file")
+    g.add_argument("--index", type=_integer, metavar="N", help="camera index in a CalLab file")
 
 
 def _noise(commands: Any) -> None:
@@ -771,7 +771,7 @@ def _bytes(text: str) -> int:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _whole(text: str) -> int:
+def _integer(text: str) -> int:
     try:
         return int(text)
     except ValueError as error:
@@ -779,7 +779,7 @@ def _whole(text: str) -> int:
 
 
 def _number(text: str) -> float:
-    """NaN if it is none."""
+    """Parse a number; NaN if the text is none."""
     try:
         return float(text)
     except ValueError:
@@ -787,7 +787,7 @@ def _number(text: str) -> float:
 
 
 def _within(bounds: Bounds, kind: Callable[[str], _Number]) -> Callable[[str], _Number]:
-    """Return a function that reads a number and refuses one outside the bounds."""
+    """Return a function that reads a number and rejects one outside the bounds."""
 
     def read(text: str) -> _Number:
         value = kind(text)
@@ -798,9 +798,9 @@ def _within(bounds: Bounds, kind: Callable[[str], _Number]) -> Callable[[str], _
     return read
 
 
-_port = _within(Bounds(1, 65535), _whole)
-_count = _within(Bounds(1), _whole)
-_non_negative = _within(Bounds(0), _whole)
+_port = _within(Bounds(1, 65535), _integer)
+_count = _within(Bounds(1), _integer)
+_non_negative = _within(Bounds(0), _integer)
 _ratio = _within(Bounds(0, 1, exclusive=True), _number)
 _seconds = _within(Bounds(0, exclusive=True), _number)
 _metres = _within(Bounds(0), _number)

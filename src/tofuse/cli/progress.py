@@ -20,7 +20,7 @@ from tofuse.results.types import FrameRecord
 
 _WINDOW = 30  # steps from whose rate the remaining time is estimated
 _GOOD_FRACTION = 0.8  # inliers
-_WIDE = 92  # columns of a terminal with space for a bar
+_MIN_BAR_COLUMNS = 92  # minimum width of a terminal for a bar
 
 
 class Pace:
@@ -45,8 +45,8 @@ class Pace:
     @property
     def per_second(self) -> float | None:
         """Steps per second; None before the first."""
-        passed = self._times[-1] - self._times[0]
-        return (len(self._times) - 1) / max(passed, 1e-3) if self.done else None
+        elapsed = self._times[-1] - self._times[0]
+        return (len(self._times) - 1) / max(elapsed, 1e-3) if self.done else None
 
     @property
     def seconds_left(self) -> float | None:
@@ -86,8 +86,8 @@ class Health:
         """The words, with rich's markup."""
         if not self._words:
             return ""
-        more = f", {self._without} without a pose" if self._without > self._consecutive else ""
-        return f"[{self._color}]{self._words}[/]{more}"
+        suffix = f", {self._without} without a pose" if self._without > self._consecutive else ""
+        return f"[{self._color}]{self._words}[/]{suffix}"
 
 
 class TerminalProgress(Silent):
@@ -98,11 +98,11 @@ class TerminalProgress(Silent):
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._console = Console(file=stream or sys.stderr, highlight=False)
-        self._tick = "[green]\u2713[/]" if self._console.encoding.startswith("utf") else "+"
-        wide = self._console.width >= _WIDE
+        self._check_mark = "[green]\u2713[/]" if self._console.encoding.startswith("utf") else "+"
+        has_bar = self._console.width >= _MIN_BAR_COLUMNS
         self._bar = Progress(
             _column("{task.fields[mark]} {task.description}", 15),
-            *([BarColumn(bar_width=20)] if wide else []),
+            *([BarColumn(bar_width=20)] if has_bar else []),
             _column("{task.fields[count]}", 9, "right"),
             _column("{task.fields[pace]}", 19),
             _column("{task.fields[health]}", 8),
@@ -125,12 +125,12 @@ class TerminalProgress(Silent):
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage."""
         if self._task is not None:
-            whole = self._pace.done or 1
+            steps = self._pace.done or 1
             self._bar.update(
                 self._task,
-                mark=self._tick,
-                total=whole,
-                completed=whole,
+                mark=self._check_mark,
+                total=steps,
+                completed=steps,
                 count=f"{self._pace.done}" if self._pace.done else "",
                 pace=f"{_duration(self._pace.seconds)}",
             )
@@ -262,12 +262,12 @@ def _duration(seconds: float) -> str:
     """A duration in few characters: 0.4 s, 12 s, 3:07, 1:02:45."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
+    total = round(seconds)
+    if total < 60:
+        return f"{total} s"
+    minutes, remainder = divmod(total, 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return f"{hours}:{minutes:02}:{remainder:02}" if hours else f"{minutes}:{remainder:02}"
 
 
 def escaped(text: str) -> str:

@@ -17,42 +17,49 @@ from tofuse.rigs.check import CameraMotion
 
 def tables(rig: Rig) -> list[Table]:
     """Return tables of the cameras' poses, and of the distances between overlapping surfaces."""
-    where = Table(box=None)
+    poses = Table(box=None)
     for title in ("camera", "x y z (m)"):
-        where.add_column(title, no_wrap=True)
+        poses.add_column(title, no_wrap=True)
     for title in ("deg", "± mm", "± deg", "clock ms", "depth mm"):
-        where.add_column(title, justify="right", no_wrap=True)
+        poses.add_column(title, justify="right", no_wrap=True)
     for camera in rig.cameras:
         T = camera.T_rig_camera
-        metres, radians = largest_sigmas(camera)
+        sigma_m, sigma_rad = largest_sigmas(camera)
         values = (
             f"{np.degrees(float(se3.angle(T))):.2f}",
-            f"{1000 * metres:.2g}",
-            f"{np.degrees(radians):.2g}",
+            f"{1000 * sigma_m:.2g}",
+            f"{np.degrees(sigma_rad):.2g}",
             f"{1000 * camera.time_offset_s:+.1f}",
             f"{1000 * camera.depth_offset_m:+.1f}",
         )
         first = camera is rig.cameras[0]
-        where.add_row(
+        poses.add_row(
             camera.name,
             " ".join(f"{x:+.3f}" for x in T[:3, 3]),
             *(("-",) * len(values) if first else values),
         )
     pairs = Table("camera", "camera", "surface distance (mm)", "pixels", box=None)
-    for found in rig.disagreement:
-        pairs.add_row(found.a, found.b, f"{1000 * found.median_m:.1f}", f"{found.pixels:,}")
-    return [where, pairs] if rig.disagreement else [where]
+    for disagreement in rig.disagreement:
+        pairs.add_row(
+            disagreement.a,
+            disagreement.b,
+            f"{1000 * disagreement.median_m:.1f}",
+            f"{disagreement.pixels:,}",
+        )
+    return [poses, pairs] if rig.disagreement else [poses]
 
 
-def notes(found: Calibration) -> list[str]:
+def notes(calibration: Calibration) -> list[str]:
     """Return warnings, those about cameras without a pose first."""
-    unplaced = [f"{name} has no pose: {why}" for name, why in found.rig.unplaced.items()]
-    return [*unplaced, *found.notes]
+    unplaced = [
+        f"{name} has no pose: {reason}" for name, reason in calibration.rig.unplaced.items()
+    ]
+    return [*unplaced, *calibration.notes]
 
 
-def exit_status(found: Calibration) -> int:
+def exit_status(calibration: Calibration) -> int:
     """Return 3 if the pose of some camera is unknown, else 0."""
-    return 3 if found.rig.unplaced else 0
+    return 3 if calibration.rig.unplaced else 0
 
 
 def check_lines(cameras: Sequence[CameraMotion]) -> list[str]:
@@ -64,16 +71,16 @@ def check_lines(cameras: Sequence[CameraMotion]) -> list[str]:
 def _outcome(camera: CameraMotion) -> str:
     if camera.reason:
         return f"not checked: {camera.reason}"
-    by = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
+    motion = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
     sigma = f"1 sigma: {1000 * camera.sigma_m:.1f} mm, {np.degrees(camera.sigma_rad):.2f} deg"
     if camera.moved:
-        p, elsewhere = f"{camera.chance:.1g}", f"{camera.chance_elsewhere:.1g}"
-        if elsewhere != p:
-            p += f", or {elsewhere} if the scene is not that of the calibration"
-        return f"moved by {by} ({sigma}; p = {p})"
+        p, p_elsewhere = f"{camera.chance:.1g}", f"{camera.chance_elsewhere:.1g}"
+        if p_elsewhere != p:
+            p += f", or {p_elsewhere} if the scene is not that of the calibration"
+        return f"moved by {motion} ({sigma}; p = {p})"
     if camera.sigma_m == 0:
         return "unchanged: reference for the others"
-    return f"unchanged, within {by} ({sigma})"
+    return f"unchanged, within {motion} ({sigma})"
 
 
 def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:

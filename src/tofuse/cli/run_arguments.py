@@ -40,8 +40,8 @@ class _Strict(Parser):
 @cache
 def _options() -> dict[str, argparse.Action]:
     """Options of `tofuse run` that a table may have, by name."""
-    found = make_parser().parse_args(["run", ".", "--out", "."]).parser._option_string_actions
-    names = {word.removeprefix("--"): action for word, action in found.items()}
+    actions = make_parser().parse_args(["run", ".", "--out", "."]).parser._option_string_actions
+    names = {word.removeprefix("--"): action for word, action in actions.items()}
     return {n: a for n, a in names.items() if not n.startswith("-") and n not in _EXCLUDED}
 
 
@@ -67,11 +67,11 @@ def run_arguments(cells: Mapping[str, str], base: Path, where: str) -> tuple[str
         name = column.replace("_", "-")
         action = _options().get(name)
         if action is None:
-            near = get_close_matches(name, _options(), 1)
+            suggestions = get_close_matches(name, _options(), 1)
             raise InputError(
                 f"{column} is not an option of `tofuse run` for a table",
                 where=where,
-                remedy=f"did you mean {near[0]}?" if near else "see docs/batch.md",
+                remedy=f"did you mean {suggestions[0]}?" if suggestions else "see docs/batch.md",
             )
         if action.nargs == 0:
             if value.lower() not in _YES | _NO:
@@ -89,7 +89,7 @@ def run_arguments(cells: Mapping[str, str], base: Path, where: str) -> tuple[str
 
 @cache
 def _problem(arguments: tuple[str, ...]) -> str:
-    """What is wrong with arguments of `tofuse run`; empty if nothing."""
+    """The problem with arguments of `tofuse run`; empty if there is none."""
     try:
         make_parser(_Strict).parse_args(["run", ".", "--out", ".", *arguments])
     except InputError as error:

@@ -1,7 +1,7 @@
 """Standard output and error that may be closed, full, or not UTF-8.
 
-What is printed is not the result: a command continues when its output can't be written, and
-reports that at the end.
+Printed text is not the result: a command continues when its output can't be written, and reports
+that at the end.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class SafeStream:
     Attributes
     ----------
     error
-        Why output was dropped; None as long as nothing was.
+        Reason for dropped output; None as long as nothing was dropped.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -70,7 +70,7 @@ class SafeStream:
 @contextmanager
 def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
     """Replace standard output and error in the block, and yield both replacements."""
-    before = sys.stdout, sys.stderr
+    previous = sys.stdout, sys.stderr
     out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
     sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
     try:
@@ -78,4 +78,4 @@ def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
     finally:
         out.flush()
         err.flush()
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr = previous

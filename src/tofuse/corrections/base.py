@@ -46,7 +46,7 @@ class Corrector(Protocol):
         return
 
     def reset_poses(self) -> None:
-        """Forget positions of surfaces, as poses are in another world frame from here on."""
+        """Forget positions of surfaces, as later poses are in another world frame."""
         return
 
 

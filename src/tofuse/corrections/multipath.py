@@ -103,10 +103,10 @@ class Multipath(Bounded, Correction):
             self, trial=False, applied=helps, strength=outcome, relative_sigma=relative_sigma
         )
 
-    def start(self, reflections: MultipathModel | None = None) -> MultipathCorrector:
-        """See `Correction.start`. `reflections` computes the multipath."""
+    def start(self, model: MultipathModel | None = None) -> MultipathCorrector:
+        """See `Correction.start`. `model` computes the multipath."""
         return MultipathCorrector(
-            self, reflections or MultipathModel(lamp=self.lamp, bounces=self.bounces)
+            self, model or MultipathModel(lamp=self.lamp, bounces=self.bounces)
         )
 
 
@@ -121,11 +121,11 @@ class MultipathCorrector(Corrector):
         As given, or the current estimate; None before the first frame.
     """
 
-    def __init__(self, options: Multipath, reflections: MultipathModel) -> None:
+    def __init__(self, options: Multipath, model: MultipathModel) -> None:
         self.gain = options.gain
         self._options = options
-        self._reflections = reflections
-        self._estimator = GainEstimator(self._reflections)
+        self._model = model
+        self._estimator = GainEstimator(self._model)
         self._map = ReflectorMap()
         self._last: tuple[int, MultipathEstimate] | None = None
 
@@ -148,13 +148,13 @@ class MultipathCorrector(Corrector):
         if self._options.gain is None:
             self._estimator.add(image)
             self.gain = self._estimator.gain
-        found = None
+        estimate = None
         if self.gain is not None:
-            found = self._reflections.solve(image, self.gain, self._map, T_world_camera)
-        if found is None:
+            estimate = self._model.solve(image, self.gain, self._map, T_world_camera)
+        if estimate is None:
             return frame
-        self._last = frame.index, found
-        return _corrected(frame, image, found, self._options.relative_sigma)
+        self._last = frame.index, estimate
+        return _corrected(frame, image, estimate, self._options.relative_sigma)
 
     def reset_poses(self) -> None:
         """See `Corrector.reset_poses`."""
@@ -164,31 +164,31 @@ class MultipathCorrector(Corrector):
         """See `Corrector.add_pose`."""
         if self._last is None or not isinstance(frame, RangeFrame) or frame.index != self._last[0]:
             return
-        found = self._last[1]
-        middle = [
-            np.minimum(np.arange(n) * found.step + found.step // 2, size - 1)
-            for n, size in zip(found.surfaces.good.shape, frame.valid.shape, strict=True)
+        estimate = self._last[1]
+        centres = [
+            np.minimum(np.arange(n) * estimate.step + estimate.step // 2, size - 1)
+            for n, size in zip(estimate.surfaces.good.shape, frame.valid.shape, strict=True)
         ]
-        self._map.add(found.surfaces, frame.valid[np.ix_(*middle)], T_world_camera)
+        self._map.add(estimate.surfaces, frame.valid[np.ix_(*centres)], T_world_camera)
 
 
 def _corrected(
-    frame: RangeFrame, image: ToFImage, found: MultipathEstimate, relative_sigma: float
+    frame: RangeFrame, image: ToFImage, estimate: MultipathEstimate, relative_sigma: float
 ) -> RangeFrame:
     assert frame.amplitude_image is not None
-    nearer = np.where(image.z > 0, found.z / np.where(image.z > 0, image.z, 1), 1)
-    factor = 1 / found.factor
+    depth_ratio = np.where(image.z > 0, estimate.z / np.where(image.z > 0, image.z, 1), 1)
+    factor = 1 / estimate.factor
     if frame.amplitude_kind == "range_compensated":
-        factor = factor * nearer**2
-    plain = (image.z <= 0) | (frame.amplitude_image >= SATURATED_AMPLITUDE)
-    amplitude = np.where(plain, frame.amplitude_image, frame.amplitude_image * factor)
+        factor = factor * depth_ratio**2
+    unchanged = (image.z <= 0) | (frame.amplitude_image >= SATURATED_AMPLITUDE)
+    amplitude = np.where(unchanged, frame.amplitude_image, frame.amplitude_image * factor)
     shared = frame.shared_sigma_image
     if relative_sigma > 0:
-        own = relative_sigma * np.abs(frame.radial_range * (1 - nearer))
-        shared = (own if shared is None else np.hypot(shared, own)).astype(np.float32)
+        sigma = relative_sigma * np.abs(frame.radial_range * (1 - depth_ratio))
+        shared = (sigma if shared is None else np.hypot(shared, sigma)).astype(np.float32)
     return replace(
         frame,
-        depth=(frame.depth * nearer).astype(np.float32),
+        depth=(frame.depth * depth_ratio).astype(np.float32),
         amplitude_image=amplitude.astype(np.float32),
         shared_sigma_image=shared,
     )

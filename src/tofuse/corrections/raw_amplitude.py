@@ -25,20 +25,20 @@ def tof_image(frame: RangeFrame, period_m: float | None = None) -> ToFImage | No
     z = np.where(frame.valid, frame.z, np.float32(0))
     rays = frame.camera.rays()
     amplitude = frame.amplitude_image
-    fine = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
-    fine &= amplitude < SATURATED_AMPLITUDE
-    raw = np.where(fine, amplitude, np.float32(0))
+    valid = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
+    valid &= amplitude < SATURATED_AMPLITUDE
+    raw = np.where(valid, amplitude, np.float32(0))
     if frame.amplitude_kind == "range_compensated":
-        square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
+        squared_length = np.where(valid, 1 + (rays * rays).sum(-1), np.float32(1))
         # The squared range is z^2 times the squared length of the ray.
-        raw = raw / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
+        raw = raw / (np.where(valid, z * z, np.float32(1)) * squared_length ** (FALLOFF / 2 + 1))
     return ToFImage(z, rays, raw.astype(np.float32, copy=False), period_m)
 
 
-def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
-    """Return the ambiguity range of a frame of one frequency, or `given`; None if unknown."""
-    if given is not None:
-        return given
+def modulation_period(frame: RangeFrame, override: float | None) -> float | None:
+    """Return the ambiguity range of a single-frequency frame, or `override`; None if unknown."""
+    if override is not None:
+        return override
     period_m = frame.ambiguity_m
     if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
         return None
@@ -53,11 +53,11 @@ def frame_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128
 
 def phasor(image: ToFImage) -> Complex128:
     """Return raw amplitude and phase as complex numbers (H, W); 0 where invalid."""
-    seen = (image.z > 0) & (image.amplitude > 0)
+    valid = (image.z > 0) & (image.amplitude > 0)
     x, y = image.rays[..., 0], image.rays[..., 1]
-    r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
+    r = np.where(valid, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
     phase = np.float32(2 * np.pi / image.period_m) * r
-    amplitude = np.where(seen, image.amplitude, np.float32(0))
+    amplitude = np.where(valid, image.amplitude, np.float32(0))
     out = np.empty(r.shape, np.complex128)
     out.real, out.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)
     return out

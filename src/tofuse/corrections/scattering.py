@@ -21,11 +21,11 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.scattering import Scattering, estimate_fractions
 
 # Smallest ratio of direct to measured light of a pixel that is corrected.
-_MIN_OWN = 0.5
+_MIN_DIRECT = 0.5
 # Margin in pixels around moving objects that counts neither as moving nor as static.
-_RIM = 4
+_MARGIN = 4
 # Fraction of the frames in which a static pixel must show its background.
-_STILL = 0.9
+_MIN_STATIC = 0.9
 
 
 @part("correction", "scattering", label="validated")
@@ -39,12 +39,12 @@ class LensScattering(Bounded, Correction):
     Attributes
     ----------
     fractions
-        Share of the light that goes into each Gaussian. None: learnt from the recording, where
-        something moves before a background that stands still.
+        Fraction of the light in each Gaussian. None: estimated from the recording, if an object
+        moves in front of a static background.
     widths
         Standard deviations of the Gaussians, as fractions of the image's width.
     period_m
-        Range after which the phase repeats; None: as the frame says.
+        Ambiguity range; None: that of the frame.
     """
 
     fractions: tuple[float, ...] | None = None
@@ -77,8 +77,8 @@ class LensScattering(Bounded, Correction):
         phasors = [x for image in images if (x := frame_phasor(image, self.period_m)) is not None]
         if images and len(phasors) == len(images):
             with suppress(InputError):
-                moves, still = _moves_and_still(images)
-                fractions = estimate_fractions(np.stack(phasors), moves, still, self.widths)
+                moving, static = _moving_and_static(images)
+                fractions = estimate_fractions(np.stack(phasors), moving, static, self.widths)
         return replace(self, fractions=tuple(float(fraction) for fraction in fractions))
 
     def start(self) -> ScatteringCorrector:
@@ -109,28 +109,30 @@ class ScatteringCorrector(Corrector):
         if image is None:
             return frame
         measured = phasor(image)
-        own = self._model.removed(measured)
-        lit = (measured != 0) & (np.abs(own) > _MIN_OWN * np.abs(measured))
-        ratio = np.where(lit, own, 1) / np.where(lit, measured, 1)
-        r = np.where(lit, frame.radial_range, 1)
-        nearer = 1 + np.angle(ratio) * (image.period_m / (2 * np.pi)) / r
-        lit &= nearer > 0
-        nearer = np.where(lit, nearer, 1)
-        factor = np.where(lit, np.abs(ratio), 1)
+        direct = self._model.without_scatter(measured)
+        valid = (measured != 0) & (np.abs(direct) > _MIN_DIRECT * np.abs(measured))
+        ratio = np.where(valid, direct, 1) / np.where(valid, measured, 1)
+        r = np.where(valid, frame.radial_range, 1)
+        range_ratio = 1 + np.angle(ratio) * (image.period_m / (2 * np.pi)) / r
+        valid &= range_ratio > 0
+        range_ratio = np.where(valid, range_ratio, 1)
+        factor = np.where(valid, np.abs(ratio), 1)
         if frame.amplitude_kind == "range_compensated":
-            factor = factor * nearer**2
+            factor = factor * range_ratio**2
         assert frame.amplitude_image is not None
         return replace(
             frame,
-            depth=(frame.depth * nearer).astype(np.float32),
+            depth=(frame.depth * range_ratio).astype(np.float32),
             amplitude_image=(frame.amplitude_image * factor).astype(np.float32),
         )
 
 
-def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
-    """Return masks (H, W) of moving pixels, and of static ones far from these."""
-    found = moving_object(images)
-    moves = found.own | np.any([found.mask(image.z) for image in images], axis=0)
-    square = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
-    around = cv2.dilate(moves.astype(np.uint8), square) > 0
-    return moves, ~around & np.isfinite(found.far.z) & (found.far.static_fraction > _STILL)
+def _moving_and_static(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
+    """Return masks (H, W) of moving pixels, and of static pixels away from them."""
+    segmentation = moving_object(images)
+    moving = segmentation.own | np.any([segmentation.mask(image.z) for image in images], axis=0)
+    square = np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)
+    around = cv2.dilate(moving.astype(np.uint8), square) > 0
+    return moving, ~around & np.isfinite(segmentation.far.z) & (
+        segmentation.far.static_fraction > _MIN_STATIC
+    )

@@ -54,11 +54,11 @@ class Unwrap(Bounded, Correction):
         white = 0.0
         # Alternate with unwrapping, as most surfaces may be beyond the ambiguity range.
         for _ in range(_ROUNDS):
-            found = [w for frame in frames if (w := self._white_of(frame, white)) > 0]
-            if not found:
+            estimates = [w for frame in frames if (w := self._white_of(frame, white)) > 0]
+            if not estimates:
                 return self
-            before, white = white, float(np.quantile(found, 0.9))
-            if abs(white - before) < 0.02 * white:
+            previous, white = white, float(np.quantile(estimates, 0.9))
+            if abs(white - previous) < 0.02 * white:
                 break
         return replace(self, white=white)
 
@@ -67,10 +67,10 @@ class Unwrap(Bounded, Correction):
         return UnwrapCorrector(self)
 
     def _white_of(self, frame: Frame, white: float) -> float:
-        known = range_and_amplitude(frame, self.period_m)
-        if known is None:
+        signal = range_and_amplitude(frame, self.period_m)
+        if signal is None:
             return 0.0
-        radial, amplitude, period = known
+        radial, amplitude, period = signal
         pitch = pixel_pitch(frame)
         periods = count_periods(radial, amplitude, period, white, pitch, self.options)
         return white_amplitude(
@@ -90,10 +90,10 @@ class UnwrapCorrector(Corrector):
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. Range-compensated amplitude is scaled to the new range."""
-        known = range_and_amplitude(frame, self.part.period_m)
-        if known is None or not isinstance(frame, RangeFrame):
+        signal = range_and_amplitude(frame, self.part.period_m)
+        if signal is None or not isinstance(frame, RangeFrame):
             return frame
-        radial, measured, period = known
+        radial, measured, period = signal
         white, pitch = self.part.white or 0.0, pixel_pitch(frame)
         periods = count_periods(radial, measured, period, white, pitch, self.part.options)
         if not periods.any():

@@ -1,7 +1,7 @@
 """Change detection between two sessions in one map: surfaces that appeared or vanished.
 
 A surface of the later session has appeared if the earlier one measured free space there; one of the
-earlier session has vanished if the later one did. Places that the other session did not see, or
+earlier session has vanished if the later one did. Points that the other session did not observe, or
 that were occluded, are not compared.
 
 Each point is compared with all views of the other session that it projects into. The standard
@@ -38,18 +38,18 @@ Kind = Literal["appeared", "vanished"]
 _POINTS, _MAX_PAIRS = 2000, 60
 # Residuals of the same surface are below this fraction of the depth.
 _MAX_RESIDUAL = 0.05
-# A surface is the same within this many standard deviations, and free space beyond this many.
-_SAME_SIGMAS, _THROUGH_SIGMAS = 3.0, 5.0
-# Probability that a view is wrong about a point for other reasons than noise, prior probability of
+# A surface is the same within this many standard deviations; beyond the second, it is free space.
+_SURFACE_SIGMAS, _FREE_SPACE_SIGMAS = 3.0, 5.0
+# Probability that a view is wrong about a point for reasons other than noise, prior probability of
 # a change, and the posterior that is required: a view counts log(19), and two more must support a
 # change than contradict it.
-_OUTLIERS, _PRIOR, _DETECT = 0.05, 0.05, 0.95
-# Views of its own session that must see a voxel: flying pixels move with the camera.
-_OWN_VIEWS = 2
-# Views with larger angles between their axes hardly see a surface from the same side.
+_OUTLIER_PROBABILITY, _PRIOR, _MIN_POSTERIOR = 0.05, 0.05, 0.95
+# Minimum views of the same session that observe a voxel: flying pixels move with the camera.
+_MIN_VIEWS = 2
+# Views with larger angles between their axes hardly observe a surface from the same side.
 _MIN_COSINE = 0.25
 # Edge of a voxel in pixels at the typical depth; voxels closer than this many edges form a cluster.
-_VOXEL_PIXELS, _GAP = 2.5, 3.0
+_VOXEL_PIXELS, _CLUSTER_GAP = 2.5, 3.0
 # Minimum area of a change, as a fraction of the area that a view covers at the typical depth.
 _MIN_AREA_RATIO = 0.004
 _CHUNKS = 32
@@ -116,27 +116,29 @@ def changes(
     """
     if not before or not after:
         return []
-    first = _prepared(before, poses_before)
-    second = _prepared(after, poses_after)
+    first = _prepare(before, poses_before)
+    second = _prepare(after, poses_after)
     scale = max(_noise_scale(first), _noise_scale(second))
-    shift = _misalignment(first, second, scale)
+    misalignment = _misalignment(first, second, scale)
     depth = float(np.median([v.depth for v in (*before, *after)]))
     pitch = float(np.median([v.projection.pitch for v in (*before, *after)]))
     voxel = _VOXEL_PIXELS * pitch * depth
-    sight = float(np.median([v.pixels * v.projection.pitch**2 for v in (*before, *after)]))
-    min_voxels = _MIN_AREA_RATIO * sight * depth**2 / voxel**2
-    found = []
-    ways: tuple[tuple[Kind, Sequence[_SessionView], Sequence[_SessionView]], ...] = (
+    solid_angle = float(np.median([v.pixels * v.projection.pitch**2 for v in (*before, *after)]))
+    min_voxels = _MIN_AREA_RATIO * solid_angle * depth**2 / voxel**2
+    detected = []
+    directions: tuple[tuple[Kind, Sequence[_SessionView], Sequence[_SessionView]], ...] = (
         ("appeared", second, first),
         ("vanished", first, second),
     )
-    for kind, own, other in ways:
-        points = _changed_voxels(own, other, scale, shift, voxel)
-        found += [Change(kind, p, voxel) for p in _clusters(points, voxel) if len(p) >= min_voxels]
-    return sorted(found, key=lambda c: -len(c.points))
+    for kind, views, other_views in directions:
+        points = _changed_voxels(views, other_views, scale, misalignment, voxel)
+        detected += [
+            Change(kind, p, voxel) for p in _clusters(points, voxel) if len(p) >= min_voxels
+        ]
+    return sorted(detected, key=lambda c: -len(c.points))
 
 
-def _prepared(views: Sequence[PreparedView], poses: Float64) -> list[_SessionView]:
+def _prepare(views: Sequence[PreparedView], poses: Float64) -> list[_SessionView]:
     return [
         _SessionView(view, sampled_points(view, _POINTS), nearest_depth(view), T)
         for view, T in zip(views, poses, strict=True)
@@ -153,7 +155,7 @@ def _compare(
     (K,) rows of the points that project to a valid pixel; their distances behind the target's
     surface, m, NaN where it has no plane; how much closer they are than everything that the target
     measured around the pixel, m; the standard deviation of both measurements, m; and whether both
-    surfaces face the same way.
+    surfaces face in the same direction.
     """
     T = se3.inverse(target.T_world_camera) @ source.T_world_camera
     points = se3.transform(T, source.points.points.astype(np.float64))
@@ -162,22 +164,22 @@ def _compare(
     rows, columns = view.z.shape
     inside = (pixel >= 0).all(1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
     inside[inside] = target.nearest[pixel[inside, 1], pixel[inside, 0]] > 0
-    at = np.flatnonzero(inside)
-    j, i = pixel[at].T
-    p = points[at]
+    projected = np.flatnonzero(inside)
+    j, i = pixel[projected].T
+    p = points[projected]
     plane = view.planes[i, j].astype(np.float64)
     length = np.linalg.norm(plane[:, :3], axis=1)
-    known = (plane[:, 3] > 0) & (length > 0)
-    length = np.where(known, length, 1.0)
+    has_plane = (plane[:, 3] > 0) & (length > 0)
+    length = np.where(has_plane, length, 1.0)
     behind = ((plane[:, :3] * p).sum(1) - 1) / length
-    normal = source.points.normals[at] @ T[:3, :3].T
-    facing = known & ((plane[:, :3] * normal).sum(1) / length > 0.5)
+    normal = source.points.normals[projected] @ T[:3, :3].T
+    facing = has_plane & ((plane[:, :3] * normal).sum(1) / length > 0.5)
     nearer = target.nearest[i, j] - p[:, 2]
-    sigma = np.hypot(source.points.sigma[at], view.sigma[i, j])
-    return at, np.where(known, behind, np.nan), nearer, sigma, facing
+    sigma = np.hypot(source.points.sigma[projected], view.sigma[i, j])
+    return projected, np.where(has_plane, behind, np.nan), nearer, sigma, facing
 
 
-def _look_alike(a: _SessionView, b: _SessionView) -> bool:
+def _similar_direction(a: _SessionView, b: _SessionView) -> bool:
     """Whether two views have similar viewing directions."""
     return float(a.T_world_camera[:3, 2] @ b.T_world_camera[:3, 2]) > _MIN_COSINE
 
@@ -186,13 +188,13 @@ def _residuals(pairs: Sequence[tuple[_SessionView, _SessionView]]) -> tuple[Floa
     """Distances of points from the same surface in other views, and their stated sigma, m."""
 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64]]:
-        found = []
+        residuals = []
         for source, target in pairs[start:stop]:
-            at, behind, _, sigma, facing = _compare(source, target)
-            z = source.points.points[at, 2]
-            same = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _MAX_RESIDUAL * z)
-            found.append((np.abs(behind[same]), sigma[same]))
-        return found
+            rows, behind, _, sigma, facing = _compare(source, target)
+            z = source.points.points[rows, 2]
+            same_surface = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _MAX_RESIDUAL * z)
+            residuals.append((np.abs(behind[same_surface]), sigma[same_surface]))
+        return residuals
 
     chunks = [item for chunk in run_chunks(work, len(pairs), _CHUNKS) for item in chunk]
     if not chunks:
@@ -203,11 +205,11 @@ def _residuals(pairs: Sequence[tuple[_SessionView, _SessionView]]) -> tuple[Floa
 
 def _noise_scale(views: Sequence[_SessionView]) -> float:
     """The disagreement of views of one session, as a multiple of the stated sigma; at least 1."""
-    # Neighbours share errors, so that views up to a quarter of the session apart are compared too.
+    # Neighbours share errors, so views up to a quarter of the session apart are compared too.
     steps = sorted({1, max(1, len(views) // 8), max(1, len(views) // 4)})
     pairs = [(views[k], views[k + s]) for s in steps for k in range(len(views) - s)]
-    some = np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).round().astype(int)
-    r, sigma = _residuals([pairs[k] for k in np.unique(some)])
+    sampled = np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).round().astype(int)
+    r, sigma = _residuals([pairs[k] for k in np.unique(sampled)])
     if not len(r):
         return 1.0
     return max(float(np.quantile(r / sigma, 0.5)) / MEDIAN_OF_NORMAL, 1.0)
@@ -217,65 +219,76 @@ def _misalignment(
     first: Sequence[_SessionView], second: Sequence[_SessionView], scale: float
 ) -> float:
     """The distance between surfaces of two sessions in excess of noise (one sigma), m."""
-    facing = [(a, b) for a in first for b in second if _look_alike(a, b)]
-    some = np.linspace(0, len(facing) - 1, min(len(facing), 4 * _MAX_PAIRS)).round().astype(int)
-    r, sigma = _residuals([facing[k] for k in np.unique(some)])
+    facing = [(a, b) for a in first for b in second if _similar_direction(a, b)]
+    sampled = np.linspace(0, len(facing) - 1, min(len(facing), 4 * _MAX_PAIRS)).round().astype(int)
+    r, sigma = _residuals([facing[k] for k in np.unique(sampled)])
     if not len(r):
         return 0.0
-    both = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL
+    total = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL
     noise = scale * float(np.sqrt((sigma**2).mean()))
-    return float(np.sqrt(max(both**2 - noise**2, 0.0)))
+    return float(np.sqrt(max(total**2 - noise**2, 0.0)))
 
 
 def _changed_voxels(
-    own: Sequence[_SessionView],
-    other: Sequence[_SessionView],
+    views: Sequence[_SessionView],
+    other_views: Sequence[_SessionView],
     scale: float,
-    shift: float,
+    misalignment: float,
     voxel: float,
 ) -> Float64:
     """(K, 3) surface centroids of voxels where the other session measured free space."""
 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64, Intp]]:
-        found = []
+        compared = []
         for k in range(start, stop):
-            source = own[k]
+            source = views[k]
             points = source.points.points.astype(np.float64)
-            says = np.zeros(len(points))
-            for target in other:
-                if not _look_alike(source, target):
+            votes = np.zeros(len(points))
+            for target in other_views:
+                if not _similar_direction(source, target):
                     continue
-                at, behind, nearer, sigma, facing = _compare(source, target)
-                sigma = np.hypot(scale * sigma, shift)
+                rows, behind, nearer, sigma, facing = _compare(source, target)
+                sigma = np.hypot(scale * sigma, misalignment)
                 # On slanted surfaces, errors along the ray exceed those along the normal.
-                through = (nearer > _THROUGH_SIGMAS * sigma) & ~(behind > -_THROUGH_SIGMAS * sigma)
-                again = facing & (np.abs(behind) < _SAME_SIGMAS * sigma)
-                says[at] += through.astype(float) - again
-            found.append(
-                (se3.transform(source.T_world_camera, points), says, np.full(len(points), k))
+                free_space = (nearer > _FREE_SPACE_SIGMAS * sigma) & ~(
+                    behind > -_FREE_SPACE_SIGMAS * sigma
+                )
+                same_surface = facing & (np.abs(behind) < _SURFACE_SIGMAS * sigma)
+                votes[rows] += free_space.astype(float) - same_surface
+            compared.append(
+                (se3.transform(source.T_world_camera, points), votes, np.full(len(points), k))
             )
-        return found
+        return compared
 
-    chunks = [item for chunk in run_chunks(work, len(own), _CHUNKS) for item in chunk]
-    points, says, views = (np.concatenate(each) for each in zip(*chunks, strict=True))
+    chunks = [item for chunk in run_chunks(work, len(views), _CHUNKS) for item in chunk]
+    points, votes, view_numbers = (np.concatenate(each) for each in zip(*chunks, strict=True))
     if not len(points):
         return np.zeros((0, 3))
     cells, cell = np.unique(np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell, minlength=len(cells))
-    odds = np.log(_PRIOR / (1 - _PRIOR))
-    odds = odds + np.log((1 - _OUTLIERS) / _OUTLIERS) * np.bincount(cell, says) / count
-    seen_by = np.bincount(np.unique(np.stack([cell, views]), axis=1)[0], minlength=len(cells))
-    changed = (odds >= np.log(_DETECT / (1 - _DETECT)) - 1e-9) & (seen_by >= _OWN_VIEWS)
-    middles = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
-    return np.asarray(middles[changed], np.float64)
+    log_odds = np.log(_PRIOR / (1 - _PRIOR))
+    log_odds = (
+        log_odds
+        + np.log((1 - _OUTLIER_PROBABILITY) / _OUTLIER_PROBABILITY)
+        * np.bincount(cell, votes)
+        / count
+    )
+    view_counts = np.bincount(
+        np.unique(np.stack([cell, view_numbers]), axis=1)[0], minlength=len(cells)
+    )
+    changed = (log_odds >= np.log(_MIN_POSTERIOR / (1 - _MIN_POSTERIOR)) - 1e-9) & (
+        view_counts >= _MIN_VIEWS
+    )
+    centroids = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
+    return np.asarray(centroids[changed], np.float64)
 
 
 def _clusters(points: Float64, voxel: float) -> list[Float64]:
     """Clusters (K, 3) of points that are close to each other."""
     if not len(points):
         return []
-    pairs = cKDTree(points).query_pairs(_GAP * voxel, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(_CLUSTER_GAP * voxel, output_type="ndarray")
     n = len(points)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     count, label = connected_components(graph, directed=False)

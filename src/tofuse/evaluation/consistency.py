@@ -1,4 +1,4 @@
-"""Map consistency: how well the range images of a recording agree under given poses.
+"""Map consistency: how well the range images of a recording agree under a set of poses.
 
 It needs no ground truth, so it distinguishes good poses from bad ones even where the reference is
 no more accurate than the estimate. The definition:
@@ -163,7 +163,7 @@ class SurfaceImage:
             The frame.
         depth_unit_m
             Unit of the recording's depth images in m, if known. Depths in single precision are
-            then rounded to it, so that comparisons with limits which counts can meet exactly have
+            then rounded to it, so that comparisons with limits that counts can meet exactly have
             the same outcome as in double precision.
         """
         depth = frame.depth.astype(np.float64)
@@ -196,26 +196,26 @@ class SurfaceImage:
             return None
         model = 0 if type(camera) is Pinhole else 2 if isinstance(camera, Fisheye) else 1
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        size = [getattr(camera, name) / self.step for name in ("fx", "fy", "cx", "cy")]
-        bend = [getattr(camera, name, 0.0) for name in names]
-        return np.array([*size, *bend, model, self.max_radius2], float)
+        intrinsics = [getattr(camera, name) / self.step for name in ("fx", "fy", "cx", "cy")]
+        distortion = [getattr(camera, name, 0.0) for name in names]
+        return np.array([*intrinsics, *distortion, model, self.max_radius2], float)
 
     @cached_property
     def max_radius2(self) -> float:
-        """The largest x^2 + y^2 at z = 1 in the field of view, with a margin."""
+        """Maximum x^2 + y^2 at z = 1 in the field of view, with a margin."""
         return 1.1 * float(np.nanmax((_rays(self.camera) ** 2).sum(-1)))
 
     def pixels(self, points: Float64) -> Float64:
         """Project points (N, 3) in the camera frame to pixels (N, 2) of this resolution."""
-        out = np.full((len(points), 2), np.nan)
+        pixels = np.full((len(points), 2), np.nan)
         if self.lens_parameters is not None:
-            project_by_lens(points, self.lens_parameters, out)
-            return out
-        # Other cameras project slowly: only points that can be in view.
+            project_by_lens(points, self.lens_parameters, pixels)
+            return pixels
+        # Other cameras project slowly, so only points that can be in view are projected.
         x, y, z = points.T
-        seen = (z > 0.05) & (x * x + y * y <= self.max_radius2 * z * z)
-        out[seen] = self.camera.project(points[seen]) / self.step
-        return out
+        in_view = (z > 0.05) & (x * x + y * y <= self.max_radius2 * z * z)
+        pixels[in_view] = self.camera.project(points[in_view]) / self.step
+        return pixels
 
 
 def pair_agreement(
@@ -236,12 +236,12 @@ def pair_agreement(
     -------
     None if they overlap too little (step 4).
     """
-    forth, compared, inliers, squares = _compare(a, b, T_a_b)
-    overlap = forth / max(b.valid, 1)
+    projected_b, compared, inliers, squares = _compare(a, b, T_a_b)
+    overlap = projected_b / max(b.valid, 1)
     if overlap < MIN_OVERLAP:
         return None
-    back, *_ = _compare(b, a, se3.inverse(T_a_b))
-    overlap = min(overlap, back / max(a.valid, 1))
+    projected_a, *_ = _compare(b, a, se3.inverse(T_a_b))
+    overlap = min(overlap, projected_a / max(a.valid, 1))
     if overlap < MIN_OVERLAP:
         return None
     return PairAgreement(i, j, overlap, compared, inliers, squares)
@@ -256,12 +256,12 @@ def consistency_of_images(images: Sequence[SurfaceImage], poses: ArrayLike) -> C
     pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
 
     def work(start: int, stop: int) -> list[PairAgreement]:
-        found = []
+        overlapping = []
         for i, j in pairs[start:stop]:
             pair = pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
             if pair is not None:
-                found.append(pair)
-        return found
+                overlapping.append(pair)
+        return overlapping
 
     agreements = tuple(p for chunk in run_chunks(work, len(pairs), chunks=64) for p in chunk)
     return Consistency.of(agreements, len(images))
@@ -303,10 +303,10 @@ def map_consistency(
         )
     if frames < 1:
         raise InputError(f"is {frames}", where="frames", remedy="use 1 or more")
-    unit = recording.metadata.get("depth_unit_m")
-    chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
+    depth_unit_m = recording.metadata.get("depth_unit_m")
+    selected = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
     images, used = [], []
-    for k in chosen:
+    for k in selected:
         try:
             frame = recording[int(k)]
         except UnreadableFrameError:
@@ -320,7 +320,7 @@ def map_consistency(
         for corrector in correctors:
             frame = corrector.apply(frame)
         assert isinstance(frame, RangeFrame)
-        images.append(SurfaceImage.of(frame, unit))
+        images.append(SurfaceImage.of(frame, depth_unit_m))
         used.append(int(k))
     return consistency_of_images(images, T[used])
 
@@ -340,14 +340,14 @@ def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -
     (M, 4, 4), NaN for frames without a pose. Of several poses for a frame the last one is used.
     """
     times, pose_times = np.asarray(times, float), np.asarray(pose_times, float)
-    out = np.full((len(times), 4, 4), np.nan)
+    frame_poses = np.full((len(times), 4, 4), np.nan)
     if len(times) == 0:
-        return out
+        return frame_poses
     for time, T in zip(pose_times, np.asarray(poses, float), strict=True):
         k = int(np.abs(times - time).argmin())
         if abs(times[k] - time) < 0.02:
-            out[k] = T
-    return out
+            frame_poses[k] = T
+    return frame_poses
 
 
 def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
@@ -370,18 +370,18 @@ def _rays(camera: Camera) -> Float64:
 
 def _normals(points: Float64) -> Float32:
     k = NORMAL_REACH
-    out = np.zeros(points.shape, np.float32)
+    normals = np.zeros(points.shape, np.float32)
     if min(points.shape[:2]) <= 2 * k:
-        return out
+        return normals
     centre = points[k:-k, k:-k, 2]
     sides = [points[k:-k, 2 * k :], points[k:-k, : -2 * k], points[2 * k :, k:-k]]
     sides.append(points[: -2 * k, k:-k])
-    known = centre > 0
+    valid = centre > 0
     for side in sides:
         z = side[..., 2]
-        known &= (z > 0) & (np.abs(z - centre) <= NORMAL_JUMP * centre)
+        valid &= (z > 0) & (np.abs(z - centre) <= NORMAL_JUMP * centre)
     normal = np.cross(sides[0] - sides[1], sides[2] - sides[3])
     length = np.linalg.norm(normal, axis=-1)
-    known &= length > 0
-    out[k:-k, k:-k][known] = normal[known] / np.maximum(length[known], 1e-12)[:, None]
-    return out
+    valid &= length > 0
+    normals[k:-k, k:-k][valid] = normal[valid] / np.maximum(length[valid], 1e-12)[:, None]
+    return normals

@@ -1,9 +1,10 @@
 """Cross-view consistency: whether overlapping images support or contradict the poses.
 
 Map consistency (`consistency`) compares a point with whatever surface lies at the pixel that it
-projects to. The far side of a turned object then counts against correct poses. Here a point
-supports the poses where it lies on a surface that faces the same way, and contradicts them where
-the other image measured free space at it. A point behind a surface is occluded and doesn't count.
+projects to. The far side of a rotated object then counts against correct poses. Here a point
+supports the poses where it lies on a surface that faces in the same direction, and contradicts
+them where the other image measured free space at it. A point behind a surface is occluded and
+doesn't count.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class PairConsistency:
     i, j
         Positions of the views; i < j.
     support
-        Number of points of either on a surface of the other that faces the same way.
+        Number of points of either on a surface of the other that faces in the same direction.
     contradiction
         Number of points of either in the free space of the other.
     squares
@@ -74,16 +75,16 @@ class CrossViewConsistency:
     def support(self, pairs: Sequence[PairConsistency] | None = None) -> float:
         """Fraction of supporting points among supporting and contradicting ones; NaN if none."""
         pairs = self.pairs if pairs is None else pairs
-        support, against = sum(p.support for p in pairs), sum(p.contradiction for p in pairs)
-        return support / (support + against) if support + against else np.nan
+        support, contradiction = sum(p.support for p in pairs), sum(p.contradiction for p in pairs)
+        return support / (support + contradiction) if support + contradiction else np.nan
 
     def support_of_views(self) -> Float64:
         """(V,) the same fraction for each view; NaN where it overlaps with no other."""
-        support, against = np.zeros(len(self.frames)), np.zeros(len(self.frames))
+        support, contradiction = np.zeros(len(self.frames)), np.zeros(len(self.frames))
         for p in self.pairs:
             support[[p.i, p.j]] += p.support
-            against[[p.i, p.j]] += p.contradiction
-        total = support + against
+            contradiction[[p.i, p.j]] += p.contradiction
+        total = support + contradiction
         return np.divide(support, total, out=np.full(len(total), np.nan), where=total > 0)
 
     def rms_m(self, pairs: Sequence[PairConsistency] | None = None) -> float:
@@ -94,9 +95,13 @@ class CrossViewConsistency:
 
     def excess_m(self) -> float:
         """Rms disagreement of distant views in excess of that of consecutive ones, m."""
-        near = self.rms_m([p for p in self.pairs if p.j == p.i + 1])
-        far = self.rms_m([p for p in self.pairs if p.j > p.i + 1])
-        return float(np.sqrt(max(far**2 - near**2, 0.0))) if np.isfinite(near + far) else 0.0
+        consecutive = self.rms_m([p for p in self.pairs if p.j == p.i + 1])
+        distant = self.rms_m([p for p in self.pairs if p.j > p.i + 1])
+        return (
+            float(np.sqrt(max(distant**2 - consecutive**2, 0.0)))
+            if np.isfinite(consecutive + distant)
+            else 0.0
+        )
 
 
 def cross_view_consistency(frames: Sequence[RangeFrame], poses: ArrayLike) -> CrossViewConsistency:
@@ -115,10 +120,10 @@ def prepare_for_comparison(frame: RangeFrame) -> PreparedView:
 
 
 def restore_thinned(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:
-    """Return a frame with removed pixels restored, except where a whole neighbourhood was removed.
+    """Restore removed pixels of a frame, except where their entire neighbourhood was removed.
 
     Filters that thin out an image leave no planes in it, so their effect is undone; regions that
-    were cut out, such as a background, stay removed.
+    were cut out, for example a background, stay removed.
     """
     kept = cv2.dilate(filtered.valid.astype(np.uint8), _NEIGHBOURS) > 0
     return frame.keep(kept & frame.valid)
@@ -132,7 +137,7 @@ def compare_views(
     Parameters
     ----------
     views
-        Views as of `prepare_view`.
+        Views prepared by `prepare_view`.
     poses
         (V, 4, 4).
     groups
@@ -140,21 +145,21 @@ def compare_views(
     """
     options = AgreementOptions(points=_POINTS)
     axes = poses[:, :3, 2]
-    # Cameras with opposite viewing directions see no surface from the same side.
+    # Cameras with opposite viewing directions observe no surface from the same side.
     facing = axes @ axes.T > 0
     if groups is not None:
         facing &= np.not_equal.outer(groups, groups)
     pairs = np.argwhere(np.triu(facing, 1))
 
     def work(start: int, stop: int) -> list[PairConsistency]:
-        found = []
+        overlapping = []
         for i, j in pairs[start:stop].tolist():
             a = agreement(views[j], views[i], se3.inverse(poses[i]) @ poses[j], options)
-            support, against = (a.support + a.clash) * a.points, a.violation * a.points
-            if support + against > _MIN_OVERLAP * a.points:
+            support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
+            if support + contradiction > _MIN_OVERLAP * a.points:
                 squares = a.rms_m**2 * support if support else 0.0
-                found.append(PairConsistency(i, j, support, against, squares))
-        return found
+                overlapping.append(PairConsistency(i, j, support, contradiction, squares))
+        return overlapping
 
     chunks = run_chunks(work, len(pairs), chunks=64)
     return CrossViewConsistency(

@@ -1,19 +1,19 @@
-"""Deviation of given poses from pairwise registrations, and its statistical significance.
+"""Deviation of input poses from pairwise registrations, and its statistical significance.
 
 Pairs of views measure the motion between them (`posegraph.pair_measurements`), with far more pairs
 than poses. A least squares fit gives the poses that agree best with all pairs, and its residuals
-the errors of registrations in this recording, relative to their stated covariances. The given poses
+the errors of registrations in this recording, relative to their stated covariances. The input poses
 are consistent if they agree with the pairs as well as correct ones would.
 
-With x the perturbations from the fitted poses to the given ones, and S the covariance of the
-fitted poses, a correction d makes the given poses consistent if (x - d)^T S^-1 (x - d) is below a
+With x the perturbations from the fitted poses to the input poses, and S the covariance of the
+fitted poses, a correction d makes the input poses consistent if (x - d)^T S^-1 (x - d) is below a
 threshold. The smallest such correction is the solution of a trust-region problem,
 (M + m S^-1) (x - d) = M x, with the m at which the threshold is met (More and Sorensen 1983). M is
 the norm: the rms displacement over the views of the surfaces in view, by the translation, and by
 the rotation at the median depth. Gauge freedom and degenerate directions cost nothing.
 
-The norm of the smallest correction is stated for two thresholds: that which correct poses usually
-meet, which estimates the error, and that which 95 % of them meet, which is its lower bound.
+The norm of the smallest correction is stated for two thresholds: one that correct poses usually
+meet, which estimates the error, and one that 95 % of them meet, which is its lower bound.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from tofuse.posegraph.solve import Solution, solve
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.registration.projective import UNITS
 
-_LEVEL = 0.95
+_CONFIDENCE = 0.95
 # Of a chi-square variable with six degrees of freedom: its median, and Huber's threshold.
-_MEDIAN, _RARE = 2 * float(gammaincinv(3, 0.5)), 2 * float(gammaincinv(3, 0.99))
-_FITS = 3
-# Degrees of freedom of the prior of the scale, the stated covariances.
-_STATED = 6.0
-# Systematic errors of the camera, equal in all views of a place, show in no residual. Ratio of the
-# squared perturbations of the true poses to those the residuals show: usually, and in 95 % of
+_CHI2_MEDIAN, _CHI2_99 = 2 * float(gammaincinv(3, 0.5)), 2 * float(gammaincinv(3, 0.99))
+_ITERATIONS = 3
+# Degrees of freedom of the prior of the scale, which is 1 for the stated covariances.
+_PRIOR_DOF = 6.0
+# Systematic errors of the camera, equal in all views of a place, affect no residual. Ratio of the
+# squared perturbations of the true poses to those in the residuals: typically, and in 95 % of
 # recordings (docs/uncertainty.md).
-_USUAL, _AT_WORST = 1.5, 6.0
+_TYPICAL_RATIO, _MAX_RATIO = 1.5, 6.0
 # Information of a direction, in units of 1 cm and 1 degree, that no measurement constrains.
-_UNMEASURED = 1e-4
+_MIN_INFORMATION = 1e-4
 _MIN_SCALE = 1e-6
-_STRIDE = np.log(100.0)  # of the weights when bracketing the root
+_BRACKET_STEP = np.log(100.0)  # of the weights when bracketing the root
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,9 @@ class Fit:
         With these poses; its information is scaled to the errors of this recording.
     scale
         Standard deviation of the residuals, relative to the stated one.
-    unknowns
+    dof
         Degrees of freedom of the poses, without unconstrained ones.
-    spare
+    scale_dof
         Degrees of freedom of the estimate of the scale.
     depth_m
         Median depth of the views, m.
@@ -72,14 +72,14 @@ class Fit:
 
     graph: PoseGraph
     scale: float
-    unknowns: float
-    spare: float
+    dof: float
+    scale_dof: float
     depth_m: float
 
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
-    """Deviation of given poses from the registrations of a recording.
+    """Deviation of input poses from the registrations of a recording.
 
     Attributes
     ----------
@@ -142,48 +142,52 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     """
     n, m = len(graph.ids), len(graph.edges)
     information, poses = graph.information, graph.poses
-    square = max(float(np.median(_squares(graph))) / _MEDIAN, _MIN_SCALE)
-    measured = int((np.linalg.eigvalsh(information * np.outer(UNITS, UNITS)) > _UNMEASURED).sum())
-    spare = max(measured - 6 * (n - 1), 0)
-    for _ in range(_FITS):
-        found = _solved(replace(graph, poses=poses, information=information / square))
-        poses = found.poses
-        left = square * float((found.weights**2 * found.chi2).sum())
-        square = (_STATED + left) / (_STATED + spare)
+    variance_scale = max(float(np.median(_chi2(graph))) / _CHI2_MEDIAN, _MIN_SCALE)
+    measured_dof = int(
+        (np.linalg.eigvalsh(information * np.outer(UNITS, UNITS)) > _MIN_INFORMATION).sum()
+    )
+    scale_dof = max(measured_dof - 6 * (n - 1), 0)
+    for _ in range(_ITERATIONS):
+        solution = _robust_fit(
+            replace(graph, poses=poses, information=information / variance_scale)
+        )
+        poses = solution.poses
+        chi2 = variance_scale * float((solution.weights**2 * solution.chi2).sum())
+        variance_scale = (_PRIOR_DOF + chi2) / (_PRIOR_DOF + scale_dof)
     per_pair = (n - 1) / m
-    weighted = (found.weights * per_pair / square)[:, None, None] * information
+    scaled_information = (solution.weights * per_pair / variance_scale)[:, None, None] * information
     return Fit(
-        replace(graph, poses=poses, information=weighted),
-        float(np.sqrt(square)),
-        per_pair * measured,
-        _STATED + per_pair * spare,
+        replace(graph, poses=poses, information=scaled_information),
+        float(np.sqrt(variance_scale)),
+        per_pair * measured_dof,
+        _PRIOR_DOF + per_pair * scale_dof,
         depth_m,
     )
 
 
 def deviation(fit: Fit, poses: Float64) -> Deviation:
-    """Compare given poses (V, 4, 4) T_world_camera of the views of a fit with it.
+    """Compare input poses (V, 4, 4) T_world_camera of the views of a fit with it.
 
     Raises
     ------
     ValueError
         If the registrations of the fit constrain nothing.
     """
-    if not fit.unknowns > 0:
+    if not fit.dof > 0:
         raise ValueError("nothing was measured")
     graph = fit.graph
     aligned = align(poses, graph.poses, arm_m=fit.depth_m) @ poses
     x = se3.log(se3.inverse(graph.poses) @ aligned)
     problem = _Corrections(graph, fit.depth_m)
-    chance = float(fdtri(fit.unknowns, fit.spare, _LEVEL))
-    estimate = problem.smallest(x, _USUAL * fit.unknowns)
-    bound = problem.smallest(x, _AT_WORST * chance * fit.unknowns)
-    known = accuracy_of(GraphCovariances(graph), ObservedErrors(), 0.0)
-    own = float(np.hypot(known.position_m, fit.depth_m * known.rotation_rad))
+    f_quantile = float(fdtri(fit.dof, fit.scale_dof, _CONFIDENCE))
+    estimate = problem.smallest_correction(x, _TYPICAL_RATIO * fit.dof)
+    bound = problem.smallest_correction(x, _MAX_RATIO * f_quantile * fit.dof)
+    fit_accuracy = accuracy_of(GraphCovariances(graph), ObservedErrors(), 0.0)
+    fit_error_m = float(np.hypot(fit_accuracy.position_m, fit.depth_m * fit_accuracy.rotation_rad))
     return Deviation(
         problem.norm(estimate),
         problem.norm(bound),
-        problem.norm(x) + own,
+        problem.norm(x) + fit_error_m,
         problem.norm(x),
         graph.ids,
         problem.lengths(estimate),
@@ -217,53 +221,53 @@ class _Corrections:
         """Return the rms of the displacements, m."""
         return float(np.sqrt((self.lengths(x) ** 2).mean()))
 
-    def smallest(self, x: Float64, allowed: float) -> Float64:
-        """Return the smallest d (V, 6) with (x - d)^T S^-1 (x - d) <= allowed."""
-        if self.product(x) <= allowed:
+    def smallest_correction(self, x: Float64, max_chi2: float) -> Float64:
+        """Return the smallest d (V, 6) with (x - d)^T S^-1 (x - d) <= max_chi2."""
+        if self.product(x) <= max_chi2:
             return np.zeros_like(x)
 
         def excess(log_m: float) -> float:
-            return self.product(self._rest(x, float(np.exp(log_m)))) - allowed
+            return self.product(self._remainder(x, float(np.exp(log_m)))) - max_chi2
 
         low = high = 0.0
         while excess(low) < 0:
-            low -= _STRIDE
+            low -= _BRACKET_STEP
         while excess(high) > 0:
-            high += _STRIDE
-        return x - self._rest(x, float(np.exp(brentq(excess, low, high, xtol=1e-3))))
+            high += _BRACKET_STEP
+        return x - self._remainder(x, float(np.exp(brentq(excess, low, high, xtol=1e-3))))
 
-    def _rest(self, x: Float64, m: float) -> Float64:
+    def _remainder(self, x: Float64, m: float) -> Float64:
         """Return (M + m S^-1)^-1 M x."""
         M = self._units**2 / len(x)
-        single = np.tile(np.diag(M), (len(x), 1, 1)), -M * x
+        unary = np.tile(np.diag(M), (len(x), 1, 1)), -M * x
         H = m * self._graph.information
-        found = self._system.solve(H, np.zeros((len(H), 6)), self._T_i_j, unary=single)
-        assert found is not None, "M is positive definite"
-        return found
+        remainder = self._system.solve(H, np.zeros((len(H), 6)), self._T_i_j, unary=unary)
+        assert remainder is not None, "M is positive definite"
+        return remainder
 
 
 def _steps(graph: PoseGraph, poses: Float64) -> Intp:
     """Return consecutive views between which the motion of poses (V, 4, 4) is inconsistent."""
     i, j = graph.edges.T
-    row = np.flatnonzero(j == i + 1)
+    consecutive = np.flatnonzero(j == i + 1)
     per_pair = (len(graph.ids) - 1) / len(graph.edges)
-    squares = _squares(replace(graph, poses=poses))[row] / per_pair
-    rare = 2 * float(gammaincinv(3, 1 - (1 - _LEVEL) / max(len(row), 1)))
-    return graph.edges[row[squares > _AT_WORST * rare]]
+    chi2 = _chi2(replace(graph, poses=poses))[consecutive] / per_pair
+    threshold = 2 * float(gammaincinv(3, 1 - (1 - _CONFIDENCE) / max(len(consecutive), 1)))
+    return graph.edges[consecutive[chi2 > _MAX_RATIO * threshold]]
 
 
-def _squares(graph: PoseGraph) -> Float64:
+def _chi2(graph: PoseGraph) -> Float64:
     """Return the (M,) squared errors of the edges, in units of their information."""
     e = graph.residuals()
     return np.asarray(np.einsum("mi,mij,mj->m", e, graph.information, e), np.float64)
 
 
-def _solved(graph: PoseGraph) -> Solution:
+def _robust_fit(graph: PoseGraph) -> Solution:
     return solve(
         graph.poses,
         graph.edges,
         graph.measurements,
         graph.information,
         loop=np.ones(len(graph.edges), np.bool_),
-        settings=Settings(robust="huber", gate=_RARE),
+        settings=Settings(robust="huber", gate=_CHI2_99),
     )

@@ -111,7 +111,7 @@ def compare_surfaces(
     *,
     threshold_m: float = 0.01,
     outlier_m: float = 0.05,
-    seen: ArrayLike | None = None,
+    visible: ArrayLike | None = None,
     samples: int = _SAMPLES,
 ) -> SurfaceErrors:
     """Compare a model with a reference in the same frame.
@@ -122,9 +122,9 @@ def compare_surfaces(
         Meshes or clouds. Distances to a mesh are those to its triangles.
     threshold_m, outlier_m
         Maximum distance of an inlier, and minimum distance of an outlier, m.
-    seen
+    visible
         (K, 3) visible points of the reference, the only ones that completeness counts; by default
-        the whole reference.
+        the entire reference.
     samples
         Number of points that represent a mesh.
 
@@ -137,21 +137,23 @@ def compare_surfaces(
         if len(shape.points) == 0:
             raise InputError("is empty", where=name, remedy="pass a model with points")
     points, _ = model.samples(samples, seed=1)
-    off = distances(points, reference, samples)
-    wanted = reference.samples(samples, seed=2)[0] if seen is None else np.asarray(seen, float)
-    missing = distances(wanted, model, samples)
-    precision = float((off <= threshold_m).mean())
-    recall = float((missing <= threshold_m).mean())
-    both = precision + recall
+    model_distances = distances(points, reference, samples)
+    reference_points = (
+        reference.samples(samples, seed=2)[0] if visible is None else np.asarray(visible, float)
+    )
+    reference_distances = distances(reference_points, model, samples)
+    precision = float((model_distances <= threshold_m).mean())
+    recall = float((reference_distances <= threshold_m).mean())
+    total = precision + recall
     return SurfaceErrors(
-        float(off.mean()),
-        float(np.median(off)),
-        float(np.percentile(off, 95)),
-        float(missing.mean()),
+        float(model_distances.mean()),
+        float(np.median(model_distances)),
+        float(np.percentile(model_distances, 95)),
+        float(reference_distances.mean()),
         precision,
         recall,
-        2 * precision * recall / both if both else 0.0,
-        float((off > outlier_m).mean()),
+        2 * precision * recall / total if total else 0.0,
+        float((model_distances > outlier_m).mean()),
         threshold_m,
         outlier_m,
     )
@@ -173,14 +175,14 @@ def distances(points: ArrayLike, shape: Surface, samples: int = _SAMPLES) -> Flo
         Number of points that represent a mesh.
     """
     points = np.asarray(points, float)
-    found, face = shape.samples(samples)
-    tree = KdTree(found)
+    sampled, face = shape.samples(samples)
+    tree = KdTree(sampled)
     if shape.faces is None or (len(face) and face[0] < 0):
         return np.sqrt(tree.nearest(points)[1])
     corners = shape.points[shape.faces]
-    near, _ = tree.neighbours(points, min(_CANDIDATES, len(found)))
+    nearest, _ = tree.neighbours(points, min(_CANDIDATES, len(sampled)))
     best = np.full(len(points), np.inf)
-    for column in near.T:
+    for column in nearest.T:
         best = np.minimum(best, _to_triangles(points, corners[face[column]]))
     return best
 

@@ -213,16 +213,16 @@ def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None)
     unconstrained, coincident ones all: a rail, a camera rotating in place, one or two poses. There
     the orientations determine it. They always contribute, but with the weight of 10 um of spread,
     which is negligible wherever the positions constrain the rotation; or, with an arm, with the
-    weight of what a rotation displaces at this distance, m.
+    weight of the displacement by a rotation at this distance, m.
     """
     T_e, T_r = np.asarray(estimate, float), np.asarray(reference, float)
     centre_e, centre_r = T_e[:, :3, 3].mean(0), T_r[:, :3, 3].mean(0)
-    spread = (T_r[:, :3, 3] - centre_r).T @ (T_e[:, :3, 3] - centre_e) / len(T_e)
-    turn = (T_r[:, :3, :3] @ np.swapaxes(T_e[:, :3, :3], 1, 2)).mean(0)
+    cross_covariance = (T_r[:, :3, 3] - centre_r).T @ (T_e[:, :3, 3] - centre_e) / len(T_e)
+    mean_rotation_matrix = (T_r[:, :3, :3] @ np.swapaxes(T_e[:, :3, :3], 1, 2)).mean(0)
     T = np.eye(4)
     # The mean squared angle is half the mean squared difference of the matrices.
     weight = _ORIENTATION_WEIGHT if arm_m is None else arm_m**2 / 2
-    T[:3, :3] = nearest_rotation(spread + weight * turn)
+    T[:3, :3] = nearest_rotation(cross_covariance + weight * mean_rotation_matrix)
     T[:3, 3] = centre_r - T[:3, :3] @ centre_e
     return T
 
@@ -236,8 +236,10 @@ def distances_between(estimate: Float64, reference: Float64) -> Float64:
 def angles_between(estimate: Float64, reference: Float64) -> Float64:
     """(N,) angles in rad between orientations of associated poses (N, 4, 4), after alignment."""
     R_estimate, R_reference = estimate[:, :3, :3], reference[:, :3, :3]
-    turn = mean_rotation(R_reference @ np.swapaxes(R_estimate, 1, 2))
-    return np.asarray(se3.angle(np.swapaxes(R_reference, 1, 2) @ (turn @ R_estimate)), np.float64)
+    R_reference_estimate = mean_rotation(R_reference @ np.swapaxes(R_estimate, 1, 2))
+    return np.asarray(
+        se3.angle(np.swapaxes(R_reference, 1, 2) @ (R_reference_estimate @ R_estimate)), np.float64
+    )
 
 
 def displacement(before: Float64, after: Float64) -> tuple[float, float]:
@@ -277,11 +279,11 @@ def _coverage(
     times_e = _times(estimate_times, estimate, "estimate")
     times_r = _times(reference_times, reference, "reference")
     if frame_times is None:
-        wanted = times_r[np.isfinite(times_r)]
+        expected = times_r[np.isfinite(times_r)]
     else:
         frames = np.asarray(frame_times, float)
-        wanted = frames[associate(frames, times_r)[:, 0]]
-    return len(associate(wanted, times_e)) / len(wanted) if len(wanted) else 0.0
+        expected = frames[associate(frames, times_r)[:, 0]]
+    return len(associate(expected, times_e)) / len(expected) if len(expected) else 0.0
 
 
 def _poses(poses: ArrayLike, name: str) -> Float64:

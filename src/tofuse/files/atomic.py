@@ -111,9 +111,9 @@ def sync(path: str | Path) -> None:
     OSError
         If the disk reports a failure.
     """
-    writable = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
+    mode = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
     try:
-        handle = os.open(path, writable | getattr(os, "O_BINARY", 0))
+        handle = os.open(path, mode | getattr(os, "O_BINARY", 0))
     except OSError:
         if Path(path).is_dir():
             return
@@ -129,10 +129,10 @@ def sync(path: str | Path) -> None:
 
 def sync_tree(folder: str | Path) -> None:
     """Wait until all files below a folder, and their names, are on disk."""
-    for here, _folders, names in os.walk(folder):
+    for directory, _folders, names in os.walk(folder):
         for name in names:
-            sync(Path(here) / name)
-        sync(here)
+            sync(Path(directory) / name)
+        sync(directory)
 
 
 def make_folder(path: str | Path) -> Path:

@@ -17,7 +17,7 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.reading import required_package
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
-_OWN = "https://tofuse.org/e57"
+_TOFUSE = "https://tofuse.org/e57"
 
 
 def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
@@ -60,15 +60,15 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
 
 def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_normals: bool) -> None:
     image = file.image_file
-    image.extensionsAdd("tofuse", _OWN)
+    image.extensionsAdd("tofuse", _TOFUSE)
     if with_normals:
         image.extensionsAdd("nor", _NORMALS)
 
     def structure(**values: float) -> Any:
         node = lib.StructureNode(image)
         for key, value in values.items():
-            whole = isinstance(value, int)
-            node.set(key, (lib.IntegerNode if whole else lib.FloatNode)(image, value))
+            is_integer = isinstance(value, int)
+            node.set(key, (lib.IntegerNode if is_integer else lib.FloatNode)(image, value))
         return node
 
     scan = lib.StructureNode(image)
@@ -106,9 +106,9 @@ def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_nor
             node = lib.FloatNode(image, low, lib.E57_SINGLE, low, high)
         else:
             # The library takes uint8 and floats, and converts them to the type in the file.
-            small = column.dtype == np.uint8
-            low, high = (0, 255) if small else (low, high)
-            values = np.ascontiguousarray(column, np.uint8 if small else np.float64)
+            is_uint8 = column.dtype == np.uint8
+            low, high = (0, 255) if is_uint8 else (low, high)
+            values = np.ascontiguousarray(column, np.uint8 if is_uint8 else np.float64)
             node = lib.IntegerNode(image, low, low, high)
         prototype.set(key, node)
         referenced.append(values)

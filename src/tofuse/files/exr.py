@@ -4,7 +4,7 @@ The layout is that of "OpenEXR File Layout" of the Academy Software Foundation: 
 attributes, a table of offsets, and blocks of scan lines, channel after channel in each line. ZIP
 deflates the differences of neighbouring bytes, the even bytes of a block before the odd ones.
 
-Own code, as OpenCV's decoder is disabled by default.
+Implemented here, as OpenCV's decoder is disabled by default.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
     if not decoded.all():
         raise _damaged("scan lines are missing", path)
     out: dict[str, Float32] = {}
-    at = 0
+    offset_in_row = 0
     for name, kind in header.channels.items():
         step = header.width * kind.itemsize
-        values = np.ascontiguousarray(image[:, at : at + step]).view(kind)
+        values = np.ascontiguousarray(image[:, offset_in_row : offset_in_row + step]).view(kind)
         with np.errstate(invalid="ignore"):
             out[name] = values.astype(np.float32)
-        at += step
+        offset_in_row += step
     return out
 
 
@@ -104,8 +104,8 @@ def _block(data: bytes, size: int, compression: int, path: str | Path) -> UInt8:
 
 def _header(data: bytes, path: str | Path) -> _Header:
     if not data.startswith(MAGIC):
-        what = "is empty" if not data else "is not an OpenEXR image"
-        raise InputError(what, where=path, remedy="check the file")
+        problem = "is empty" if not data else "is not an OpenEXR image"
+        raise InputError(problem, where=path, remedy="check the file")
     (version,) = _unpack("<I", data, 4, path)
     if version & ~_LONG_NAMES != _SINGLE_SCAN_LINES:
         raise InputError(
@@ -113,20 +113,20 @@ def _header(data: bytes, path: str | Path) -> _Header:
             where=path,
             remedy="write it as scan lines of one part",
         )
-    at = 8
+    offset = 8
     attributes: dict[str, bytes] = {}
-    while data[at : at + 1] != b"\0":
-        name, at = _name(data, at, path)
-        _, at = _name(data, at, path)
-        (size,) = _unpack("<I", data, at, path)
-        at += 4
-        attributes[name] = data[at : at + size]
+    while data[offset : offset + 1] != b"\0":
+        name, offset = _name(data, offset, path)
+        _, offset = _name(data, offset, path)
+        (size,) = _unpack("<I", data, offset, path)
+        offset += 4
+        attributes[name] = data[offset : offset + size]
         if len(attributes[name]) < size:
             raise InputError(
                 "is cut off within its header", where=path, remedy="copy the file again"
             )
-        at += size
-    at += 1
+        offset += size
+    offset += 1
     missing = [n for n in ("channels", "compression", "dataWindow") if n not in attributes]
     if missing:
         raise _damaged(f"no {missing[0]}", path)
@@ -144,16 +144,16 @@ def _header(data: bytes, path: str | Path) -> _Header:
             where=path,
             remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
-    return _Header(width, height, top, compression, _channels(attributes["channels"], path), at)
+    return _Header(width, height, top, compression, _channels(attributes["channels"], path), offset)
 
 
 def _channels(data: bytes, path: str | Path) -> dict[str, np.dtype[Any]]:
     out: dict[str, np.dtype[Any]] = {}
-    at = 0
-    while data[at : at + 1] != b"\0":
-        name, at = _name(data, at, path)
-        kind, _, x_sampling, y_sampling = _unpack("<4I", data, at, path)
-        at += 16
+    offset = 0
+    while data[offset : offset + 1] != b"\0":
+        name, offset = _name(data, offset, path)
+        kind, _, x_sampling, y_sampling = _unpack("<4I", data, offset, path)
+        offset += 16
         if kind >= len(_TYPES) or x_sampling != 1 or y_sampling != 1 or name in out:
             raise _damaged(f"channel {name!r:.40} can't be read", path)
         out[name] = _TYPES[kind]
@@ -164,18 +164,18 @@ def _channels(data: bytes, path: str | Path) -> dict[str, np.dtype[Any]]:
     return out
 
 
-def _name(data: bytes, at: int, path: str | Path) -> tuple[str, int]:
-    end = data.find(b"\0", at, at + 256)
-    if end <= at:
+def _name(data: bytes, offset: int, path: str | Path) -> tuple[str, int]:
+    end = data.find(b"\0", offset, offset + 256)
+    if end <= offset:
         raise _damaged("its header is invalid", path)
-    return data[at:end].decode("latin-1"), end + 1
+    return data[offset:end].decode("latin-1"), end + 1
 
 
-def _unpack(form: str, data: bytes, at: int, path: str | Path) -> tuple[int, ...]:
-    if at < 0 or at + struct.calcsize(form) > len(data):
+def _unpack(layout: str, data: bytes, offset: int, path: str | Path) -> tuple[int, ...]:
+    if offset < 0 or offset + struct.calcsize(layout) > len(data):
         raise InputError("is cut off", where=path, remedy="copy the file again")
-    return struct.unpack_from(form, data, at)
+    return struct.unpack_from(layout, data, offset)
 
 
-def _damaged(what: str, path: str | Path) -> InputError:
-    return InputError(f"is a damaged OpenEXR image ({what})", where=path, remedy="copy it again")
+def _damaged(reason: str, path: str | Path) -> InputError:
+    return InputError(f"is a damaged OpenEXR image ({reason})", where=path, remedy="copy it again")

@@ -1,4 +1,4 @@
-"""What the file formats of meshes and point clouds have in common."""
+"""The common content of the file formats of meshes and point clouds."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _AMPLITUDES = (
 
 @dataclass(frozen=True, eq=False)
 class GeometryRecord:
-    """A mesh or a point cloud as files store it. Each format keeps what it knows of the fields.
+    """A mesh or a point cloud as files store it. Each format stores the fields that it supports.
 
     Attributes
     ----------
     points
         (N, 3) in m, float32 or float64.
     faces
-        (M, 3) int32 vertex indices, counter-clockwise seen from outside; None for a cloud.
+        (M, 3) int32 vertex indices, counter-clockwise from outside; None for a cloud.
     normals
         (N, 3) unit normals.
     color

@@ -103,7 +103,7 @@ def _document(
     generator: str,
     linear_colors: NDArray[Any] | None = None,
 ) -> tuple[dict[str, Any], bytearray]:
-    """The JSON document of a mesh, and its buffer; other colours may take the place of its own."""
+    """The JSON document of a mesh, and its buffer; `linear_colors` if the mesh has no colours."""
     mesh.check(path)
     points = np.asarray(mesh.points, np.float32)
     faces = np.zeros((0, 3), np.int32) if mesh.faces is None else mesh.faces
@@ -242,11 +242,11 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     magic, version, length = struct.unpack_from("<4sII", data)
     if (magic, version, length) != (b"glTF", 2, len(data)):
         raise ValueError("invalid header")
-    at, chunks = 12, {b"BIN\0": b""}
-    while at < length:
-        size, kind = struct.unpack_from("<I4s", data, at)
-        chunks[kind] = data[at + 8 : at + 8 + size]
-        at += 8 + size
+    offset, chunks = 12, {b"BIN\0": b""}
+    while offset < length:
+        size, kind = struct.unpack_from("<I4s", data, offset)
+        chunks[kind] = data[offset + 8 : offset + 8 + size]
+        offset += 8 + size
     return json.loads(chunks[b"JSON"]), chunks[b"BIN\0"]
 
 

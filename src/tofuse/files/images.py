@@ -1,7 +1,7 @@
 """PNG and JPEG images, checked before they are decoded.
 
 OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
-and allocates whatever size a header declares. So the structure of a file is checked first.
+and allocates any size that a header declares. So the structure of a file is checked first.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def _header(data: bytes, path: str | Path) -> ImageHeader:
     elif data.startswith(b"\xff\xd8"):
         header = _jpeg_header(data, path)
     else:
-        what = "is empty" if not data else "is neither a PNG nor a JPEG image"
-        raise InputError(what, where=path, remedy="check the file")
+        problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
+        raise InputError(problem, where=path, remedy="check the file")
     if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
         raise InputError(
             f"declares {header.width} x {header.height} pixels",
@@ -82,37 +82,37 @@ def _png_header(data: bytes, path: str | Path) -> ImageHeader:
 
 
 def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
-    at = 2
-    while at + 9 < len(data):
-        if data[at] != 0xFF:
+    offset = 2
+    while offset + 9 < len(data):
+        if data[offset] != 0xFF:
             break
-        marker = data[at + 1]
+        marker = data[offset + 1]
         if marker == 0xFF:
-            at += 1
+            offset += 1
             continue
-        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
+        (length,) = struct.unpack(">H", data[offset + 2 : offset + 4])
         if 0xC0 <= marker <= 0xCF and marker not in _NOT_SOF:
-            bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            bits, height, width, channels = struct.unpack(">BHHB", data[offset + 4 : offset + 10])
             return ImageHeader("jpeg", width, height, channels, bits)
-        at += 2 + length
+        offset += 2 + length
     raise InputError("is a damaged or cut off JPEG", where=path, remedy="copy the file again")
 
 
-def _check_whole(data: bytes, path: str | Path) -> None:
+def _check_complete(data: bytes, path: str | Path) -> None:
     """Raise InputError unless a PNG has all its chunks, each with its checksum."""
     view = memoryview(data)
-    at = len(_PNG)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        end = at + 12 + length
+    offset = len(_PNG)
+    while offset + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, offset)
+        end = offset + 12 + length
         if end > len(data):
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
-        if zlib.crc32(view[at + 4 : end - 4]) != checksum:
+        if zlib.crc32(view[offset + 4 : end - 4]) != checksum:
             raise InputError("is damaged (wrong checksum of a PNG chunk)", where=path)
-        if data[at + 4 : at + 8] == b"IEND":
+        if data[offset + 4 : offset + 8] == b"IEND":
             return
-        at = end
+        offset = end
     raise InputError("is cut off before its end", where=path, remedy="copy the file again")
 
 
@@ -140,15 +140,15 @@ def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, r
 
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
     """Return (width, height) of the first image with a readable header."""
-    error: InputError | None = None
+    first_error: InputError | None = None
     for path in files:
         try:
             header = read_header(path)
-        except InputError as trouble:
-            error = error or trouble
+        except InputError as error:
+            first_error = first_error or error
             continue
         return header.width, header.height
-    raise error or InputError("has no images", where="depth", remedy="check the recording")
+    raise first_error or InputError("has no images", where="depth", remedy="check the recording")
 
 
 def read_image(
@@ -195,7 +195,7 @@ def parse_image(
             remedy=f"store one channel of {dtype}",
         )
     if header.format == "png":
-        _check_whole(data, path)
+        _check_complete(data, path)
     elif data.rfind(b"\xff\xd9") < 0:
         raise InputError("is cut off before its end", where=path, remedy="copy the file again")
     return _decode(data, header, path)

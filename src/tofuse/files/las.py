@@ -91,7 +91,7 @@ def write_laz(
     descriptions: Mapping[str, str] | None = None,
     software: str = "tofuse",
 ) -> None:
-    """Write what `write_las` writes, compressed (Isenburg 2013), block by block.
+    """Write the content of `write_las`, compressed (Isenburg 2013), block by block.
 
     Raises
     ------

@@ -21,21 +21,21 @@ from typing import Any
 from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
 
-_TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK)
+_HELD_ERRORS = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 _MAX_NOTE_BYTES = 4096  # the holder's description of itself in the lock file
 _RETRIES = 100
 
 if sys.platform == "win32":
     import msvcrt
 
-    def _take(handle: int) -> None:
+    def _lock_blocking(handle: int) -> None:
         while True:
             try:
                 return msvcrt.locking(handle, msvcrt.LK_LOCK, 1)
             except OSError:  # after ten seconds it gives up
                 continue
 
-    def _try(handle: int) -> None:
+    def _lock_nonblocking(handle: int) -> None:
         # Beyond the note: other processes can't read a locked range.
         os.lseek(handle, 1 << 30, os.SEEK_SET)
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
@@ -43,10 +43,10 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-    def _try(handle: int) -> None:
+    def _lock_nonblocking(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
-    def _take(handle: int) -> None:
+    def _lock_blocking(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX)
 
 
@@ -69,7 +69,7 @@ def locked(path: str | Path) -> Iterator[int]:
         raise output_error(error, path) from error
     try:
         try:
-            _take(handle)
+            _lock_blocking(handle)
         except OSError as error:
             raise output_error(error, path) from error
         yield handle
@@ -85,14 +85,14 @@ class Claim:
     while the process that it names is alive, or if that ran on another machine.
     """
 
-    def __init__(self, path: str | Path, *, what: str | Path) -> None:
+    def __init__(self, path: str | Path, *, target: str | Path) -> None:
         """Take the lock.
 
         Parameters
         ----------
         path
             The lock file.
-        what
+        target
             What is locked, for error messages.
 
         Raises
@@ -102,9 +102,9 @@ class Claim:
         """
         self._path = Path(path)
         try:
-            self._handle: int | None = self._taken(what)
+            self._handle: int | None = self._acquire(target)
         except OSError as error:
-            raise output_error(error, what) from error
+            raise output_error(error, target) from error
 
     def release(self) -> None:
         """Release the lock; harmless if already released."""
@@ -124,20 +124,20 @@ class Claim:
         with suppress(Exception):
             self.release()
 
-    def _taken(self, what: str | Path) -> int:
-        safe = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    def _acquire(self, target: str | Path) -> int:
+        flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         for _ in range(_RETRIES):
-            handle = os.open(self._path, os.O_RDWR | os.O_CREAT | safe, 0o666)
+            handle = os.open(self._path, os.O_RDWR | os.O_CREAT | flags, 0o666)
             try:
                 status = os.fstat(handle)
                 if not stat.S_ISREG(status.st_mode):
                     raise OSError(errno.EINVAL, "its lock is not a regular file")
                 holder = _read_note(handle)
                 try:
-                    _try(handle)
+                    _lock_nonblocking(handle)
                 except OSError as error:
-                    if error.errno in _TAKEN or _alive(holder):
-                        raise _refusal(what, holder) from None
+                    if error.errno in _HELD_ERRORS or _alive(holder):
+                        raise _refusal(target, holder) from None
                 if not _is_at(status, self._path):  # removed by its holder in the meantime
                     os.close(handle)
                     continue
@@ -146,15 +146,15 @@ class Claim:
                 os.close(handle)
                 raise
             return handle
-        raise _refusal(what, {})
+        raise _refusal(target, {})
 
 
 def _is_at(status: os.stat_result, path: Path) -> bool:
     try:
-        now = os.lstat(path)
+        current = os.lstat(path)
     except OSError:
         return False
-    return os.path.samestat(status, now)
+    return os.path.samestat(status, current)
 
 
 def _write_note(handle: int) -> None:
@@ -191,14 +191,14 @@ def _alive(holder: dict[str, Any]) -> bool:
     return pid != os.getpid()
 
 
-def _refusal(what: str | Path, holder: dict[str, Any]) -> OutputError:
-    known = [
-        (word, str(holder[key])) for key, word in _NOTE if isinstance(holder.get(key), int | str)
+def _refusal(target: str | Path, holder: dict[str, Any]) -> OutputError:
+    fields = [
+        (label, str(holder[key])) for key, label in _NOTE if isinstance(holder.get(key), int | str)
     ]
-    who = ", ".join(f"{word} {text[:80]}" for word, text in known) or "unknown"
+    description = ", ".join(f"{label} {text[:80]}" for label, text in fields) or "unknown"
     return OutputError(
-        f"is being written by another process ({who})",
-        where=what,
+        f"is being written by another process ({description})",
+        where=target,
         remedy="wait until it is done, or choose another folder",
     )
 

@@ -1,8 +1,8 @@
 """LZFSE streams (Apple's codec), in which Record3D stores depth.
 
 The layout is that of Apple's reference implementation, github.com/lzfse/lzfse: blocks, each of
-which begins with four bytes that identify its kind. Own code, as there are no wheels of a decoder
-for Linux.
+which begins with four bytes that identify its kind. Implemented here, as there are no wheels of a
+decoder for Linux.
 """
 
 from __future__ import annotations
@@ -34,26 +34,28 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
         If it is damaged, cut off, of another size, or contains unsupported blocks.
     """
     out = np.empty(size, np.uint8)
-    at = done = 0
+    offset = done = 0
     while True:
-        kind = data[at : at + 4]
+        kind = data[offset : offset + 4]
         if kind == _END:
             break
         if kind not in (_RAW, _PACKED):
             names = {_TABLED: "uncompressed tables", _SMALL: "LZVN"}
-            what = f"uses {names[kind]}, which is not supported" if kind in names else "is damaged"
-            raise InputError(f"{what} (LZFSE)", where=path, remedy="export the recording again")
-        (count,) = _unpack("<I", data, at + 4, path)
+            problem = (
+                f"uses {names[kind]}, which is not supported" if kind in names else "is damaged"
+            )
+            raise InputError(f"{problem} (LZFSE)", where=path, remedy="export the recording again")
+        (count,) = _unpack("<I", data, offset + 4, path)
         if done + count > size:
             raise _damaged(path)
         if kind == _RAW:
-            block = np.frombuffer(data[at + 8 : at + 8 + count], np.uint8)
+            block = np.frombuffer(data[offset + 8 : offset + 8 + count], np.uint8)
             if len(block) < count:
                 raise _damaged(path)
             out[done : done + count] = block
-            at += 8 + count
+            offset += 8 + count
         else:
-            at = _packed(data, at, out[: done + count], done, path)
+            offset = _packed(data, offset, out[: done + count], done, path)
         done += count
     if done != size:
         raise InputError(
@@ -62,21 +64,21 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
     return out.tobytes()
 
 
-def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> int:
+def _packed(data: bytes, offset: int, out: UInt8, done: int, path: str | Path) -> int:
     """Decode a block with packed tables to the end of `out`; return the next block's offset."""
     from tofuse.kernels.lzfse import STATES, lzfse_block
 
-    _, _, first, second, third = _unpack("<4sIQQQ", data, at, path)
+    _, _, first, second, third = _unpack("<4sIQQQ", data, offset, path)
 
-    def field(word: int, offset: int, bits: int) -> int:
-        return int(word) >> offset & ((1 << bits) - 1)
+    def field(word: int, shift: int, bits: int) -> int:
+        return int(word) >> shift & ((1 << bits) - 1)
 
     literal_bytes, copy_bytes = field(first, 20, 20), field(second, 40, 20)
     literal_skip, copy_skip = 7 - field(first, 60, 3), 7 - field(second, 60, 3)
     header = field(third, 0, 32)
     literal_states = np.array([field(second, 10 * k, 10) for k in range(4)], np.int64)
     copy_states = np.array([field(third, 32 + 10 * k, 10) for k in range(3)], np.int64)
-    end = at + header + literal_bytes + copy_bytes
+    end = offset + header + literal_bytes + copy_bytes
     if (
         header < _HEADER
         or end > len(data)
@@ -85,8 +87,8 @@ def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> in
         or copy_skip > 8 * copy_bytes
     ):
         raise _damaged(path)
-    counts = _counts(data[at + _HEADER : at + header], path)
-    payload = np.frombuffer(data, np.uint8, literal_bytes + copy_bytes, at + header)
+    counts = _counts(data[offset + _HEADER : offset + header], path)
+    payload = np.frombuffer(data, np.uint8, literal_bytes + copy_bytes, offset + header)
     stop = lzfse_block(
         payload[:literal_bytes],
         literal_skip,
@@ -107,7 +109,7 @@ def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> in
 
 def _counts(data: bytes, path: str | Path) -> Int64:
     """Unpack the number of states of each of the 360 symbols."""
-    bits, left = int.from_bytes(data, "little"), 8 * len(data)
+    bits, remaining = int.from_bytes(data, "little"), 8 * len(data)
     out = np.zeros(_SYMBOLS, np.int64)
     for k in range(_SYMBOLS if data else 0):
         if bits & 3 in _TWO:
@@ -121,16 +123,16 @@ def _counts(data: bytes, path: str | Path) -> Int64:
         else:
             used, out[k] = 14, 24 + (bits >> 4 & 1023)
         bits >>= used
-        left -= used
-        if left < 0:
+        remaining -= used
+        if remaining < 0:
             raise _damaged(path)
     return out
 
 
-def _unpack(form: str, data: bytes, at: int, path: str | Path) -> tuple[int, ...]:
-    if at + struct.calcsize(form) > len(data):
+def _unpack(layout: str, data: bytes, offset: int, path: str | Path) -> tuple[int, ...]:
+    if offset + struct.calcsize(layout) > len(data):
         raise _damaged(path)
-    return struct.unpack_from(form, data, at)
+    return struct.unpack_from(layout, data, offset)
 
 
 def _damaged(path: str | Path) -> InputError:

@@ -1,7 +1,7 @@
 """The part of Matroska that camera recordings use: tracks, blocks, attachments, tags.
 
 Follows RFC 8794 (EBML) and RFC 9559 (Matroska). Only the headers of elements are read when a file
-is opened; blocks are read on demand. A file that was cut off is used up to there.
+is opened; blocks are read on demand. A truncated file is used up to its end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAGIC = b"\x1a\x45\xdf\xa3"
 
 _SEGMENT, _CLUSTER = 0x18538067, 0x1F43B675
 _INFO, _TRACKS, _TAGS, _ATTACHMENTS = 0x1549A966, 0x1654AE6B, 0x1254C367, 0x1941A469
-_TOP = {_INFO, _TRACKS, _TAGS, _ATTACHMENTS, _CLUSTER, 0x114D9B74, 0x1C53BB6B, 0x1043A770}
+_TOP_LEVEL = {_INFO, _TRACKS, _TAGS, _ATTACHMENTS, _CLUSTER, 0x114D9B74, 0x1C53BB6B, 0x1043A770}
 _TRACK, _VIDEO, _TAG, _SIMPLE_TAG, _FILE = 0xAE, 0xE0, 0x7373, 0x67C8, 0x61A7
 _BLOCK_GROUP, _BLOCK, _SIMPLE_BLOCK, _TIME = 0xA0, 0xA1, 0xA3, 0xE7
 _LACED = 0x06
@@ -85,7 +85,7 @@ class Matroska:
         try:
             with path.open("rb") as self._file:
                 self._size = os.fstat(self._file.fileno()).st_size
-                if self._at(0, 4) != MAGIC:
+                if self._read_at(0, 4) != MAGIC:
                     raise InputError("is not a Matroska file", where=path, remedy="check the file")
                 self._parse()
         except OSError as error:
@@ -107,7 +107,7 @@ class Matroska:
             raise InputError("is cut off", where=self.path, remedy="copy the file again")
         return data
 
-    def _at(self, offset: int, size: int) -> bytes:
+    def _read_at(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
         return self._file.read(size)
 
@@ -121,22 +121,22 @@ class Matroska:
                 elif top == _INFO:
                     self._scale_ns = self._numbers(begin, stop).get(0x2AD7B1, 1_000_000)
                 elif top == _TRACKS:
-                    self._each(_TRACK, begin, stop, self._track)
+                    self._for_each(_TRACK, begin, stop, self._track)
                 elif top == _TAGS:
-                    self._each(_TAG, begin, stop, self._tag)
+                    self._for_each(_TAG, begin, stop, self._tag)
                 elif top == _ATTACHMENTS:
-                    self._each(_FILE, begin, stop, self._attachment)
+                    self._for_each(_FILE, begin, stop, self._attachment)
 
-    def _elements(self, at: int, end: int) -> Iterator[tuple[int, int, int, bool]]:
+    def _elements(self, offset: int, end: int) -> Iterator[tuple[int, int, int, bool]]:
         """Yield each element's number, begin, end, and whether its size is known."""
-        while at < end:
-            head = self._at(at, 12)
-            kind, first = _variable(head, 0, keep=True)
+        while offset < end:
+            head = self._read_at(offset, 12)
+            kind, first = _variable(head, 0, keep_marker=True)
             size, second = _variable(head, first)
             if not first or not second or kind == 0:
                 self.complete = False
                 return
-            begin = at + second
+            begin = offset + second
             if begin > end:  # a header that doesn't fit into its parent
                 self.complete = False
                 return
@@ -147,18 +147,18 @@ class Matroska:
                 self.complete = False
                 stop = end
             yield kind, begin, stop, sized
-            at = self._resume if not sized and kind == _CLUSTER else stop
+            offset = self._resume if not sized and kind == _CLUSTER else stop
 
     def _cluster(self, begin: int, end: int, sized: bool) -> None:
         time = 0
         self._resume = end
         for kind, start, stop, _ in self._elements(begin, end):
-            if not sized and kind in _TOP:
+            if not sized and kind in _TOP_LEVEL:
                 # A cluster of unknown size ends where the next element of its parent begins.
-                self._resume = self._before(start, kind)
+                self._resume = self._header_offset(start, kind)
                 return
             if kind == _TIME:
-                time = _unsigned(self._at(start, min(stop - start, 8)))
+                time = _unsigned(self._read_at(start, min(stop - start, 8)))
             elif kind == _SIMPLE_BLOCK:
                 self._block(start, stop, time)
             elif kind == _BLOCK_GROUP:
@@ -166,37 +166,37 @@ class Matroska:
                     if inner == _BLOCK:
                         self._block(first, last, time)
 
-    def _before(self, start: int, kind: int) -> int:
+    def _header_offset(self, start: int, kind: int) -> int:
         """Return the offset of the header of an element whose content begins at `start`."""
         name = kind.to_bytes(4, "big")
-        head = self._at(max(start - 12, 0), min(start, 12))
+        head = self._read_at(max(start - 12, 0), min(start, 12))
         return max(start - 12, 0) + head.rfind(name)
 
     def _block(self, start: int, stop: int, time: int) -> None:
-        head = self._at(start, 11)
-        number, at = _variable(head, 0)
-        if not at or len(head) < at + 3 or stop < start + at + 3:
+        head = self._read_at(start, 11)
+        number, position = _variable(head, 0)
+        if not position or len(head) < position + 3 or stop < start + position + 3:
             self.complete = False
             return
-        (relative,) = struct.unpack_from(">h", head, at)
+        (relative,) = struct.unpack_from(">h", head, position)
         track = next((t for t in self.tracks if t.number == number), None)
         self._blocks += 1
         if track is None or self._blocks > _MAX_BLOCKS:
             return
-        offset = start + at + 3
-        laced = bool(head[at + 2] & _LACED)
+        offset = start + position + 3
+        laced = bool(head[position + 2] & _LACED)
         time_ns = (time + relative) * self._scale_ns
         track.blocks.append(Block(time_ns, offset, stop - offset, laced))
 
-    def _each(self, wanted: int, begin: int, end: int, use: object) -> None:
+    def _for_each(self, target: int, begin: int, end: int, handle: object) -> None:
         for kind, start, stop, _ in self._elements(begin, end):
-            if kind == wanted:
-                use(start, stop)  # type: ignore[operator]
+            if kind == target:
+                handle(start, stop)  # type: ignore[operator]
 
     def _values(self, begin: int, end: int) -> dict[int, bytes]:
         """The bytes of each element between two offsets, except of very large ones."""
         return {
-            kind: self._at(start, stop - start)
+            kind: self._read_at(start, stop - start)
             for kind, start, stop, _ in self._elements(begin, end)
             if stop - start <= _MAX_VALUE
         }
@@ -230,18 +230,18 @@ class Matroska:
         self.attachments[_text(values.get(0x466E, b""))] = values.get(0x465C, b"")
 
 
-def _variable(data: bytes, at: int, *, keep: bool = False) -> tuple[int, int]:
+def _variable(data: bytes, offset: int, *, keep_marker: bool = False) -> tuple[int, int]:
     """Return a variable-length integer and the position after it; 0, 0 if there is none.
 
-    `keep` leaves the length marker in it, as in element numbers.
+    `keep_marker` leaves the length marker in it, as in element numbers.
     """
-    if at >= len(data) or data[at] == 0:
+    if offset >= len(data) or data[offset] == 0:
         return 0, 0
-    length = 9 - data[at].bit_length()
-    if at + length > len(data):
+    length = 9 - data[offset].bit_length()
+    if offset + length > len(data):
         return 0, 0
-    value = int.from_bytes(data[at : at + length], "big")
-    return value if keep else value & ((1 << 7 * length) - 1), at + length
+    value = int.from_bytes(data[offset : offset + length], "big")
+    return value if keep_marker else value & ((1 << 7 * length) - 1), offset + length
 
 
 def _unsigned(data: bytes) -> int:

@@ -100,16 +100,16 @@ def _read(
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
         raise ValueError(f"it contains {len(members)} arrays")
-    wanted = [
+    selected = [
         m
         for m in members
         if (only is None or m.filename.removesuffix(".npy") in only)
         and (without is None or not m.filename.startswith(without))
     ]
-    if sum(m.file_size for m in wanted) > limit:
+    if sum(m.file_size for m in selected) > limit:
         raise ValueError(f"its arrays have more than {limit >> 20} MiB")
     arrays: Arrays = {}
-    for member in wanted:
+    for member in selected:
         if not member.filename.endswith(".npy"):
             raise ValueError(f"{member.filename!r} is not an array")
         if member.file_size > _MAX_COMPRESSION * member.compress_size + 1000:

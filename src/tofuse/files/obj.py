@@ -45,8 +45,8 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
         table = np.column_stack([table, np.asarray(color, float) / 255])
     lines += _rows("v", table, "%.5f" if color is None else "%.5f %.5f %.5f %.4g %.4g %.4g")
     if uv is not None:
-        from_below = np.asarray(uv, float) * [1, -1] + [0, 1]  # from the lower left corner
-        lines += _rows("vt", from_below, "%.5f")
+        flipped_uv = np.asarray(uv, float) * [1, -1] + [0, 1]  # from the lower left corner
+        lines += _rows("vt", flipped_uv, "%.5f")
     if normals is not None:
         lines += _rows("vn", np.asarray(normals, float), "%.3f")
     corner = {(False, False): "%d", (True, False): "%d/%d", (False, True): "%d//%d"}.get(

@@ -97,15 +97,15 @@ def read_pcd(path: str | Path) -> Pcd:
         if fields[name].ndim != 1:
             raise InputError(f"has several values of {name!r} per point", where=path)
     color = _unpacked_color(fields)
-    points = _taken(fields, ("x", "y", "z"))
+    points = _pop_stacked(fields, ("x", "y", "z"))
     normals: Float32 | None = None
     if all(name in fields for name in _NORMALS):
-        normals = _taken(fields, _NORMALS).astype(np.float32)
+        normals = _pop_stacked(fields, _NORMALS).astype(np.float32)
     cloud = GeometryRecord(points, normals=normals, color=color, scalars=fields)
     return Pcd(cloud, header.width, header.height, np.array(header.viewpoint, float))
 
 
-def _taken(fields: dict[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[np.floating]:
+def _pop_stacked(fields: dict[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[np.floating]:
     """Remove columns (N,) from the fields, and return them as (N, C) float32 or float64."""
     columns = [fields.pop(name) for name in names]
     dtype = np.result_type(np.float32, *(c.dtype for c in columns))
@@ -125,16 +125,16 @@ def _unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:
 
 def _read_header(data: bytes, path: str | Path) -> _Header:
     values: dict[str, list[str]] = {}
-    at = 0
+    offset = 0
     while "DATA" not in values:
-        end = data.find(b"\n", at, _HEADER_LIMIT)
+        end = data.find(b"\n", offset, _HEADER_LIMIT)
         if end < 0:
-            what = "is empty" if not data else "is not a PCD file (its header has no DATA line)"
-            raise InputError(what, where=path, remedy=_COPY_AGAIN)
-        words = data[at:end].decode("latin-1").split("#", 1)[0].split()
-        at = end + 1
-        if words:
-            values[words[0].upper()] = words[1:]
+            problem = "is empty" if not data else "is not a PCD file (its header has no DATA line)"
+            raise InputError(problem, where=path, remedy=_COPY_AGAIN)
+        cells = data[offset:end].decode("latin-1").split("#", 1)[0].split()
+        offset = end + 1
+        if cells:
+            values[cells[0].upper()] = cells[1:]
     try:
         names = values["FIELDS"] if "FIELDS" in values else values["COLUMNS"]
         sizes = [int(v) for v in values["SIZE"]]
@@ -162,10 +162,10 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
         raise InputError(f"declares {points} points", where=path, remedy=_COPY_AGAIN)
     if len(viewpoint) != 7 or not all(map(math.isfinite, viewpoint)):
         viewpoint = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    return _Header(names, dtypes, counts, width, height, points, viewpoint, kind, at)
+    return _Header(names, dtypes, counts, width, height, points, viewpoint, kind, offset)
 
 
-def _cut_off(header: _Header, path: str | Path) -> InputError:
+def _truncated(header: _Header, path: str | Path) -> InputError:
     return InputError(
         f"is cut off: its header declares {header.points} points, more than it contains",
         where=path,
@@ -175,7 +175,7 @@ def _cut_off(header: _Header, path: str | Path) -> InputError:
 
 def _binary(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
     if header.points * header.stride > len(body):
-        raise _cut_off(header, path)
+        raise _truncated(header, path)
     dtype = np.dtype(
         [
             (f"f{k}", t, (c,) if c > 1 else ())
@@ -190,7 +190,7 @@ def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDA
     from tofuse.kernels.lzf import lzf_decompress
 
     if len(body) < 8:
-        raise _cut_off(header, path)
+        raise _truncated(header, path)
     compressed, size = struct.unpack_from("<II", body)
     expected = header.points * header.stride
     # LZF expands by at most a factor of 88: 264 bytes from 3.
@@ -205,18 +205,18 @@ def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDA
     if lzf_decompress(source, out) != size:
         raise InputError("contains damaged compressed data", where=path, remedy=_COPY_AGAIN)
     columns: list[NDArray[Any]] = []
-    at = 0
+    offset = 0
     for dtype, count in zip(header.dtypes, header.counts, strict=True):
-        column = np.frombuffer(out, dtype, header.points * count, at)
+        column = np.frombuffer(out, dtype, header.points * count, offset)
         columns.append(column.reshape(-1, count) if count > 1 else column)
-        at += column.nbytes
+        offset += column.nbytes
     return columns
 
 
 def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
     lines = [line for line in bytes(body).decode("latin-1").splitlines() if line.strip()]
     if len(lines) < header.points:
-        raise _cut_off(header, path)
+        raise _truncated(header, path)
     total = sum(header.counts)
     try:
         table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
@@ -230,12 +230,12 @@ def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[
         ) from error
     table = table.reshape(header.points, total)
     columns: list[NDArray[Any]] = []
-    at = 0
+    first = 0
     with np.errstate(invalid="ignore", over="ignore"):
         for dtype, count in zip(header.dtypes, header.counts, strict=True):
-            column = table[:, at : at + count].astype(dtype)
+            column = table[:, first : first + count].astype(dtype)
             columns.append(column if count > 1 else column[:, 0])
-            at += count
+            first += count
     return columns
 
 

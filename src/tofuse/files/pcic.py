@@ -36,7 +36,7 @@ class Chunk:
     time_us: int
     seconds: int
     nanoseconds: int
-    about: dict[str, Any]
+    metadata: dict[str, Any]
     start: int
     end: int
 
@@ -57,35 +57,35 @@ def pcic_frames(data: bytes, path: str | Path) -> list[dict[int, Chunk] | InputE
         If there are no frames.
     """
     frames: list[dict[int, Chunk] | InputError] = []
-    at = data.find(BEGIN)
-    while at >= 0 and len(frames) < _MAX_FRAMES:
-        at += len(BEGIN)
+    offset = data.find(BEGIN)
+    while offset >= 0 and len(frames) < _MAX_FRAMES:
+        offset += len(BEGIN)
         try:
-            chunks, at = _chunks(data, at, f"{path}: frame {len(frames)}")
+            chunks, offset = _chunks(data, offset, f"{path}: frame {len(frames)}")
             frames.append(chunks)
         except InputError as error:
             frames.append(error)
-        at = data.find(BEGIN, at)
+        offset = data.find(BEGIN, offset)
     if not frames:
         raise InputError("is not a PCIC stream", where=path, remedy="check the file")
     return frames
 
 
-def _chunks(data: bytes, at: int, where: str) -> tuple[dict[int, Chunk], int]:
+def _chunks(data: bytes, offset: int, where: str) -> tuple[dict[int, Chunk], int]:
     chunks: dict[int, Chunk] = {}
-    while data[at : at + 4] != END:
-        if at + _HEAD > len(data):
+    while data[offset : offset + 4] != END:
+        if offset + _HEAD > len(data):
             raise InputError("is cut off", where=where, remedy="copy the file again")
-        words = struct.unpack_from("<9I", data, at)
-        kind, size, head, version, width, height, format_, time_us = words[:8]
-        if not _HEAD <= head <= size or at + size > len(data):
+        words = struct.unpack_from("<9I", data, offset)
+        kind, size, header_size, version, width, height, format_, time_us = words[:8]
+        if not _HEAD <= header_size <= size or offset + size > len(data):
             raise InputError(f"is cut off or damaged in chunk {kind}", where=where)
         seconds = nanoseconds = 0
-        about: dict[str, Any] = {}
-        if version >= 2 and head >= 48:
-            seconds, nanoseconds = struct.unpack_from("<2I", data, at + 40)
-        if version >= 3 and head > 48:
-            about = _json(data[at + 48 : at + head])
+        metadata: dict[str, Any] = {}
+        if version >= 2 and header_size >= 48:
+            seconds, nanoseconds = struct.unpack_from("<2I", data, offset + 40)
+        if version >= 3 and header_size > 48:
+            metadata = _json(data[offset + 48 : offset + header_size])
         chunks[kind] = Chunk(
             kind,
             width,
@@ -94,20 +94,20 @@ def _chunks(data: bytes, at: int, where: str) -> tuple[dict[int, Chunk], int]:
             time_us,
             seconds,
             nanoseconds,
-            about,
-            at + head,
-            at + size,
+            metadata,
+            offset + header_size,
+            offset + size,
         )
-        at += size
-    return chunks, at + 4
+        offset += size
+    return chunks, offset + 4
 
 
 def _json(data: bytes) -> dict[str, Any]:
     try:
-        about = json.loads(data.split(b"\0", 1)[0])
+        metadata = json.loads(data.split(b"\0", 1)[0])
     except (ValueError, RecursionError):
         return {}
-    return about if isinstance(about, dict) else {}
+    return metadata if isinstance(metadata, dict) else {}
 
 
 def chunk_image(data: bytes, chunk: Chunk, where: str) -> NDArray[Any]:

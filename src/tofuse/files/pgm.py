@@ -26,10 +26,10 @@ def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
     header = _HEADER.match(data)
     if header is None:
         raise InputError("is not a binary PGM image", where=where, remedy="copy the file again")
-    width, height, largest = (int(each) for each in header.groups())
-    if not 0 < width * height <= MAX_PIXELS or not 0 < largest < 65536:
-        raise InputError(f"declares {width} x {height} pixels up to {largest}", where=where)
-    dtype = np.dtype(">u2" if largest > 255 else "u1")
+    width, height, max_value = (int(text) for text in header.groups())
+    if not 0 < width * height <= MAX_PIXELS or not 0 < max_value < 65536:
+        raise InputError(f"declares {width} x {height} pixels up to {max_value}", where=where)
+    dtype = np.dtype(">u2" if max_value > 255 else "u1")
     size = width * height * dtype.itemsize
     if len(data) < header.end() + size:
         raise InputError("is cut off before its end", where=where, remedy="copy the file again")

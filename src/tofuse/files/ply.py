@@ -128,21 +128,21 @@ def _read_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], li
             where=path,
             remedy=_COPY_AGAIN,
         )
-    at = data.find(b"end_header", 0, _HEADER_LIMIT)
-    line_end = data.find(b"\n", at) if at >= 0 else -1
-    if at < 0 or (line_end < 0 and not data.endswith(b"end_header")):
+    header_end = data.find(b"end_header", 0, _HEADER_LIMIT)
+    line_end = data.find(b"\n", header_end) if header_end >= 0 else -1
+    if header_end < 0 or (line_end < 0 and not data.endswith(b"end_header")):
         raise InputError("has a PLY header without an end", where=path, remedy=_COPY_AGAIN)
     kind = ""
     elements: list[_Element] = []
     comments: list[str] = []
-    for line in data[3:at].decode("latin-1").splitlines():
-        words = line.split()
+    for line in data[3:header_end].decode("latin-1").splitlines():
+        cells = line.split()
         try:
-            match words:
+            match cells:
                 case []:
                     pass
-                case ["comment" | "obj_info", *rest]:
-                    comments.append(" ".join(rest))
+                case ["comment" | "obj_info", *text]:
+                    comments.append(" ".join(text))
                 case ["format", kind, *_]:
                     pass
                 case ["element", name, count]:
@@ -171,7 +171,7 @@ def _read_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], li
     return kind, elements, comments, line_end + 1 if line_end >= 0 else len(data)
 
 
-def _cut_off(element: _Element, path: str | Path) -> InputError:
+def _truncated(element: _Element, path: str | Path) -> InputError:
     return InputError(
         f"is cut off: its header declares {element.count} of {element.name!r}, "
         "more than it contains",
@@ -183,8 +183,8 @@ def _cut_off(element: _Element, path: str | Path) -> InputError:
 class _Binary:
     """Reads elements sequentially from the body of a binary file."""
 
-    def __init__(self, data: bytes, at: int, order: str, path: str | Path) -> None:
-        self.data, self.at, self.order, self.path = data, at, order, path
+    def __init__(self, data: bytes, offset: int, order: str, path: str | Path) -> None:
+        self.data, self.offset, self.order, self.path = data, offset, order, path
 
     def element(self, element: _Element) -> _Columns:
         if not element.has_list:
@@ -197,10 +197,10 @@ class _Binary:
 
     def _rows(self, dtype: np.dtype, element: _Element) -> NDArray[np.void]:
         size = dtype.itemsize * element.count
-        if self.at + size > len(self.data):
-            raise _cut_off(element, self.path)
-        rows = np.frombuffer(self.data, dtype, element.count, self.at)
-        self.at += size
+        if self.offset + size > len(self.data):
+            raise _truncated(element, self.path)
+        rows = np.frombuffer(self.data, dtype, element.count, self.offset)
+        self.offset += size
         return rows
 
     def _equal_lists(self, element: _Element) -> _Columns | None:
@@ -209,19 +209,19 @@ class _Binary:
         count_dtype = np.dtype(self.order + str(p.count_dtype))
         if element.count == 0:
             return {p.name: np.zeros((0, 3), np.int32)}
-        if self.at + count_dtype.itemsize > len(self.data):
-            raise _cut_off(element, self.path)
-        n = int(np.frombuffer(self.data, count_dtype, 1, self.at)[0])
+        if self.offset + count_dtype.itemsize > len(self.data):
+            raise _truncated(element, self.path)
+        n = int(np.frombuffer(self.data, count_dtype, 1, self.offset)[0])
         if not 1 <= n <= 64:
             return None
         dtype = np.dtype([("n", count_dtype), ("items", self.order + p.dtype, (n,))])
         size = dtype.itemsize * element.count
-        if self.at + size > len(self.data):
+        if self.offset + size > len(self.data):
             return None
-        rows = np.frombuffer(self.data, dtype, element.count, self.at)
+        rows = np.frombuffer(self.data, dtype, element.count, self.offset)
         if (rows["n"] != n).any():
             return None
-        self.at += size
+        self.offset += size
         return {p.name: _fans(rows["items"])}
 
     def _lists(self, element: _Element) -> _Columns:
@@ -237,14 +237,14 @@ class _Binary:
                 items = self._take(np.dtype(self.order + p.dtype), n, element)
                 if p.count_dtype:
                     polygons[p.name].append(items)
-        return {name: _fans_of_all(rows) for name, rows in polygons.items()}
+        return {name: _triangulated(rows) for name, rows in polygons.items()}
 
     def _take(self, dtype: np.dtype, n: int, element: _Element) -> NDArray[np.generic]:
         size = dtype.itemsize * n
-        if n < 0 or self.at + size > len(self.data):
-            raise _cut_off(element, self.path)
-        items = np.frombuffer(self.data, dtype, n, self.at)
-        self.at += size
+        if n < 0 or self.offset + size > len(self.data):
+            raise _truncated(element, self.path)
+        items = np.frombuffer(self.data, dtype, n, self.offset)
+        self.offset += size
         return items
 
 
@@ -253,13 +253,13 @@ class _Ascii:
 
     def __init__(self, body: bytes, path: str | Path) -> None:
         self.lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
-        self.at, self.path = 0, path
+        self.offset, self.path = 0, path
 
     def element(self, element: _Element) -> _Columns:
-        lines = self.lines[self.at : self.at + element.count]
+        lines = self.lines[self.offset : self.offset + element.count]
         if len(lines) < element.count:
-            raise _cut_off(element, self.path)
-        self.at += element.count
+            raise _truncated(element, self.path)
+        self.offset += element.count
         try:
             if element.has_list:
                 return self._lists(element, lines)
@@ -283,18 +283,20 @@ class _Ascii:
             p.name: [] for p in element.properties if p.count_dtype
         }
         for line in lines:
-            words = line.split()
-            at = 0
+            cells = line.split()
+            position = 0
             for p in element.properties:
                 n = 1
                 if p.count_dtype:
-                    n, at = int(words[at]), at + 1
-                if n < 0 or at + n > len(words):
+                    n, position = int(cells[position]), position + 1
+                if n < 0 or position + n > len(cells):
                     raise ValueError("a row is too short")
                 if p.count_dtype:
-                    polygons[p.name].append(np.array([float(w) for w in words[at : at + n]]))
-                at += n
-        return {name: _fans_of_all(rows) for name, rows in polygons.items()}
+                    polygons[p.name].append(
+                        np.array([float(w) for w in cells[position : position + n]])
+                    )
+                position += n
+        return {name: _triangulated(rows) for name, rows in polygons.items()}
 
 
 def _native(column: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -314,7 +316,7 @@ def _fans(polygons: NDArray[np.generic]) -> Int32:
     return np.clip(triangles.reshape(-1, 3), -1, 2**31 - 1).astype(np.int32)
 
 
-def _fans_of_all(polygons: list[NDArray[np.generic]]) -> Int32:
+def _triangulated(polygons: list[NDArray[np.generic]]) -> Int32:
     """Triangles (K, 3) of polygons with any number of corners each."""
     triangles = [_fans(polygon[None]) for polygon in polygons]
     return np.concatenate([np.zeros((0, 3), np.int32), *triangles])
@@ -343,7 +345,7 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
     record
         The cloud or mesh.
     double
-        Whether to write the points as float64 instead of float32, as map coordinates need it.
+        Whether to write the points as float64 instead of float32, as map coordinates require.
 
     Raises
     ------

@@ -76,16 +76,16 @@ def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:
 def _from_numbers(text: str, path: str | Path) -> Float64:
     lines = [line.split("#", 1)[0].replace(",", " ") for line in text.splitlines()]
     numbers: list[float] = []
-    for count, line in enumerate(lines, 1):
-        for word in line.split():
+    for number, line in enumerate(lines, 1):
+        for cell in line.split():
             try:
-                numbers.append(float(word))
+                numbers.append(float(cell))
             except ValueError as error:
                 raise InputError(
-                    f"{word[:40]!r} is not a number", where=f"{path}, line {count}", remedy=_REMEDY
+                    f"{cell[:40]!r} is not a number", where=f"{path}, line {number}", remedy=_REMEDY
                 ) from error
             if not math.isfinite(numbers[-1]):
-                raise InputError(f"contains {word}", where=f"{path}, line {count}", remedy=_REMEDY)
+                raise InputError(f"contains {cell}", where=f"{path}, line {number}", remedy=_REMEDY)
     if len(numbers) == 16:
         return np.array(numbers).reshape(4, 4)
     if len(numbers) not in (7, 8):

@@ -17,7 +17,7 @@ from tofuse.errors import InputError
 MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
 _MAX_DOTS = 1000  # on a line of TOML
-# Errors that malformed data cause in code that takes it apart.
+# Errors that malformed data cause in code that parses it.
 _MALFORMED = (
     ArithmeticError,
     AttributeError,
@@ -103,27 +103,27 @@ def read_head(path: str | Path, size: int) -> bytes:
 
 
 @contextmanager
-def damage_reported(path: str | Path, what: str) -> Iterator[None]:
-    """Turn errors of a block that takes apart a file of tofuse's own into InputError.
+def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn errors of a block that parses a file written by tofuse into InputError.
 
     Parameters
     ----------
     path
         The file.
-    what
-        Its kind, such as "a tileset".
+    kind
+        Kind of file, for the message, such as "a tileset".
     """
     try:
         yield
     except _MALFORMED as error:
         raise InputError(
-            f"is damaged, or not {what} written by tofuse ({type(error).__name__}: {error})",
+            f"is damaged, or not {kind} written by tofuse ({type(error).__name__}: {error})",
             where=path,
             remedy="copy the whole folder again, or create it again",
         ) from error
 
 
-def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: str) -> Any:
+def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_name: str) -> Any:
     """Parse external JSON or TOML.
 
     Parameters
@@ -134,7 +134,7 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: s
         The text.
     where
         Its source, for errors.
-    what
+    format_name
         Its format, for errors.
 
     Raises
@@ -145,20 +145,20 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: s
     try:
         return parse(text)
     except RecursionError as error:
-        raise InputError(f"is not {what} (nested too deeply)", where=where) from error
+        raise InputError(f"is not {format_name} (nested too deeply)", where=where) from error
     except ValueError as error:
-        raise InputError(f"is not {what} ({error})", where=where) from error
+        raise InputError(f"is not {format_name} ({error})", where=where) from error
 
 
 def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
-    """Return what a TOML text from outside says; errors as `parsed`.
+    """Return the data of an external TOML text; errors as `parsed`.
 
-    The time that tomllib takes for a dotted key grows with the square of its parts.
+    The time of tomllib for a dotted key grows with the square of the number of its parts.
     """
     if any(line.count(".") > _MAX_DOTS for line in text.split("\n")):
         raise InputError("is not TOML (nested too deeply)", where=where)
-    found: dict[str, Any] = parsed(tomllib.loads, text, where=where, what="TOML")
-    return found
+    data: dict[str, Any] = parsed(tomllib.loads, text, where=where, format_name="TOML")
+    return data
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES) -> str:
@@ -204,12 +204,12 @@ def files_with(path: str | Path, *suffixes: str) -> list[Path]:
     return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
 
 
-def files_named(path: Path, named: Callable[[str], object]) -> list[Path]:
-    """Return the files in a folder whose name satisfies `named`; none if it is not a folder."""
+def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
+    """Return the files in a folder whose name `matches`; none if it is not a folder."""
     if not is_folder(path):
         return []
     try:
-        return [p for p in list_folder(path) if named(p.name) and is_file(p)]
+        return [p for p in list_folder(path) if matches(p.name) and is_file(p)]
     except InputError:
         return []
 

@@ -2,7 +2,7 @@
 
 A recording may be hours long, and its last frames may need views of its first. Items stay in memory
 within a budget; the arrays of others are read back from a temporary file. The file is read instead
-of mapped, so that the resident memory is what was budgeted. Arrays are restored bit by bit: no
+of mapped, so that the resident memory stays within the budget. Arrays are restored bit by bit: no
 result depends on the budget.
 """
 
@@ -25,7 +25,7 @@ from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
 from tofuse.files.memory import give_back
 
-_PIECE = 16 << 20  # bytes copied at a time
+_PIECE_BYTES = 16 << 20  # bytes copied at a time
 _TRIM_BYTES = 128 << 20  # evicted between two returns of free memory to the system
 
 
@@ -62,33 +62,36 @@ class SpillFile:
                 )
                 weakref.finalize(self, self._file.close)
             self._file.seek(offset)
-            left = data.data
-            while left:
-                left = left[self._file.write(left) :]
+            remaining = data.data
+            while remaining:
+                remaining = remaining[self._file.write(remaining) :]
         except OSError as error:
-            raise _no_room(error, self._where) from error
+            raise _disk_error(error, self._where) from error
         self.size = offset + len(data)
         return offset
 
     def read(self, offset: int, out: UInt8) -> None:
         """Fill `out` with the bytes at an offset."""
-        left = out.data
+        remaining = out.data
         try:
             assert self._file is not None
             self._file.seek(offset)
-            while left:
-                count = self._file.readinto(left)  # type: ignore[attr-defined]
+            while remaining:
+                count = self._file.readinto(remaining)  # type: ignore[attr-defined]
                 if not count:
                     raise OutputError(
                         "a temporary file of this run was truncated", where=self._where
                     )
-                left = left[count:]
+                remaining = remaining[count:]
         except OSError as error:
-            raise _no_room(error, self._where) from error
+            raise _disk_error(error, self._where) from error
 
     def pieces(self) -> list[Piece]:
         """Return the content as pieces that are read when they are converted to arrays."""
-        return [Piece(self, k, min(_PIECE, self.size - k)) for k in range(0, self.size, _PIECE)]
+        return [
+            Piece(self, k, min(_PIECE_BYTES, self.size - k))
+            for k in range(0, self.size, _PIECE_BYTES)
+        ]
 
     def close(self) -> None:
         """Remove the file."""
@@ -204,20 +207,22 @@ class Spill(Generic[T]):
         }
         arrays = {name: value for name, value in fields.items() if _is_array(value)}
         with self._lock:
-            own = {n: _compact(a) for n, a in arrays.items() if self._last.get(n) is not a}
-            if any(own[name] is not arrays[name] for name in own):
+            unshared = {n: _compact(a) for n, a in arrays.items() if self._last.get(n) is not a}
+            if any(unshared[name] is not arrays[name] for name in unshared):
                 # The layout is lost on disk, and sums depend on it: it must be the same in memory.
-                item = type(item)(**(fields | own))
+                item = type(item)(**(fields | unshared))
             self._last = arrays
             number, self._next = self._next, self._next + 1
-            empty = {name: self._empty_like(a) for name, a in own.items()}
-            shapes = {name: a.shape for name, a in own.items()}
+            placeholders = {name: self._empty_like(a) for name, a in unshared.items()}
+            shapes = {name: a.shape for name, a in unshared.items()}
             if shapes == self._shapes:
-                shapes = self._shapes  # of which there may be many
+                shapes = self._shapes  # share one object between many items
             self._shapes = shapes
-            nbytes = sum(a.nbytes for a in own.values())
-            self._entries[number] = _Entry(_shell(type(item), fields | empty), shapes, nbytes)
-            self._keep(number, item)
+            nbytes = sum(a.nbytes for a in unshared.values())
+            self._entries[number] = _Entry(
+                _shell(type(item), fields | placeholders), shapes, nbytes
+            )
+            self._make_resident(number, item)
         return number
 
     def get(self, number: int) -> T:
@@ -228,7 +233,7 @@ class Spill(Generic[T]):
                 return self._resident[number]
             entry = self._entries[number]
             item: T = dataclasses.replace(entry.shell, **self._read(entry))
-            self._keep(number, item)
+            self._make_resident(number, item)
             return item
 
     def drop(self, number: int) -> None:
@@ -269,7 +274,7 @@ class Spill(Generic[T]):
         empty = np.empty((0, *array.shape[1:])[: array.ndim], array.dtype)
         return self._empty.setdefault((empty.shape, empty.dtype.str), empty)
 
-    def _keep(self, number: int, item: T) -> None:
+    def _make_resident(self, number: int, item: T) -> None:
         self._resident[number] = item
         self._resident_bytes += self._entries[number].nbytes
         while self._resident_bytes > self.budget and len(self._resident) > 1:
@@ -373,7 +378,7 @@ def _bytes_of(array: NDArray[Any]) -> UInt8:
     return array.reshape(-1).view(np.uint8) if array.size else np.empty(0, np.uint8)
 
 
-def _no_room(error: OSError, where: Path) -> OutputError:
+def _disk_error(error: OSError, where: Path) -> OutputError:
     cause = output_error(error, where)
     return OutputError(
         f"temporary data {cause.problem}",

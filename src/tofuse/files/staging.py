@@ -27,7 +27,7 @@ from tofuse.files.atomic import replacing, sync, sync_tree
 _ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
 _MAX_PLAN_BYTES = 4 << 20
 _TIME_RESOLUTION_S = 2.0  # of modification times on FAT file systems
-_PART = re.compile(r"\..*\.part(\.\w+)?|\..*\.unfinished")  # temporary files
+_TEMPORARY_NAME = re.compile(r"\..*\.part(\.\w+)?|\..*\.unfinished")  # temporary files
 
 # Kind, size in bytes and modification time in s of a file; of a folder, the marks of its files.
 Mark = tuple[str, int, float] | dict[str, Any]
@@ -39,7 +39,7 @@ class Names:
 
     Attributes
     ----------
-    files, more
+    files, file_pattern
         Names of files, and the pattern of further ones.
     folders
         Patterns of names of folders, and the names in them.
@@ -47,24 +47,24 @@ class Names:
 
     files: frozenset[str]
     folders: tuple[tuple[re.Pattern[str], Names], ...] = ()
-    more: re.Pattern[str] | None = None
+    file_pattern: re.Pattern[str] | None = None
 
     def file(self, name: str) -> bool:
         """Whether `name` is that of a file of a result."""
-        return name in self.files or bool(self.more and self.more.fullmatch(name))
+        return name in self.files or bool(self.file_pattern and self.file_pattern.fullmatch(name))
 
     def folder(self, name: str) -> Names | None:
         """Return the names in the folder `name`; None if a result has no such folder."""
-        return next((inner for like, inner in self.folders if like.fullmatch(name)), None)
+        return next((inner for pattern, inner in self.folders if pattern.fullmatch(name)), None)
 
-    def is_whole(self, folder: Path) -> bool:
-        """Whether a path is such a folder, without links or other content."""
+    def is_result_folder(self, folder: Path) -> bool:
+        """Whether a path is a folder of a result, without links or other content."""
         inner = self.folder(folder.name)
         return (
             inner is not None
-            and _is(folder, stat.S_ISDIR)
+            and _has_type(folder, stat.S_ISDIR)
             and all(
-                inner.is_whole(p) or (inner.file(p.name) and _is(p, stat.S_ISREG))
+                inner.is_result_folder(p) or (inner.file(p.name) and _has_type(p, stat.S_ISREG))
                 for p in folder.iterdir()
             )
         )
@@ -131,8 +131,8 @@ def move_all(staging: Path, folder: Path, names: Names, marker: str) -> None:
         If a move fails; the previous state is restored.
     """
     new = sorted((p.name for p in staging.iterdir()), key=lambda n: (n == marker, n))
-    there = sorted((p.name for p in folder.iterdir()), key=lambda n: (n != marker, n))
-    old = [n for n in there if n in new or names.file(n) or names.is_whole(folder / n)]
+    existing = sorted((p.name for p in folder.iterdir()), key=lambda n: (n != marker, n))
+    old = [n for n in existing if n in new or names.file(n) or names.is_result_folder(folder / n)]
     for name in old:
         check_replaceable(folder / name, names)
     plan = _Plan(
@@ -148,12 +148,12 @@ def move_all(staging: Path, folder: Path, names: Names, marker: str) -> None:
     except BaseException:
         os.replace(staging / _FORWARD, staging / _BACK)
         plan.undo(staging, folder)
-        _end(staging, folder, _BACK)
+        _remove_plan(staging, folder, _BACK)
         raise
-    _end(staging, folder, _FORWARD)
+    _remove_plan(staging, folder, _FORWARD)
 
 
-def _end(staging: Path, folder: Path, name: str) -> None:
+def _remove_plan(staging: Path, folder: Path, name: str) -> None:
     """Remove a completed plan."""
     sync(folder)
     sync(staging)
@@ -165,7 +165,7 @@ def is_interrupted(staging: Path) -> bool:
     return any(os.path.lexists(staging / name) for name in (_FORWARD, _BACK))
 
 
-def places(staging: Path, folder: Path) -> tuple[Path, ...]:
+def result_locations(staging: Path, folder: Path) -> tuple[Path, ...]:
     """Return the folders in which files of the old and the new result can be during the moves."""
     return (folder, staging / _ASIDE, staging)
 
@@ -189,11 +189,11 @@ def recover(staging: Path, folder: Path, names: Names, marker: str) -> None:
         except _InvalidPlanError as error:
             raise _invalid_plan(staging / name, error) from None
         move(plan, staging, folder)
-        _end(staging, folder, name)
+        _remove_plan(staging, folder, name)
 
 
 def check_interrupted(staging: Path, names: Names, marker: str) -> None:
-    """Check a plan of interrupted moves, if any, without looking at the files that it names.
+    """Check a plan of interrupted moves, if any, without accessing the files that it names.
 
     Raises
     ------
@@ -210,9 +210,9 @@ def checked_plan(staging: Path, names: Names, marker: str, name: str) -> _Plan:
     path = staging / name
     try:
         for part in (staging, staging / _ASIDE):
-            if not _is(part, stat.S_ISDIR):
+            if not _has_type(part, stat.S_ISDIR):
                 raise _InvalidPlanError(f"{part.name} is not a folder")
-        if not _is(path, stat.S_ISREG) or path.stat().st_size > _MAX_PLAN_BYTES:
+        if not _has_type(path, stat.S_ISREG) or path.stat().st_size > _MAX_PLAN_BYTES:
             raise _InvalidPlanError("it is not a small file")
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
@@ -232,9 +232,9 @@ def checked_plan(staging: Path, names: Names, marker: str, name: str) -> _Plan:
         raise _invalid_plan(path, error.strerror or error) from error
 
 
-def _invalid_plan(path: Path, why: object) -> OutputError:
+def _invalid_plan(path: Path, reason: object) -> OutputError:
     return OutputError(
-        f"was not left by this program, or has changed since ({why}); nothing was touched",
+        f"was not left by this program, or has changed since ({reason}); nothing was touched",
         where=path,
         remedy=f"move {path.parent.name} away if it is not yours, or choose another --out",
     )
@@ -269,21 +269,21 @@ def _mark(path: Path, names: Names) -> Mark:
     """The kind, size and time of a file of a result, or the marks of a folder's files."""
     status = path.lstat()
     inner = names.folder(path.name)
-    if inner is not None and stat.S_ISDIR(status.st_mode) and names.is_whole(path):
+    if inner is not None and stat.S_ISDIR(status.st_mode) and names.is_result_folder(path):
         return {p.name: _mark(p, inner) for p in sorted(path.iterdir())}
     for kind, test in (("file", stat.S_ISREG), ("link", stat.S_ISLNK)):
         if test(status.st_mode) and names.file(path.name):
             return (kind, status.st_size, status.st_mtime)
-    raise check_error(path)
+    raise not_a_result_error(path)
 
 
 def _check(path: Path, mark: Mark, names: Names) -> None:
     """Raise _InvalidPlanError if a file was changed since it was marked."""
     try:
-        now = _mark(path, names)
+        current = _mark(path, names)
     except (OSError, OutputError):
         raise _InvalidPlanError(f"{path.name} was changed") from None
-    if not _same(now, mark):
+    if not _same(current, mark):
         raise _InvalidPlanError(f"{path.name} was changed")
 
 
@@ -304,14 +304,14 @@ def check_replaceable(path: Path, names: Names) -> None:
         If it is of another kind than in a result, or a folder with additional content.
     """
     if names.folder(path.name):
-        good = names.is_whole(path)
+        replaceable = names.is_result_folder(path)
     else:
-        good = _is(path, stat.S_ISREG) or _is(path, stat.S_ISLNK)
-    if not good:
-        raise check_error(path)
+        replaceable = _has_type(path, stat.S_ISREG) or _has_type(path, stat.S_ISLNK)
+    if not replaceable:
+        raise not_a_result_error(path)
 
 
-def check_error(path: Path) -> OutputError:
+def not_a_result_error(path: Path) -> OutputError:
     """Return the error that something is not part of a result."""
     return OutputError(
         "is not a file of an earlier result",
@@ -321,13 +321,13 @@ def check_error(path: Path) -> OutputError:
 
 
 def clear(staging: Path, names: Names) -> bool:
-    """Remove a staging folder with the files of a result in it, and return whether it is gone.
+    """Remove a staging folder with the files of a result in it, and return whether it is removed.
 
     Links are never followed, and other files stay.
     """
     if not os.path.lexists(staging):
         return True
-    if not _is(staging, stat.S_ISDIR):
+    if not _has_type(staging, stat.S_ISDIR):
         return False
     _clear_folder(staging / _ASIDE, names)
     _clear_folder(staging, names)
@@ -335,20 +335,20 @@ def clear(staging: Path, names: Names) -> bool:
 
 
 def _clear_folder(folder: Path, names: Names) -> None:
-    if not _is(folder, stat.S_ISDIR):
+    if not _has_type(folder, stat.S_ISDIR):
         return
     for path in list(folder.iterdir()):
         inner = names.folder(path.name)
         if inner is not None:
             _clear_folder(path, inner)
-        elif names.file(path.name) or _PART.fullmatch(path.name):
+        elif names.file(path.name) or _TEMPORARY_NAME.fullmatch(path.name):
             with suppress(OSError):
                 path.unlink()
     with suppress(OSError):
         folder.rmdir()
 
 
-def _is(path: Path, test: Callable[[int], bool]) -> bool:
+def _has_type(path: Path, test: Callable[[int], bool]) -> bool:
     try:
         return test(path.lstat().st_mode)
     except OSError:

@@ -20,7 +20,7 @@ def stamp(path: Path) -> Stamp:
 def stamps_in(folder: Path, without: Path) -> list[Stamp]:
     """Return the stamps of all files below a folder, in order, except those below `without`."""
     stamps = []
-    for here, folders, names in os.walk(folder):
-        folders[:] = sorted(f for f in folders if Path(here) / f != without)
-        stamps += [stamp(Path(here) / name) for name in sorted(names)]
+    for directory, folders, names in os.walk(folder):
+        folders[:] = sorted(f for f in folders if Path(directory) / f != without)
+        stamps += [stamp(Path(directory) / name) for name in sorted(names)]
     return stamps

@@ -64,16 +64,16 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
-        what = "is empty" if not data else "is not a TIFF image"
-        raise InputError(what, where=path, remedy="check the file")
+        problem = "is empty" if not data else "is not a TIFF image"
+        raise InputError(problem, where=path, remedy="check the file")
     try:
         tags = _tags(data, order)
         width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
         channels = tags.get(_SAMPLES, [1])[0]
         pieces = [(tags[a], tags[b]) for a, b in _PIECES if a in tags and b in tags]
-        whole = bool(pieces) and all(
+        complete = bool(pieces) and all(
             len(starts) == len(sizes)
-            and all(at + count <= len(data) for at, count in zip(starts, sizes, strict=True))
+            and all(start + count <= len(data) for start, count in zip(starts, sizes, strict=True))
             for starts, sizes in pieces
         )
     except (struct.error, KeyError, IndexError, ValueError) as error:
@@ -86,27 +86,27 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
         )
     if channels != 1:
         raise InputError(f"has {channels} channels", where=path, remedy="store one channel")
-    if not whole:
+    if not complete:
         raise InputError("is cut off before its end", where=path, remedy="copy the file again")
     return width, height
 
 
 def _tags(data: bytes, order: str) -> dict[int, list[int]]:
     """The integer values of the tags of the first directory."""
-    (at,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, at)
+    (directory,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, directory)
     if count > _MAX_TAGS:
         raise ValueError(count)
     tags = {}
     for k in range(count):
-        tag, kind, number = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
+        tag, kind, number = struct.unpack_from(order + "HHI", data, directory + 2 + 12 * k)
         if kind not in _CODES:
             continue
-        start = at + 2 + 12 * k + 8
-        values = struct.calcsize(order + _CODES[kind]) * number
-        if values > 4:
+        start = directory + 2 + 12 * k + 8
+        size = struct.calcsize(order + _CODES[kind]) * number
+        if size > 4:
             (start,) = struct.unpack_from(order + "I", data, start)
-        if start + values > len(data):
+        if start + size > len(data):
             raise ValueError(number)
         tags[tag] = list(struct.unpack_from(f"{order}{number}{_CODES[kind]}", data, start))
     return tags

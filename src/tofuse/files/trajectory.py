@@ -79,8 +79,8 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
             where="trajectory",
             remedy="pass (N,) and (N, 4, 4)",
         )
-    known = np.isfinite(T).all((1, 2))
-    times, T = times[known], T[known]
+    finite = np.isfinite(T).all((1, 2))
+    times, T = times[finite], T[finite]
     if not len(times):
         return ""
     table = np.column_stack([times, T[:, :3, 3], from_matrix(T[:, :3, :3])])
@@ -92,7 +92,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> None:
 
     The format has no timestamps and no gaps: poses that are NaN are skipped.
     """
-    T = _known(poses)
+    T = _finite_poses(poses)
     rows = T[:, :3].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(exact(v) for v in row) + "\n" for row in rows))
 
@@ -105,14 +105,16 @@ def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
     numbers
         (N,) frame numbers: each pose has a line `n n n+1` before its matrix.
     """
-    known = np.isfinite(np.asarray(poses, float)).all((1, 2))
+    finite = np.isfinite(np.asarray(poses, float)).all((1, 2))
     lines = []
-    for n, T in zip(np.asarray(numbers)[known].tolist(), _known(poses).tolist(), strict=True):
+    for n, T in zip(
+        np.asarray(numbers)[finite].tolist(), _finite_poses(poses).tolist(), strict=True
+    ):
         lines += [f"{n} {n} {n + 1}", *(" ".join(exact(v) for v in row) for row in T)]
     write_text(path, "".join(f"{line}\n" for line in lines))
 
 
-def _known(poses: ArrayLike) -> Float64:
+def _finite_poses(poses: ArrayLike) -> Float64:
     T = np.asarray(poses, float)
     return np.asarray(T[np.isfinite(T).all((1, 2))], np.float64)
 
@@ -130,23 +132,23 @@ def associate(
     if `exclusive`, each of the others is matched at most once, to the nearest timestamp.
     """
     times, others = np.asarray(timestamps, float), np.asarray(others, float)
-    out = np.full(len(times), -1, np.intp)
+    index = np.full(len(times), -1, np.intp)
     if not len(times) or not len(others):
-        return out
+        return index
     order = np.argsort(others, kind="stable")
     ordered = others[order]
     after = np.clip(np.searchsorted(ordered, times), 0, len(ordered) - 1)
     before = np.maximum(after - 1, 0)
-    nearer = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
-    best = np.where(nearer, before, after)
+    is_before = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
+    best = np.where(is_before, before, after)
     gap = np.abs(ordered[best] - times)
     # In order of the gap, so that conflicts are won by the nearer one.
-    taken = np.zeros(len(ordered), bool)
+    matched = np.zeros(len(ordered), bool)
     for k in np.argsort(gap, kind="stable"):
-        if gap[k] <= limit + 1e-9 and not taken[best[k]]:
-            taken[best[k]] = exclusive
-            out[k] = order[best[k]]
-    return out
+        if gap[k] <= limit + 1e-9 and not matched[best[k]]:
+            matched[best[k]] = exclusive
+            index[k] = order[best[k]]
+    return index
 
 
 def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:

@@ -25,7 +25,7 @@ from tofuse.geometry.quaternion import length, to_matrix
 
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
-_KNOWN = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
+_SUPPORTED = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
 # Times in nanoseconds are larger than any in seconds.
 _NANOSECONDS = 1e12
 # Digits that always fit into an int64.
@@ -85,10 +85,10 @@ class TimedPoses:
         if clock is None:
             return self.frames.astype(np.float64), self.poses
         poses = self.of_frames(*clock)
-        known = np.isfinite(poses).all((1, 2))
-        if not known.any():
+        posed = np.isfinite(poses).all((1, 2))
+        if not posed.any():
             raise InputError("has poses of other frames than the recording", where=where)
-        return clock[0][known], poses[known]
+        return clock[0][posed], poses[posed]
 
 
 # (N,) timestamps and (N,) numbers of the frames of a recording.
@@ -105,10 +105,10 @@ def read_poses(path: str | Path) -> TimedPoses:
     """
     path = Path(path)
     if is_folder(path):
-        first = next((path / name for name in NAMES if is_file(path / name)), None)
-        if first is None:
+        file = next((path / name for name in NAMES if is_file(path / name)), None)
+        if file is None:
             raise InputError(f"contains none of {', '.join(NAMES)}", where=path)
-        path = first
+        path = file
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return _numpy(path)
@@ -117,7 +117,7 @@ def read_poses(path: str | Path) -> TimedPoses:
         return _transforms(text, path)
     rows = list(_rows(text))
     if not rows:
-        raise InputError("contains no poses", where=path, remedy=f"use {_KNOWN}")
+        raise InputError("contains no poses", where=path, remedy=f"use {_SUPPORTED}")
     return _reader(rows, path)(rows, path)
 
 
@@ -142,7 +142,7 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
     raise InputError(
         f"is not a trajectory of a known format: its first line has {count} columns",
         where=path,
-        remedy=f"use {_KNOWN}",
+        remedy=f"use {_SUPPORTED}",
     )
 
 
@@ -191,11 +191,11 @@ def _rigid(T: Float64, where: str) -> Float64:
 
 
 def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[int]) -> Float64:
-    off = np.abs(length(q_xyzw) - 1)
-    if (off > 0.1).any():
+    deviation = np.abs(length(q_xyzw) - 1)
+    if (deviation > 0.1).any():
         raise InputError(
             "contains a quaternion that is not of unit length",
-            where=f"{path}, line {lines[int(np.argmax(off))]}",
+            where=f"{path}, line {lines[int(np.argmax(deviation))]}",
         )
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     poses[:, :3, 3] = t
@@ -214,14 +214,14 @@ def _euroc(rows: _Rows, path: Path) -> TimedPoses:
 def _kitti(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of 3 x 4 matrices, one for each frame."""
     out = np.tile(np.eye(4), (len(rows), 1, 1))
-    known = []
+    frames = []
     for k, (number, cells) in enumerate(rows):
         table, _ = _numbers([(number, cells)], path, 12)
         if len(table):
             out[k, :3] = table.reshape(3, 4)
             out[k] = _rigid(out[k], f"{path}, line {number}")
-            known.append(k)
-    return TimedPoses(out[known], frames=np.array(known, np.intp))
+            frames.append(k)
+    return TimedPoses(out[frames], frames=np.array(frames, np.intp))
 
 
 def _log(rows: _Rows, path: Path) -> TimedPoses:
@@ -248,7 +248,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
     table, lines = _numbers(images, path, 8)
     T_camera_world = _from_quaternions(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
     names = [cells[9] for _, cells in images]
-    return TimedPoses(se3.inverse(T_camera_world), frames=_numbers_in(names, path))
+    return TimedPoses(se3.inverse(T_camera_world), frames=_frame_numbers(names, path))
 
 
 def _transforms(text: str, path: Path) -> TimedPoses:
@@ -259,7 +259,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
         raise InputError(f"is not valid JSON ({error})", where=path) from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError("has no list 'frames'", where=path, remedy=f"use {_KNOWN}")
+        raise InputError("has no list 'frames'", where=path, remedy=f"use {_SUPPORTED}")
     poses, names = [], []
     for k, frame in enumerate(frames):
         where = f"{path}, frame {k}"
@@ -270,7 +270,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
             raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
         poses.append(_rigid(T, where) @ OPENGL)
         names.append(str(frame.get("file_path", k)))
-    return TimedPoses(_stacked(poses), frames=_numbers_in(names, path))
+    return TimedPoses(_stacked(poses), frames=_frame_numbers(names, path))
 
 
 def _numpy(path: Path) -> TimedPoses:
@@ -286,16 +286,16 @@ def _numpy(path: Path) -> TimedPoses:
         raise InputError(f"is of shape {table.shape}", where=path, remedy="write (N, 4, 4)")
     out = np.tile(np.eye(4), (len(table), 1, 1))
     out[:, :3] = table[:, :3]
-    known = np.flatnonzero(np.isfinite(out).all((1, 2)))
-    poses = [_rigid(out[k], f"{path}, pose {k}") for k in known]
-    return TimedPoses(_stacked(poses), frames=known)
+    frames = np.flatnonzero(np.isfinite(out).all((1, 2)))
+    poses = [_rigid(out[k], f"{path}, pose {k}") for k in frames]
+    return TimedPoses(_stacked(poses), frames=frames)
 
 
 def _stacked(poses: Sequence[Float64]) -> Float64:
     return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
 
-def _numbers_in(names: Sequence[str], path: Path) -> Intp:
+def _frame_numbers(names: Sequence[str], path: Path) -> Intp:
     """The last number in each file name: the frame number."""
     digits_in = [re.findall(r"[0-9]+", Path(name).stem) for name in names]
     if not all(digits_in):

@@ -107,8 +107,8 @@ def write_usdz(path: str | Path, mesh: GeometryRecord, *, generator: str = "tofu
         texts.append(("normal3f[] normals", _tuples(np.asarray(mesh.normals, float), "%.4f")))
     image = "texture.png" if texture is not None and texture[:4] == b"\x89PNG" else "texture.jpg"
     if texture is not None:
-        from_below = np.asarray(mesh.uv, float) * [1, -1] + [0, 1]  # from the lower left corner
-        texts.append(("texCoord2f[] primvars:st", _tuples(from_below, "%.5f")))
+        flipped_uv = np.asarray(mesh.uv, float) * [1, -1] + [0, 1]  # from the lower left corner
+        texts.append(("texCoord2f[] primvars:st", _tuples(flipped_uv, "%.5f")))
     elif mesh.color is not None:
         light = linear(np.asarray(mesh.color, np.uint8))[:, :3] / 65535
         texts.append(("color3f[] primvars:displayColor", _tuples(light, "%.4f")))

@@ -20,9 +20,10 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class Background(Bounded, Filter):
     """Keep points in front of the background of a static camera.
 
-    The background of a pixel is the farthest surface that it sees in several frames, sampled over
-    the whole recording. Where the object always occludes it, that surface belongs to the object: it
-    stands out in depth from its surroundings, and continues the object at neighbouring pixels.
+    The background of a pixel is the farthest surface that it measures in several frames, sampled
+    over the entire recording. Where the object always occludes the background, that surface belongs
+    to the object: its depth differs from the surroundings, and continues the object at neighbouring
+    pixels.
 
     Attributes
     ----------
@@ -66,9 +67,9 @@ class FittedBackground(Background):
 
     _found: MovingObject
 
-    def __init__(self, options: Background, found: MovingObject) -> None:
+    def __init__(self, options: Background, fitted: MovingObject) -> None:
         super().__init__(**{f.name: getattr(options, f.name) for f in fields(options)})
-        object.__setattr__(self, "_found", found)
+        object.__setattr__(self, "_found", fitted)
 
     @property
     def needs_fit(self) -> bool:

@@ -100,11 +100,11 @@ def apply_filters(
     Returns the filtered frame and the statistics of each filter.
     """
     removals = []
-    for item in filters:
-        before = len(frame)
-        past = history[-(item.window - 1) :] if item.window > 1 else ()
-        mask = item.mask(frame, past)
+    for filter_ in filters:
+        count = len(frame)
+        past = history[-(filter_.window - 1) :] if filter_.window > 1 else ()
+        mask = filter_.mask(frame, past)
         if not mask.all():
             frame = frame.keep(mask)
-        removals.append(Removal(name_of(item), before, before - len(frame)))
+        removals.append(Removal(name_of(filter_), count, count - len(frame)))
     return frame, removals

@@ -39,7 +39,9 @@ class NeighbourDistance(Bounded, Filter):
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
-        return _spread(frame, mean_neighbour_distance(frame.points, self.k) <= self.threshold)
+        return _to_frame_mask(
+            frame, mean_neighbour_distance(frame.points, self.k) <= self.threshold
+        )
 
 
 @part("filter", "neighbour_fraction")
@@ -70,7 +72,7 @@ class NeighbourFraction(Bounded, Filter):
         kept = len(distance) - int(self.fraction * len(distance) + 1e-6)
         keep = np.zeros(len(distance), bool)
         keep[np.argsort(distance, kind="stable")[:kept]] = True
-        return _spread(frame, keep)
+        return _to_frame_mask(frame, keep)
 
 
 def mean_neighbour_distance(points: Float32, k: int) -> Float64:
@@ -87,7 +89,7 @@ def mean_neighbour_distance(points: Float32, k: int) -> Float64:
     return np.sqrt(squares[:, 1:]).mean(1)
 
 
-def _spread(frame: Frame, keep: Bool) -> Bool:
+def _to_frame_mask(frame: Frame, keep: Bool) -> Bool:
     """Scatter the values of the valid points to the shape of the frame."""
     mask = np.zeros(frame.valid.shape, bool)
     mask[frame.valid] = keep

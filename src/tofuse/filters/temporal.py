@@ -59,8 +59,8 @@ def z_deviation(z: Sequence[Float32]) -> Float64:
     NaN where fewer than two images have a value.
     """
     stack = np.asarray(z, np.float64)
-    seen = stack > 0
-    count = seen.sum(0)
-    mean = stack.sum(0, where=seen) / np.maximum(count, 1)
-    squares = ((stack - mean) ** 2).sum(0, where=seen)
+    valid = stack > 0
+    count = valid.sum(0)
+    mean = stack.sum(0, where=valid) / np.maximum(count, 1)
+    squares = ((stack - mean) ** 2).sum(0, where=valid)
     return np.where(count >= 2, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)

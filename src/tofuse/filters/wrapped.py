@@ -17,7 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
 # Number of pixels of a view from which white is estimated, and dark pixels are counted.
-_ASKED = 10_000
+_SAMPLED_PIXELS = 10_000
 # Minimum fraction of the valid pixels that are darker than any material: single ones are noise.
 _MIN_DARK = 0.001
 # Information need not propagate across the image, as wrapped pixels are removed and not corrected.
@@ -32,8 +32,8 @@ class Wrapped(Bounded, Filter):
     Wrapped surfaces appear in free space, and consistently in consecutive views, so that they are
     no outliers. They are detected by their amplitude, which is that of a far surface. Views are
     examined only if some pixels are darker than any material would be at the measured range; then
-    these are removed, and all pixels that `count_periods` finds to be wrapped, with white estimated
-    from the view itself.
+    these are removed, and all pixels that are wrapped according to `count_periods`, with white
+    estimated from the view itself.
 
     Works on cameras with one modulation frequency that record amplitude; other views are unchanged.
 
@@ -50,16 +50,16 @@ class Wrapped(Bounded, Filter):
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         keep = np.ones(frame.valid.shape, bool)
-        known = range_and_amplitude(frame, None)
-        if known is None or not isinstance(frame, RangeFrame):
+        signal = range_and_amplitude(frame, None)
+        if signal is None or not isinstance(frame, RangeFrame):
             return keep
-        radial, amplitude, period = known
-        step = max(1, round(np.sqrt(radial.size / _ASKED)))
-        some, some_amplitude = radial[::step, ::step], amplitude[::step, ::step]
-        white = white_amplitude(some_amplitude, some, some > 0)
-        seen = (some > 0) & (some_amplitude > 0)
-        dark = seen & (some_amplitude * np.square(some) < self.min_albedo * white)
-        if dark.sum() <= _MIN_DARK * seen.sum():
+        radial, amplitude, period = signal
+        step = max(1, round(np.sqrt(radial.size / _SAMPLED_PIXELS)))
+        sampled, sampled_amplitude = radial[::step, ::step], amplitude[::step, ::step]
+        white = white_amplitude(sampled_amplitude, sampled, sampled > 0)
+        valid = (sampled > 0) & (sampled_amplitude > 0)
+        dark = valid & (sampled_amplitude * np.square(sampled) < self.min_albedo * white)
+        if dark.sum() <= _MIN_DARK * valid.sum():
             return keep
         periods = count_periods(radial, amplitude, period, white, pixel_pitch(frame), _OPTIONS)
         return (periods == 0) & (amplitude * np.square(radial) >= self.min_albedo * white)

@@ -31,11 +31,11 @@ class Cloud:
     points
         (N, 3) float32 in m, relative to `offset`.
     normals
-        (N, 3) float32 unit normals towards the cameras that saw them, or None.
+        (N, 3) float32 unit normals towards the cameras that observed them, or None.
     color
         (N, 3) uint8 RGB (amplitude as grey where there is no colour), or None.
     views
-        (N,) int32, number of frames that saw each point.
+        (N,) int32, number of frames that observed each point.
     offset
         (3,) float64.
     sigma
@@ -56,7 +56,7 @@ class Cloud:
         return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
 
     def record(self) -> GeometryRecord:
-        """Return it as the writers of files take it, in the world frame, float64."""
+        """Return the record for file writers, in the world frame, float64."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
         points = self.points.astype(np.float64) + self.offset
         return GeometryRecord(points, normals=self.normals, color=self.color, scalars=scalars)
@@ -75,7 +75,7 @@ class Cloud:
 
     @property
     def diagonal_m(self) -> float:
-        """Of the box around it, m; 0 without points."""
+        """Diagonal of the bounding box, m; 0 without points."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
 
 
@@ -104,13 +104,13 @@ class CloudBuilder:
         """Add a (filtered) view at its pose."""
         if len(frame) == 0:
             return
-        local = frame.points.astype(float)
-        world = se3.transform(T_world_camera, local)
-        towards = (T_world_camera[:3, :3] @ frame.origin + T_world_camera[:3, 3]) - world
-        distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+        points = frame.points.astype(float)
+        world = se3.transform(T_world_camera, points)
+        to_camera = (T_world_camera[:3, :3] @ frame.origin + T_world_camera[:3, 3]) - world
+        distance = np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-9)
         rows = np.zeros((len(world), 13))
         rows[:, 0:3] = world
-        rows[:, 3:6] = towards / distance
+        rows[:, 3:6] = to_camera / distance
         rows[:, 6] = 1
         if frame.color is not None:
             # Black: the colour camera didn't see the point.
@@ -122,7 +122,9 @@ class CloudBuilder:
             rows[:, 12] = 1
         keys = _voxel_keys(world, self.voxel_m)
         keys, sums = _sum_by_key(keys, rows)
-        sums[:, :] /= sums[:, 6:7]  # equal weight for each frame, whatever its pixels in the voxel
+        sums[:, :] /= sums[
+            :, 6:7
+        ]  # equal weight for each frame, however many pixels it has in the voxel
         self._keys.append(keys)
         self._sums.append(sums)
         self._rows += len(keys)
@@ -148,7 +150,7 @@ class CloudBuilder:
         points = sums[:, 0:3] / views[:, None]
         return Cloud(
             points.astype(np.float32),
-            _normals(points, sums[:, 3:6], _NORMAL_NEIGHBOURS) if normals else None,
+            _estimate_normals(points, sums[:, 3:6], _NORMAL_NEIGHBOURS) if normals else None,
             _colors(sums),
             np.round(views).astype(np.int32),
             np.zeros(3),
@@ -163,22 +165,22 @@ def empty_cloud() -> Cloud:
 def as_cloud(frame: Frame, max_points: int) -> CloudFrame:
     """Return the view as a cloud of at most `max_points` points, taken at an even stride.
 
-    Its amplitude is not range-compensated, whatever that of the view is.
+    Its amplitude is not range-compensated, even if that of the view is.
     """
-    part = slice(None, None, max(1, -(-len(frame) // max_points)))
+    stride = slice(None, None, max(1, -(-len(frame) // max_points)))
     amplitude = None if frame.amplitude is None else _raw_amplitude(frame)
 
-    def cut(values: NDArray[Any] | None) -> Any:
-        return None if values is None else values[part].copy()
+    def subsampled(values: NDArray[Any] | None) -> Any:
+        return None if values is None else values[stride].copy()
 
     return CloudFrame(
         frame.index,
         frame.timestamp,
-        cut(frame.points),
-        cut(frame.normals),
-        cut(frame.sigma),
-        cut(amplitude),
-        cut(frame.color),
+        subsampled(frame.points),
+        subsampled(frame.normals),
+        subsampled(frame.sigma),
+        subsampled(amplitude),
+        subsampled(frame.color),
         frame.origin,
     )
 
@@ -188,8 +190,8 @@ def _raw_amplitude(frame: Frame) -> Float32:
     amplitude = frame.amplitude
     assert amplitude is not None
     if isinstance(frame, RangeFrame) and frame.amplitude_kind == "range_compensated":
-        square = np.einsum("ni,ni->n", frame.points, frame.points)
-        return (amplitude / np.maximum(square, 1e-6)).astype(np.float32)
+        squared_range = np.einsum("ni,ni->n", frame.points, frame.points)
+        return (amplitude / np.maximum(squared_range, 1e-6)).astype(np.float32)
     return amplitude
 
 
@@ -210,12 +212,12 @@ def _colors(sums: Float64) -> UInt8 | None:
     rgb, grey = sums[:, 10] > 0, sums[:, 12] > 0
     if not (rgb.any() or grey.any()):
         return None
-    out = np.full((len(sums), 3), 128, np.uint8)
-    out[rgb] = np.round(sums[rgb, 7:10] / sums[rgb, 10:11]).clip(0, 255).astype(np.uint8)
+    colors = np.full((len(sums), 3), 128, np.uint8)
+    colors[rgb] = np.round(sums[rgb, 7:10] / sums[rgb, 10:11]).clip(0, 255).astype(np.uint8)
     grey &= ~rgb
     if grey.any():
-        out[grey] = grey_of(sums[grey, 11] / sums[grey, 12])
-    return out
+        colors[grey] = grey_of(sums[grey, 11] / sums[grey, 12])
+    return colors
 
 
 def grey_of(albedo: Float64) -> UInt8:
@@ -228,20 +230,20 @@ def grey_of(albedo: Float64) -> UInt8:
     return np.repeat(np.round(255 * grey).astype(np.uint8)[:, None], 3, axis=1)
 
 
-def _normals(points: Float64, towards: Float64, neighbours: int) -> Float32 | None:
+def _estimate_normals(points: Float64, to_camera: Float64, neighbours: int) -> Float32 | None:
     from scipy.spatial import cKDTree
 
     k = min(neighbours, len(points))
     if k < 3:
         return None
-    _, near = cKDTree(points).query(points, k=k, workers=thread_count())
+    _, rows = cKDTree(points).query(points, k=k, workers=thread_count())
     out = np.empty((len(points), 3), np.float32)
     for start in range(0, len(points), 50_000):  # bounds the memory of the gathered neighbours
-        part = slice(start, start + 50_000)
-        group = points[near[part]]
-        group = group - group.mean(1, keepdims=True)
-        _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", group, group))
+        chunk = slice(start, start + 50_000)
+        neighbourhood = points[rows[chunk]]
+        neighbourhood = neighbourhood - neighbourhood.mean(1, keepdims=True)
+        _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbourhood, neighbourhood))
         normal = vectors[..., 0]
-        sign = np.where((normal * towards[part]).sum(1) < 0, -1.0, 1.0)
-        out[part] = normal * sign[:, None]
+        sign = np.where((normal * to_camera[chunk]).sum(1) < 0, -1.0, 1.0)
+        out[chunk] = normal * sign[:, None]
     return out

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, UInt8
 
-# Displayed colour of points without one.
+# Displayed colour of points without a colour.
 UNSEEN = (142, 142, 142)
 
 
@@ -17,6 +17,6 @@ def has_color(colors: UInt8) -> Bool:
 
 def seen_colors(colors: UInt8) -> UInt8:
     """Return colours (N, 3) with a neutral grey for unknown ones."""
-    out = colors.copy()
-    out[~has_color(colors)] = UNSEEN
-    return out
+    shown = colors.copy()
+    shown[~has_color(colors)] = UNSEEN
+    return shown

@@ -11,12 +11,12 @@ from tofuse.arrays import Float32, Float64, Int32, Intp
 # The library collapses edges in 100 passes: in pass k those with an error, the sum of squared
 # distances from planes, below 1e-9 (k + 3) ** _GROWTH. So the limit of a distance starts at 1.6e-4
 # and grows 200-fold. With a slow growth edges are collapsed nearly in the order of their errors.
-_GROWTH = 3
+_AGGRESSIVENESS = 3
 # Unit of length in the library, relative to the spacing of the vertices: the limit starts at 3 % of
 # the spacing, whatever the size of the object.
-_UNIT = 200.0
-# If these passes are not enough, more follow with a larger unit, unless they remove hardly any.
-_LARGER, _MIN_REMOVED = 100.0, 0.1
+_UNITS_PER_SPACING = 200.0
+# If these passes do not suffice, more follow with a larger unit, unless they remove hardly any.
+_UNIT_FACTOR, _MIN_REMOVED = 100.0, 0.1
 
 # The library's state is global.
 _LOCK = Lock()
@@ -25,7 +25,7 @@ _LOCK = Lock()
 def collapse_edges(
     vertices: Float32, faces: Int32, count: int, spacing: float
 ) -> tuple[Intp, Float64]:
-    """Collapse edges until at most `count` triangles are left, or more can't be removed.
+    """Collapse edges until at most `count` triangles remain, or no more can be removed.
 
     Parameters
     ----------
@@ -42,34 +42,38 @@ def collapse_edges(
     -------
     group
         (N,) number of the group of vertices that were merged into one.
-    places
+    positions
         (G, 3) position of each group, m.
     """
     from fast_simplification import simplify  # slow to import
 
-    middle = vertices.mean(0, dtype=float)
-    places = vertices - middle
-    into = np.arange(len(vertices))
-    unit = _UNIT * spacing
+    centroid = vertices.mean(0, dtype=float)
+    positions = vertices - centroid
+    merged_into = np.arange(len(vertices))
+    unit = _UNITS_PER_SPACING * spacing
     while len(faces) > count:
         with _LOCK:
-            moved, left, collapses = simplify(
-                places / unit, faces, target_count=count, agg=_GROWTH, return_collapses=True
+            new_positions, remaining, collapses = simplify(
+                positions / unit,
+                faces,
+                target_count=count,
+                agg=_AGGRESSIVENESS,
+                return_collapses=True,
             )
         parent = np.arange(len(vertices))
         parent[collapses[:, 1]] = collapses[:, 0]
         while (parent[parent] != parent).any():
             parent = parent[parent]
-        into = parent[into]
-        enough = len(left) <= max(count, (1 - _MIN_REMOVED) * len(faces))
-        # The library numbers the vertices that are left in the order of their old numbers.
+        merged_into = parent[merged_into]
+        reduced = len(remaining) <= max(count, (1 - _MIN_REMOVED) * len(faces))
+        # The library numbers the remaining vertices in the order of their old numbers.
         faces = with_distinct_corners(parent[faces])
-        places[np.unique(faces)] = moved * unit
-        if not enough:
+        positions[np.unique(faces)] = new_positions * unit
+        if not reduced:
             break
-        unit *= _LARGER
-    kept, group = np.unique(into, return_inverse=True)
-    return group, places[kept] + middle
+        unit *= _UNIT_FACTOR
+    kept, group = np.unique(merged_into, return_inverse=True)
+    return group, positions[kept] + centroid
 
 
 def with_distinct_corners(faces: Intp) -> Int32:

@@ -43,8 +43,8 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
     path
         The file.
     R_up_world
-        (3, 3) rotation from the world to axes with y up, used for glTF, OBJ, STL and USDZ; unless
-        given, the axes of the first camera.
+        (3, 3) rotation from the world to axes with y up, used for glTF, OBJ, STL and USDZ; by
+        default the axes of the first camera.
 
     Raises
     ------
@@ -83,21 +83,21 @@ def to_open3d(record: GeometryRecord) -> Any:
     o3d = _library("open3d")
     vector = o3d.utility.Vector3dVector
     if record.faces is None:
-        out = o3d.geometry.PointCloud(vector(record.points))
+        geometry = o3d.geometry.PointCloud(vector(record.points))
         prefix = ""
     else:
         triangles = o3d.utility.Vector3iVector(record.faces)
-        out = o3d.geometry.TriangleMesh(vector(record.points), triangles)
+        geometry = o3d.geometry.TriangleMesh(vector(record.points), triangles)
         prefix = "vertex_"
     if record.normals is not None:
-        setattr(out, f"{prefix}normals", vector(record.normals.astype(float)))
+        setattr(geometry, f"{prefix}normals", vector(record.normals.astype(float)))
     if record.color is not None:
-        setattr(out, f"{prefix}colors", vector(record.color / 255.0))
-    return out
+        setattr(geometry, f"{prefix}colors", vector(record.color / 255.0))
+    return geometry
 
 
 def _for_display(mesh: GeometryRecord, R: Float64) -> GeometryRecord:
-    """A mesh in other axes, with its texture or else its colours as displayed."""
+    """A mesh in other axes, with its texture or else its display colours."""
     return GeometryRecord(
         mesh.points @ R.T,
         mesh.faces,

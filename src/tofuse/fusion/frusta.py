@@ -27,7 +27,7 @@ class Frusta:
     spans
         (N, 4) minimum x/z and y/z, and maximum.
     far
-        (N,) largest z that a view affects, m; 0 for empty views.
+        (N,) maximum z that a view affects, m; 0 for empty views.
     """
 
     T_camera_world: Float64
@@ -54,19 +54,19 @@ class Frusta:
     def touching(self, low: Float64, high: Float64) -> Bool:
         """Return which views (N,) may affect the box from `low` to `high` (3,), m.
 
-        The test is conservative: no view that does is missing.
+        The test is conservative: no such view is missed.
         """
         R, t = self.T_camera_world[:, :3, :3], self.T_camera_world[:, :3, 3]
-        middle, half = R @ (0.5 * (low + high)) + t, 0.5 * (high - low)
-        ahead = middle[:, 2] - np.abs(R[:, 2]) @ half
-        out = (self.far > 0) & (ahead <= self.far)
-        one = np.ones(len(out))
+        centre, half_size = R @ (0.5 * (low + high)) + t, 0.5 * (high - low)
+        min_z = centre[:, 2] - np.abs(R[:, 2]) @ half_size
+        touching = (self.far > 0) & (min_z <= self.far)
+        ones = np.ones(len(touching))
         for axis in range(2):
             for side, sign in ((0, -1.0), (2, 1.0)):
                 # Points outside of a side plane have n . p > 0.
-                n = np.zeros((len(out), 3))
-                n[:, axis], n[:, 2] = sign * one, -sign * self.spans[:, side + axis]
-                reach = np.abs(np.einsum("ni,nij->nj", n, R)) @ half
-                out &= np.einsum("ni,ni->n", n, middle) <= reach
-        # Nothing behind the camera is seen.
-        return out & (middle[:, 2] + np.abs(R[:, 2]) @ half > 0)
+                n = np.zeros((len(touching), 3))
+                n[:, axis], n[:, 2] = sign * ones, -sign * self.spans[:, side + axis]
+                radius = np.abs(np.einsum("ni,nij->nj", n, R)) @ half_size
+                touching &= np.einsum("ni,ni->n", n, centre) <= radius
+        # Nothing behind the camera is visible.
+        return touching & (centre[:, 2] + np.abs(R[:, 2]) @ half_size > 0)

@@ -3,7 +3,7 @@
 The blocks of all views are laid out first, so that their order depends on the surfaces alone. If
 they exceed the memory, they are bisected recursively into boxes, which are fused one at a time. One
 layer of blocks around a box is fused with it: cells of the surface extend into the adjacent block
-and no farther, so the surface of a box's own cells is the same as if all blocks were fused jointly.
+and no farther, so the surface of the box's cells is the same as if all blocks were fused jointly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tofuse.kernels.tsdf import near_cubes
 
 _CHUNKS = 16
 # Far from surfaces, free space is integrated of at most every 4th view, with a weight of 4, as
-# hundreds of views that see through a place are redundant. The stride grows by 1 per 32 views.
+# hundreds of views through the same free space are redundant. The stride grows by 1 per 32 views.
 _MAX_STRIDE, _VIEWS_PER_STRIDE = 4, 32
 # Spacing of samples along a normal: as a fraction of a block's edge, and of an eighth's.
 _BLOCK_SPACING, CUBE_SPACING = 0.34, 0.6
@@ -42,15 +42,15 @@ class Region:
     Attributes
     ----------
     rows
-        (B,) rows of the layout's keys: the region's own, ascending, then the layer around.
-    own
-        Number of the region's own blocks.
+        (B,) rows of the layout's keys: those owned, ascending, then the layer around them.
+    owned
+        Number of blocks that the region owns.
     low, high
-        (3,) corners of the box around all of them, in blocks.
+        (3,) corners of the bounding box of all of them, in blocks.
     """
 
     rows: Int64
-    own: int
+    owned: int
     low: Int64
     high: Int64
 
@@ -80,8 +80,8 @@ class Layout:
     @classmethod
     def of(cls, views: Views, poses: Float64, voxel_m: float) -> Layout:
         """Lay out the blocks near the surfaces of views at their poses (N, 4, 4)."""
-        known = summaries(views)
-        noise = [each.sigma_m for each in known if each.sigma_m > 0]
+        view_summaries = summaries(views)
+        noise = [summary.sigma_m for summary in view_summaries if summary.sigma_m > 0]
         sigma = float(np.median(noise)) if noise else 0.0
         free_space_stride = int(np.clip(len(views) // _VIEWS_PER_STRIDE, 1, _MAX_STRIDE))
         reach = voxel_m * float(
@@ -96,7 +96,7 @@ class Layout:
             voxel_m,
             reach,
             keys,
-            max((each.channels for each in known), default=0),
+            max((summary.channels for summary in view_summaries), default=0),
             free_space_stride,
         )
 
@@ -105,8 +105,8 @@ class Layout:
         """Memory of a block while it is fused."""
         return VOXELS * (_VOXEL_BYTES + 4 * self.channels) + _BLOCK_BYTES
 
-    def whole(self) -> Region:
-        """All blocks as one region."""
+    def single_region(self) -> Region:
+        """All blocks as a single region."""
         return Region(
             np.arange(len(self.keys)), len(self.keys), np.full(3, -HALF), np.full(3, HALF)
         )
@@ -115,53 +115,55 @@ class Layout:
         """Bisect the blocks into boxes of at most `max_blocks`, the layer around included.
 
         A box with more is cut into halves of nearly equal numbers of blocks, across its longest
-        side. A single block is not cut, however many are around it.
+        side. A single block is not cut, however large the layer around it.
         """
         if len(self.keys) <= max_blocks:
-            return [self.whole()]
-        places = _places(self.keys)
-        out = []
-        everything = np.arange(len(self.keys))
-        waiting = [(everything, everything)]
-        while waiting:
-            own, around = waiting.pop()
-            region = _with_layer(own, around, places)
-            if len(region.rows) <= max_blocks or len(own) == 1:
-                out.append(region)
+            return [self.single_region()]
+        coordinates = _coordinates(self.keys)
+        boxes = []
+        all_rows = np.arange(len(self.keys))
+        pending = [(all_rows, all_rows)]
+        while pending:
+            owned, candidates = pending.pop()
+            region = _with_layer(owned, candidates, coordinates)
+            if len(region.rows) <= max_blocks or len(owned) == 1:
+                boxes.append(region)
             else:
-                waiting += [(half, region.rows) for half in reversed(_halves(own, places))]
-        return out
+                pending += [(half, region.rows) for half in reversed(_halves(owned, coordinates))]
+        return boxes
 
 
-def _places(keys: Int64) -> Int32:
-    """Return the places (B, 3) of blocks, in blocks, by their keys."""
+def _coordinates(keys: Int64) -> Int32:
+    """Return the grid coordinates (B, 3) of blocks by their keys."""
     return np.stack([((keys >> s) & (2 * HALF - 1)) - HALF for s in (42, 21, 0)], 1).astype(
         np.int32
     )
 
 
-def _halves(own: Int64, places: Int32) -> list[Int64]:
+def _halves(owned: Int64, coordinates: Int32) -> list[Int64]:
     """Return the rows of both halves of a box."""
-    inside = places[own]
-    axis = int(np.ptp(inside, axis=0).argmax())
-    along = inside[:, axis]
-    middle = np.median(along)
-    first = along < middle
-    if not first.any():  # at least half of them are in the first layer
-        first = along <= middle
-    return [own[first], own[~first]]
+    box = coordinates[owned]
+    axis = int(np.ptp(box, axis=0).argmax())
+    coordinate = box[:, axis]
+    median = np.median(coordinate)
+    lower = coordinate < median
+    if not lower.any():  # at least half of the blocks are in the first layer
+        lower = coordinate <= median
+    return [owned[lower], owned[~lower]]
 
 
-def _with_layer(own: Int64, around: Int64, places: Int32) -> Region:
-    """Return a box with the layer of blocks around it, which are among the rows `around`."""
-    low = places[own].min(0).astype(np.int64) - 1
-    high = places[own].max(0).astype(np.int64) + 2
-    within = around[((places[around] >= low) & (places[around] < high)).all(1)]
-    return Region(np.concatenate([own, np.setdiff1d(within, own)]), len(own), low, high)
+def _with_layer(owned: Int64, candidates: Int64, coordinates: Int32) -> Region:
+    """Return a box with the layer of blocks around it, taken from the rows `candidates`."""
+    low = coordinates[owned].min(0).astype(np.int64) - 1
+    high = coordinates[owned].max(0).astype(np.int64) + 2
+    in_box = candidates[
+        ((coordinates[candidates] >= low) & (coordinates[candidates] < high)).all(1)
+    ]
+    return Region(np.concatenate([owned, np.setdiff1d(in_box, owned)]), len(owned), low, high)
 
 
 def _surface_blocks(
-    views: Views, poses: Float64, block_m: float, reach: float, free_space_stride: int
+    views: Views, poses: Float64, block_m: float, reach_m: float, free_space_stride: int
 ) -> Int64:
     """Return the keys of the blocks near surfaces, ascending."""
 
@@ -169,7 +171,7 @@ def _surface_blocks(
         table, count = np.full(1 << 12, EMPTY, np.int64), 0
         for k in range(start, stop):
             keys = cubes_near(
-                views[k], poses[k], block_m, reach, _BLOCK_SPACING, k, min(free_space_stride, 2)
+                views[k], poses[k], block_m, reach_m, _BLOCK_SPACING, k, min(free_space_stride, 2)
             )
             table, count = enter(table, count, keys)
         return table[table != EMPTY]
@@ -183,7 +185,7 @@ def cubes_near(
     view: RangeView,
     T_world_camera: Float64,
     cube_m: float,
-    reach: float,
+    reach_m: float,
     spacing: float,
     number: int,
     stride: int,
@@ -194,7 +196,7 @@ def cubes_near(
     ----------
     view, T_world_camera
         The view and its (4, 4) pose.
-    cube_m, reach
+    cube_m, reach_m
         Edge of the cubes and truncation distance, m.
     spacing
         Of samples along a normal, as a fraction of the edge.
@@ -207,7 +209,7 @@ def cubes_near(
         view.stored,
         T_world_camera,
         cube_m,
-        reach,
+        reach_m,
         spacing,
         (number % stride, number // stride % stride),
         stride,

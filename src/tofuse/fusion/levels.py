@@ -1,9 +1,9 @@
 """Levels of detail of a surface, cut into tiles, for display at any distance.
 
-Level 0 is the surface. Each further one merges the vertices in cubes twice as large (see
-`Mesh.simplified`), of the whole surface, and only then is it cut. So tiles of one level share the
-vertices at their borders, without cracks between them. Tiles grow with the cubes: eight of a level
-are in one of the next.
+Level 0 is the surface. Each further one merges the vertices of the full surface in cubes twice as
+large (see `Mesh.simplified`), and is split only then. So tiles of one level share the vertices at
+their borders, without cracks between them. Tiles grow with the cubes: eight of a level are in one
+of the next.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Level:
     error_m
         Edge of the cubes whose vertices are merged, m, which bounds the error; 0 for level 0.
     mesh
-        The whole level.
+        The mesh of all tiles.
     order, places, ends
         (M,) faces sorted by tile; place of each tile, in tiles; (T,) end of its faces.
     """
@@ -47,10 +47,10 @@ class Level:
     ends: Int64
 
     def tiles(self) -> Iterator[tuple[Place, Mesh]]:
-        """Yield each tile, with vertices of its own."""
+        """Yield each tile, with separate vertices."""
         starts = np.concatenate([[0], self.ends])[:-1]
         for place, start, end in zip(self.places, starts, self.ends, strict=True):
-            yield place, _part(self.mesh, self.order[start:end])
+            yield place, _submesh(self.mesh, self.order[start:end])
 
 
 def levels(mesh: Mesh) -> Iterator[Level]:
@@ -61,7 +61,9 @@ def levels(mesh: Mesh) -> Iterator[Level]:
     edge = max(mesh.spacing, 1e-6 * size, 1e-9)
     number, error = 0, 0.0
     while True:
-        level = _cut(number, error, mesh, origin, _TRIANGLES_PER_EDGE * edge * 2**number)
+        level = _split_into_tiles(
+            number, error, mesh, origin, _TRIANGLES_PER_EDGE * edge * 2**number
+        )
         yield level
         if len(level.places) <= 1:
             return
@@ -70,19 +72,21 @@ def levels(mesh: Mesh) -> Iterator[Level]:
         mesh = mesh.simplified(error)
 
 
-def _cut(number: int, error_m: float, mesh: Mesh, origin: Float64, size: float) -> Level:
+def _split_into_tiles(
+    number: int, error_m: float, mesh: Mesh, origin: Float64, size: float
+) -> Level:
     """Assign each face to the tile of its centroid."""
     key, extents = np.zeros(len(mesh.faces), np.int64), []
     for axis in range(3):
-        along = mesh.vertices[:, axis].astype(float)
+        coordinate = mesh.vertices[:, axis].astype(float)
         a, b, c = mesh.faces.T
-        middle = (along[a] + along[b] + along[c]) / 3
+        centroid = (coordinate[a] + coordinate[b] + coordinate[c]) / 3
         # Faces that merging moved outside stay with their neighbours.
-        place = np.maximum(np.floor((middle - origin[axis]) / size), 0).astype(np.int64)
+        place = np.maximum(np.floor((centroid - origin[axis]) / size), 0).astype(np.int64)
         extents.append(int(place.max(initial=0)) + 1)
         key = key * extents[-1] + place
-    found, counts = np.unique(key, return_counts=True)
-    places = np.stack(np.unravel_index(found, extents), 1).tolist()
+    tile_keys, counts = np.unique(key, return_counts=True)
+    places = np.stack(np.unravel_index(tile_keys, extents), 1).tolist()
     return Level(
         number,
         error_m,
@@ -93,8 +97,8 @@ def _cut(number: int, error_m: float, mesh: Mesh, origin: Float64, size: float) 
     )
 
 
-def _part(mesh: Mesh, faces: Int64) -> Mesh:
-    """Return some faces with their vertices."""
+def _submesh(mesh: Mesh, faces: Int64) -> Mesh:
+    """Return a subset of the faces with their vertices."""
     used, place = np.unique(mesh.faces[faces], return_inverse=True)
     return replace(
         mesh,

@@ -19,14 +19,15 @@ from tofuse.kernels.clustering import flatten_groups, has_area, number_keys, pla
 
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
-# Triangles from which the mean size is estimated.
+# Maximum number of triangles from which the mean size is estimated.
 _MAX_SAMPLED = 100_000
-# Triangles whose edges are collapsed at once: about 0.4 GB of memory, which the library keeps.
+# Maximum number of triangles whose edges are collapsed at a time: about 0.4 GB of memory, which the
+# library keeps.
 _MAX_COLLAPSED = 1_000_000
-# Smallest height of a triangle relative to its longest edge: below it, float32 leaves no normal.
+# Minimum height of a triangle relative to its longest edge: below it, float32 leaves no normal.
 _MIN_HEIGHT = 1e-6
 # Vertices with a smaller cosine between their normals are on different sides of a thin sheet.
-_BEHIND = -0.3
+_MAX_OPPOSITE_COSINE = -0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Mesh:
         (N,) float32 standard deviation of each vertex along its normal, m, from the noise of the
         views; and from the errors of their poses once these are estimated (`pose_errors`).
     views
-        (N,) int32, number of views that saw it.
+        (N,) int32, number of views that observed each vertex.
     offset
         (3,) float64.
     """
@@ -67,7 +68,7 @@ class Mesh:
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
 
     def record(self) -> GeometryRecord:
-        """Return it as the writers of files take it, in the world frame, float64."""
+        """Return the record for file writers, in the world frame, float64."""
         scalars = {"views": self.views, "sigma": self.sigma}
         points = self.vertices.astype(np.float64) + self.offset
         return GeometryRecord(points, self.faces, self.normals, self.color, scalars=scalars)
@@ -93,11 +94,11 @@ class Mesh:
         kept = self.faces[faces]
         used = np.zeros(len(self), bool)
         used[kept.ravel()] = True
-        place = np.cumsum(used, dtype=np.int32) - 1
+        new_row = np.cumsum(used, dtype=np.int32) - 1
         return replace(
             self,
             vertices=self.vertices[used],
-            faces=place[kept].astype(np.int32).reshape(-1, 3),
+            faces=new_row[kept].astype(np.int32).reshape(-1, 3),
             normals=self.normals[used],
             color=None if self.color is None else self.color[used],
             sigma=self.sigma[used],
@@ -107,10 +108,10 @@ class Mesh:
     @property
     def spacing(self) -> float:
         """Edge of a square of two triangles of the mean area, m."""
-        some = self.faces[:: max(1, -(-len(self.faces) // _MAX_SAMPLED))]
-        a, b, c = (self.vertices[some[:, k]] for k in range(3))
-        across = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        return float(np.sqrt(across.mean(dtype=float))) if len(some) else 0.0
+        sampled = self.faces[:: max(1, -(-len(self.faces) // _MAX_SAMPLED))]
+        a, b, c = (self.vertices[sampled[:, k]] for k in range(3))
+        double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(np.sqrt(double_area.mean(dtype=float))) if len(sampled) else 0.0
 
     def without_islands(self, min_vertices: int) -> Mesh:
         """Return the mesh without connected pieces of fewer than `min_vertices` vertices."""
@@ -127,20 +128,20 @@ class Mesh:
         Each gets a new vertex at its centroid, with 0 views, and a `sigma` of the hole's radius.
         Outer borders are no holes.
         """
-        ends = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-        border = ends[~np.isin(ends @ [len(self), 1], ends @ [1, len(self)])]
+        half_edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        border = half_edges[~np.isin(half_edges @ [len(self), 1], half_edges @ [1, len(self)])]
         vertices: list[tuple[Int64, Float64, float]] = []
         faces: list[Int64] = []
         for rim in _loops(border):
             p = self.vertices[rim].astype(float)
             length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
-            middle = p.mean(0)
-            fan = np.cross(np.roll(p, -1, 0) - middle, p - middle).sum(0)
-            if length > max_border_m or fan @ self.normals[rim].sum(0) <= 0:
+            centroid = p.mean(0)
+            fan_normal = np.cross(np.roll(p, -1, 0) - centroid, p - centroid).sum(0)
+            if length > max_border_m or fan_normal @ self.normals[rim].sum(0) <= 0:
                 continue
-            new = np.full(len(rim), len(self) + len(vertices))
-            faces.append(np.stack([np.roll(rim, -1), rim, new], -1))
-            vertices.append((rim, middle, length))
+            apex = np.full(len(rim), len(self) + len(vertices))
+            faces.append(np.stack([np.roll(rim, -1), rim, apex], -1))
+            vertices.append((rim, centroid, length))
         if not vertices:
             return self
         normals = np.array([self.normals[loop].sum(0, dtype=float) for loop, _, _ in vertices])
@@ -165,9 +166,9 @@ class Mesh:
     def decimated(self, faces: int) -> Mesh:
         """Return the mesh reduced to at most `faces` triangles by collapsing edges.
 
-        A vertex has the mean normal, known colour and variance of the vertices merged into it, and
-        the largest of their numbers of views. Very large meshes are first reduced by `clustered`,
-        which takes less memory; as are those of so many pieces that edges are not enough.
+        A vertex has the mean normal, colour and variance of the vertices merged into it, and their
+        maximum number of views. Very large meshes are first reduced by `clustered`, which takes
+        less memory; as are those of too many pieces for collapsing edges to suffice.
         """
         if len(self.faces) <= faces:
             return self
@@ -176,36 +177,38 @@ class Mesh:
             mesh = mesh.clustered(max(faces, _MAX_COLLAPSED))._without_degenerate()
         if len(mesh.faces) <= faces:
             return mesh
-        group, places = collapse_edges(mesh.vertices, mesh.faces, faces, mesh.spacing)
-        left = with_distinct_corners(group[mesh.faces])
-        if len(left) <= faces:
-            small = mesh._merged(group, np.bincount(group), left, places)
+        group, positions = collapse_edges(mesh.vertices, mesh.faces, faces, mesh.spacing)
+        remaining = with_distinct_corners(group[mesh.faces])
+        if len(remaining) <= faces:
+            reduced = mesh._merge_groups(group, np.bincount(group), remaining, positions)
         else:
-            small = mesh.clustered(faces)
-        return small._without_degenerate()
+            reduced = mesh.clustered(faces)
+        return reduced._without_degenerate()
 
     def _without_degenerate(self) -> Mesh:
         """Return the mesh of the triangles that have an area and are finite."""
-        good = np.empty(len(self.faces), bool)
-        has_area(self.vertices, self.faces, _MIN_HEIGHT, good)
-        return self.rows(good)
+        valid = np.empty(len(self.faces), bool)
+        has_area(self.vertices, self.faces, _MIN_HEIGHT, valid)
+        return self.rows(valid)
 
     def clustered(self, faces: int) -> Mesh:
         """Return the mesh simplified to at most `faces` triangles: faster than `decimated`."""
         if len(self.faces) <= faces:
             return self
-        some = self.faces[:: -(-len(self.faces) // _MAX_SAMPLED)]
-        a, b, c = (self.vertices[some[:, k]] for k in range(3))
-        across = np.cross(b - a, c - a)
-        area = 0.5 * float(np.linalg.norm(across, axis=1).mean(dtype=float)) * len(self.faces)
+        sampled = self.faces[:: -(-len(self.faces) // _MAX_SAMPLED)]
+        a, b, c = (self.vertices[sampled[:, k]] for k in range(3))
+        cross = np.cross(b - a, c - a)
+        area = 0.5 * float(np.linalg.norm(cross, axis=1).mean(dtype=float)) * len(self.faces)
         cell = float(np.sqrt(2 * area / faces))  # two triangles a cell, if it is flat
         while True:
-            group, count = self._groups(cell)
-            left = with_distinct_corners(group[self.faces])
-            if len(left) <= faces:
-                return self._merged(group, count, left, self._places(group, count, cell))
-            # A larger step than for a flat surface.
-            cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
+            group, count = self._cluster(cell)
+            remaining = with_distinct_corners(group[self.faces])
+            if len(remaining) <= faces:
+                return self._merge_groups(
+                    group, count, remaining, self._optimal_positions(group, count, cell)
+                )
+            # A larger step than a flat surface would need.
+            cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
 
     def simplified(self, cell_m: float) -> Mesh:
         """Return the mesh simplified by clustering vertices in the cells of a grid.
@@ -221,70 +224,74 @@ class Mesh:
         """
         if len(self) == 0:
             return self
-        group, count = self._groups(cell_m)
-        left = with_distinct_corners(group[self.faces])
-        return self._merged(group, count, left, self._places(group, count, cell_m))
+        group, count = self._cluster(cell_m)
+        remaining = with_distinct_corners(group[self.faces])
+        return self._merge_groups(
+            group, count, remaining, self._optimal_positions(group, count, cell_m)
+        )
 
-    def _groups(self, cell_m: float) -> tuple[Intp, Intp]:
+    def _cluster(self, cell_m: float) -> tuple[Intp, Intp]:
         """Return the group of each vertex (N,), and the size of each group (G,)."""
         key = np.zeros(len(self), np.int64)
-        for along in self.vertices.T:  # one axis at a time takes a third of the memory
-            cell = np.floor(along.astype(float) / cell_m).astype(np.int64)
+        for coordinate in self.vertices.T:  # one axis at a time takes a third of the memory
+            cell = np.floor(coordinate.astype(float) / cell_m).astype(np.int64)
             cell -= cell.min()
             key = key * (cell.max() + 1) + cell
         number = np.empty(len(key), np.int64)
         first = number_keys(key, number)
         order = np.argsort(key[first])
-        place = np.empty(len(order), np.intp)
-        place[order] = np.arange(len(order))
+        rank = np.empty(len(order), np.intp)
+        rank[order] = np.arange(len(order))
         # The sides of a thin sheet stay separate.
-        behind = np.einsum("ni,ni->n", self.normals, self.normals[first[number]]) < _BEHIND
-        side = 2 * place[number] + behind
+        behind = (
+            np.einsum("ni,ni->n", self.normals, self.normals[first[number]]) < _MAX_OPPOSITE_COSINE
+        )
+        side = 2 * rank[number] + behind
         count = np.bincount(side, minlength=2 * len(order))
         return (np.cumsum(count > 0) - 1)[side], count[count > 0]
 
-    def _merged(self, group: Intp, count: Intp, faces: Int32, places: Float64) -> Mesh:
-        """Return the mesh of groups (N,) of vertices, of sizes (G,), at places (G, 3), m."""
+    def _merge_groups(self, group: Intp, count: Intp, faces: Int32, positions: Float64) -> Mesh:
+        """Return the mesh of groups (N,) of vertices, of sizes (G,), at positions (G, 3), m."""
         normals = _means(self.normals, group, count)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
-        most = np.zeros(len(count), np.int32)
-        np.maximum.at(most, group, self.views)
+        max_views = np.zeros(len(count), np.int32)
+        np.maximum.at(max_views, group, self.views)
         merged = Mesh(
-            places.astype(np.float32),
+            positions.astype(np.float32),
             faces,
             normals.astype(np.float32),
             self._mean_color(group, len(count)),
             np.sqrt(_means(self.sigma.astype(float) ** 2, group, count)).astype(np.float32),
-            most,
+            max_views,
             self.offset,
         )
         return merged.rows(np.ones(len(faces), bool))
 
     def _mean_color(self, group: Intp, groups: int) -> UInt8 | None:
-        """Return the mean (G, 3) of the known colours of each group; black without any."""
+        """Return the mean (G, 3) of the colours of each group; black if none has a colour."""
         if self.color is None:
             return None
-        known = has_color(self.color)
-        count = np.maximum(np.bincount(group[known], minlength=groups), 1)
-        sums = [np.bincount(group[known], c[known].astype(float), groups) for c in self.color.T]
+        colored = has_color(self.color)
+        count = np.maximum(np.bincount(group[colored], minlength=groups), 1)
+        sums = [np.bincount(group[colored], c[colored].astype(float), groups) for c in self.color.T]
         return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
 
-    def _places(self, group: Intp, count: Intp, cell_m: float) -> Float64:
-        """Return the place (G, 3) of each group by least squares on the planes of its triangles.
+    def _optimal_positions(self, group: Intp, count: Intp, cell_m: float) -> Float64:
+        """Return the position (G, 3) of each group by least squares on its triangles' planes.
 
         Unconstrained directions stay at the centroid; the step is at most half a cell.
         """
-        middles = _means(self.vertices, group, count)
-        A = np.zeros((len(middles), 3, 3))
-        b = np.zeros((len(middles), 3))
-        plane_sums(self.vertices, self.faces, group, middles, A, b)
+        centroids = _means(self.vertices, group, count)
+        A = np.zeros((len(centroids), 3, 3))
+        b = np.zeros((len(centroids), 3))
+        plane_sums(self.vertices, self.faces, group, centroids, A, b)
         A += np.triu(A, 1).transpose(0, 2, 1)
         trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
         step = np.linalg.solve(A + _DAMPING * trace[:, None, None] * np.eye(3), b[..., None])[
             ..., 0
         ]
-        return middles + step.clip(-0.5 * cell_m, 0.5 * cell_m)
+        return centroids + step.clip(-0.5 * cell_m, 0.5 * cell_m)
 
 
 def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
@@ -298,24 +305,24 @@ def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
 
 def _loops(edges: Int64) -> list[Int64]:
     """Return the loops of directed edges (K, 2); several through one vertex are separated."""
-    follow: dict[int, list[int]] = {}
+    successors: dict[int, list[int]] = {}
     for a, b in edges.tolist():
-        follow.setdefault(a, []).append(b)
-    found = []
-    for start in list(follow):
-        path, place = [start], {start: 0}
+        successors.setdefault(a, []).append(b)
+    loops = []
+    for start in list(successors):
+        path, position = [start], {start: 0}
         while path:
-            if not follow.get(path[-1]):
-                del place[path.pop()]
+            if not successors.get(path[-1]):
+                del position[path.pop()]
                 continue
-            following = follow[path[-1]].pop()
-            if following in place:
-                loop = path[place[following] :]
-                found.append(np.array(loop))
+            successor = successors[path[-1]].pop()
+            if successor in position:
+                loop = path[position[successor] :]
+                loops.append(np.array(loop))
                 for vertex in loop[1:]:
-                    del place[vertex]
-                del path[place[following] + 1 :]
+                    del position[vertex]
+                del path[position[successor] + 1 :]
             else:
-                place[following] = len(path)
-                path.append(following)
-    return [loop for loop in found if len(loop) > 2]
+                position[successor] = len(path)
+                path.append(successor)
+    return [loop for loop in loops if len(loop) > 2]

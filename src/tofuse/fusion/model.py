@@ -49,7 +49,7 @@ class ModelBuilder:
     options
         How views are fused.
     spill
-        The store of views; by default a tenth of the memory for voxels, the rest on disk.
+        The store of views; by default a tenth of the memory for voxels, the others on disk.
     """
 
     def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
@@ -116,21 +116,21 @@ class ModelBuilder:
             )
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
         views = self._ranges.of(poses)
-        wrong = any(errors.values())
-        if wrong:
+        has_errors = any(errors.values())
+        if has_errors:
             views = views.corrected(errors)
-        at = np.array([poses[each.index] for each in views.summaries], float)
-        mesh = fuse_surface(views, at, self._options, advance)
+        T_world_camera = np.array([poses[summary.index] for summary in views.summaries], float)
+        mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
-            model = Model(mesh.cloud(), self._finished(mesh))
+            model = Model(mesh.cloud(), self._postprocessed(mesh))
         else:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)
-        if wrong:
+        if has_errors:
             views.drop()
         return model
 
-    def _finished(self, mesh: Mesh) -> Mesh:
+    def _postprocessed(self, mesh: Mesh) -> Mesh:
         """Return the surface with small holes closed, and decimated."""
         if self._options.holes_m:
             mesh = mesh.without_holes(self._options.holes_m)
@@ -139,15 +139,15 @@ class ModelBuilder:
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
         """Return a cloud at other poses for display, without normals for images.
 
-        It is made of some evenly spaced images, and of some pixels of each.
+        It consists of evenly spaced images, and of evenly spaced pixels of each.
         """
         if len(self._clouds):
             return self._average(self._clouds.of(poses), poses, self._voxel_m)
         ranges = self._ranges.of(poses)
-        some = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCH_VIEWS)))
+        sampled = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCH_VIEWS)))
         voxel = self._range_voxel
-        sketched = (ranges[k].as_cloud(_SKETCH_PIXELS) for k in some)
-        return self._average(sketched, poses, voxel, normals=False)
+        clouds = (ranges[k].as_cloud(_SKETCH_PIXELS) for k in sampled)
+        return self._average(clouds, poses, voxel, normals=False)
 
     @property
     def _range_voxel(self) -> float:

@@ -10,7 +10,7 @@ from tofuse.bounds import Bounded, Bounds
 
 @dataclass(frozen=True)
 class Fusion(Bounded):
-    """How posed views become one model: a cloud, and for images a surface.
+    """How posed views are fused into a model: a cloud, and for images a surface.
 
     Attributes
     ----------
@@ -18,13 +18,13 @@ class Fusion(Bounded):
         Edge of a voxel, m; None chooses the distance between neighbouring pixels at the median
         depth, which keeps the resolution of the sensor, or 0.4 % of that depth if that is more.
     min_views
-        Minimum number of frames that saw a point of the model.
+        Minimum number of frames that observed a point of the model.
     island
         Connected pieces of the surface with fewer vertices are removed.
     memory_mb
-        Maximum memory for the voxels: beyond it, the model is made region by region, with the same
-        result. A tenth as much may be used for stored views; what does not fit is on disk until it
-        is fused.
+        Maximum memory for the voxels: beyond it, the model is fused region by region, with the
+        same result. A tenth as much may be used for stored views; those that do not fit are on
+        disk until they are fused.
     holes_m
         Holes in the surface with a border no longer than this are closed; 0 closes none.
     faces

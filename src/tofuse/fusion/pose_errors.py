@@ -14,10 +14,10 @@ from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import RangeFrame
 
-# It varies slowly over the surface: size of its cells, as a fraction of the model's diagonal.
-_CELL = 0.01
-# A view sees a cell if its depth there differs by less than this fraction and one cell.
-_SAME_DEPTH = 0.05
+# They vary slowly over the surface: size of its cells, as a fraction of the model's diagonal.
+_CELL_FRACTION = 0.01
+# A cell is visible in a view if its depth there differs by less than this fraction plus one cell.
+_MAX_DEPTH_DIFFERENCE = 0.05
 # Standard deviation in m where a view's pose is not constrained.
 UNKNOWN_M = 10.0
 
@@ -32,25 +32,25 @@ def with_pose_errors(
     model
         The model, with the noise of the views in `sigma`.
     frames
-        Images that see the model.
+        Images of the model.
     poses, covariances
-        (F, 4, 4) T_world_camera of these and (F, 6, 6) of its right perturbation, NaN if the pose
-        is unconstrained.
+        (F, 4, 4) T_world_camera of these, and (F, 6, 6) of their right perturbation, NaN if the
+        pose is unconstrained.
     """
     cloud, mesh = model.cloud, model.mesh
     if cloud.sigma is None or not len(cloud) or not len(frames):
         return model
     cells = _Cells.of(cloud)
-    more = _sigma(cells, frames, poses, covariances)
-    if more is None:
+    pose_sigma = _cell_sigma(cells, frames, poses, covariances)
+    if pose_sigma is None:
         return model
-    sigma = np.hypot(cloud.sigma, more[cells.of_point]).astype(np.float32)
+    sigma = np.hypot(cloud.sigma, pose_sigma[cells.of_point]).astype(np.float32)
     if mesh is not None and len(mesh):
-        own = sigma
+        mesh_sigma = sigma
         if len(mesh) != len(cloud):  # holes were filled, or it has fewer faces
             nearest, _ = KdTree(cells.points).nearest(mesh.vertices.astype(np.float64))
-            own = np.hypot(mesh.sigma, more[nearest]).astype(np.float32)
-        mesh = replace(mesh, sigma=own)
+            mesh_sigma = np.hypot(mesh.sigma, pose_sigma[nearest]).astype(np.float32)
+        mesh = replace(mesh, sigma=mesh_sigma)
     return Model(replace(cloud, sigma=sigma), mesh)
 
 
@@ -68,7 +68,7 @@ class _Cells:
 
     @classmethod
     def of(cls, cloud: Cloud) -> _Cells:
-        size = max(_CELL * cloud.diagonal_m, 1e-6)
+        size = max(_CELL_FRACTION * cloud.diagonal_m, 1e-6)
         cell = np.floor((cloud.points - cloud.points.min(0)) / np.float32(size)).astype(np.int64)
         count = cell.max(0) + 1
         key = (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
@@ -76,38 +76,38 @@ class _Cells:
         return cls(size, cloud.points[first].astype(np.float64), cloud.offset, of_point)
 
 
-def _sigma(
+def _cell_sigma(
     cells: _Cells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
 ) -> Float64 | None:
-    """Return sigma (M,) of each cell by the view with the smallest; None if no view sees any."""
+    """Return sigma (M,) of each cell, the minimum over the views; None if no cell is visible."""
     world = cells.points + cells.offset
-    best = np.full(len(world), np.inf)
+    min_variance = np.full(len(world), np.inf)
     for frame, T, C in zip(frames, poses, covariances, strict=True):
-        at = se3.transform(se3.inverse(T), world)
-        seen = _visible(frame, at, cells.size)
+        p_camera = se3.transform(se3.inverse(T), world)
+        visible = _visible(frame, p_camera, cells.size)
         if np.isfinite(C).all():
-            variance = _variance(at[seen], C)
+            variance = _variance(p_camera[visible], C)
         else:
-            variance = np.full(int(seen.sum()), UNKNOWN_M**2)
-        best[seen] = np.minimum(best[seen], variance)
-    known = np.isfinite(best)
-    if not known.any():
+            variance = np.full(int(visible.sum()), UNKNOWN_M**2)
+        min_variance[visible] = np.minimum(min_variance[visible], variance)
+    observed = np.isfinite(min_variance)
+    if not observed.any():
         return None
-    # Cells that no image shows take the value of the nearest one.
-    nearest, _ = KdTree(world[known]).nearest(world[~known])
-    best[~known] = best[known][nearest]
-    return np.asarray(np.sqrt(best), np.float64)
+    # Cells that are visible in no image take the value of the nearest one.
+    nearest, _ = KdTree(world[observed]).nearest(world[~observed])
+    min_variance[~observed] = min_variance[observed][nearest]
+    return np.asarray(np.sqrt(min_variance), np.float64)
 
 
 def _visible(frame: RangeFrame, points: Float64, size: float) -> Bool:
     """Return which points (N, 3) in the camera's frame an image measured, (N,)."""
     pixel = np.nan_to_num(np.rint(frame.camera.project(points)), nan=-1.0, posinf=-1, neginf=-1)
     limits = (frame.camera.width, frame.camera.height)
-    inside = ((pixel >= 0) & (pixel < limits)).all(1) & (points[:, 2] > 0)
-    column, row = np.where(inside[:, None], pixel, 0).astype(np.intp).T
+    in_image = ((pixel >= 0) & (pixel < limits)).all(1) & (points[:, 2] > 0)
+    column, row = np.where(in_image[:, None], pixel, 0).astype(np.intp).T
     z = frame.z[row, column].astype(np.float64)
-    near = np.abs(z - points[:, 2]) < _SAME_DEPTH * points[:, 2] + size
-    return np.asarray(inside & (z > 0) & near)
+    consistent = np.abs(z - points[:, 2]) < _MAX_DEPTH_DIFFERENCE * points[:, 2] + size
+    return np.asarray(in_image & (z > 0) & consistent)
 
 
 def _variance(points: Float64, C: Float64) -> Float64:

@@ -1,8 +1,8 @@
 """Stitching of the pieces of a surface that were extracted from regions of its blocks.
 
 A vertex is identified by its cell: the number of the block among all, and that of the voxel in it.
-The region that owns the block creates it; faces of other regions refer to it by name. So nothing is
-matched by distance, and nothing is duplicated.
+The region that owns the block creates it; faces of other regions refer to it by its id. So nothing
+is matched by distance, and nothing is duplicated.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from tofuse.kernels.clustering import flatten_groups, union_faces
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The surface of a region's own blocks.
+    """The surface of the blocks that a region owns.
 
     Attributes
     ----------
-    names
-        (K,) of vertices: V of its own, ascending, then others that its faces refer to.
-    points, normals, tints, sigma, views
-        Of its own vertices, V rows; see `Mesh`, and `colored`.
+    ids
+        (K,) ids of vertices: the V owned, ascending, then others that its faces refer to.
+    points, normals, intensity, sigma, views
+        Of the owned vertices, V rows; see `Mesh`, and `to_rgb`.
     faces
-        (M, 3) rows of `names`.
+        (M, 3) rows of `ids`.
     blocks, counts
-        (B,) numbers of its own blocks, ascending, and the number of faces of each, in this order.
+        (B,) numbers of the owned blocks, ascending, and the number of faces of each.
     """
 
-    names: Int64
+    ids: Int64
     points: Float32
     normals: Float32
-    tints: Float32
+    intensity: Float32
     sigma: Float32
     views: Int32
     faces: Int32
@@ -48,15 +48,15 @@ class Piece:
         return len(self.points)
 
     @property
-    def own_names(self) -> Int64:
-        """Names of its own vertices."""
-        return self.names[: len(self)]
+    def owned_ids(self) -> Int64:
+        """Ids of the owned vertices."""
+        return self.ids[: len(self)]
 
 
 def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
     """Stitch the pieces of all blocks, without islands.
 
-    Vertices are in the order of their names, faces in that of their blocks, as for a single region.
+    Vertices are in the order of their ids, faces in that of their blocks, as for a single region.
     Pieces are read one at a time, so that little memory is needed besides the result.
 
     Parameters
@@ -68,31 +68,31 @@ def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
     island
         Connected surfaces of fewer vertices are left out.
     """
-    each = range(len(pieces))
-    names = np.sort(np.concatenate([pieces.get(k).own_names for k in each]))
-    tints = np.empty((len(names), pieces.get(0).tints.shape[1]), np.float32)
-    group = np.arange(len(names), dtype=np.int32)
-    used = np.zeros(len(names), bool)
-    for k in each:
+    indices = range(len(pieces))
+    ids = np.sort(np.concatenate([pieces.get(k).owned_ids for k in indices]))
+    intensity = np.empty((len(ids), pieces.get(0).intensity.shape[1]), np.float32)
+    group = np.arange(len(ids), dtype=np.int32)
+    used = np.zeros(len(ids), bool)
+    for k in indices:
         piece = pieces.get(k)
-        place = _places(piece, names)
-        tints[place[: len(piece)]] = piece.tints
-        faces = place[piece.faces]
+        rows = _rows(piece, ids)
+        intensity[rows[: len(piece)]] = piece.intensity
+        faces = rows[piece.faces]
         used[faces] = True
         union_faces(faces, group)
     flatten_groups(group)
-    color = colored(tints)  # with those of islands, for the range of brightness
-    del tints
-    used &= np.bincount(group, minlength=len(names))[group] >= island
+    color = to_rgb(intensity)  # with those of islands, for the range of brightness
+    del intensity
+    used &= np.bincount(group, minlength=len(ids))[group] >= island
     del group
     counts = np.zeros(blocks, np.int64)
-    for k in each:
+    for k in indices:
         piece = pieces.get(k)
         block = np.repeat(piece.blocks, piece.counts)
-        kept = used[_places(piece, names)[piece.faces[:, 0]]]
-        counts += np.bincount(block[kept], minlength=blocks)
-    place_of = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    firsts = np.cumsum(counts) - counts
+        used_faces = used[_rows(piece, ids)[piece.faces[:, 0]]]
+        counts += np.bincount(block[used_faces], minlength=blocks)
+    new_row = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    starts = np.cumsum(counts) - counts
     total = int(used.sum())
     mesh = Mesh(
         np.empty((total, 3), np.float32),
@@ -103,30 +103,33 @@ def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         np.empty(total, np.int32),
         np.zeros(3),
     )
-    for k in each:
+    for k in indices:
         piece = pieces.get(k)
-        place = _places(piece, names)
-        own = used[place[: len(piece)]]
-        to = place_of[place[: len(piece)][own]]
-        mesh.vertices[to], mesh.normals[to] = piece.points[own], piece.normals[own]
-        mesh.sigma[to], mesh.views[to] = piece.sigma[own], piece.views[own]
-        kept = used[place[piece.faces[:, 0]]]
-        block = np.repeat(piece.blocks, piece.counts)[kept]
-        before = np.searchsorted(block, block)  # faces of earlier blocks of this piece
-        mesh.faces[firsts[block] + np.arange(len(block)) - before] = place_of[
-            place[piece.faces[kept]]
+        rows = _rows(piece, ids)
+        used_owned = used[rows[: len(piece)]]
+        target = new_row[rows[: len(piece)][used_owned]]
+        mesh.vertices[target], mesh.normals[target] = (
+            piece.points[used_owned],
+            piece.normals[used_owned],
+        )
+        mesh.sigma[target], mesh.views[target] = piece.sigma[used_owned], piece.views[used_owned]
+        used_faces = used[rows[piece.faces[:, 0]]]
+        block = np.repeat(piece.blocks, piece.counts)[used_faces]
+        earlier = np.searchsorted(block, block)  # faces of earlier blocks of this piece
+        mesh.faces[starts[block] + np.arange(len(block)) - earlier] = new_row[
+            rows[piece.faces[used_faces]]
         ]
     return mesh
 
 
-def _places(piece: Piece, names: Int64) -> Int32:
-    """Return the rows of the vertices of a piece among all, by their names."""
-    return np.searchsorted(names, piece.names).astype(np.int32)
+def _rows(piece: Piece, ids: Int64) -> Int32:
+    """Return the rows of the vertices of a piece among all, by their ids."""
+    return np.searchsorted(ids, piece.ids).astype(np.int32)
 
 
-def colored(tints: Float32) -> UInt8 | None:
-    """Return colours (N, 3) of tints (N, C): three channels are RGB, one the root of the albedo."""
-    channels = tints.shape[1]
+def to_rgb(intensity: Float32) -> UInt8 | None:
+    """Return RGB (N, 3) of intensity (N, C): three channels are RGB, one the root of the albedo."""
+    channels = intensity.shape[1]
     if channels == 3:
-        return np.round(tints).clip(0, 255).astype(np.uint8)
-    return grey_of(tints[:, 0].astype(float) ** 2) if channels else None
+        return np.round(intensity).clip(0, 255).astype(np.uint8)
+    return grey_of(intensity[:, 0].astype(float) ** 2) if channels else None

@@ -38,7 +38,7 @@ class Views(Protocol):
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, which: int, /) -> RangeView: ...
+    def __getitem__(self, index: int, /) -> RangeView: ...
 
     def __iter__(self) -> Iterator[RangeView]: ...
 
@@ -69,7 +69,7 @@ class StoredViews:
         self.summaries.append(ViewSummary.of(view))
 
     def of(self, indices: Container[int]) -> StoredViews:
-        """Select the views of some frame indices, in the same store."""
+        """Select the views of these frame indices, in the same store."""
         selected = StoredViews(self._spill)
         for number, summary in zip(self._numbers, self.summaries, strict=True):
             if summary.index in indices:
@@ -93,8 +93,8 @@ class StoredViews:
     def __len__(self) -> int:
         return len(self._numbers)
 
-    def __getitem__(self, which: int, /) -> RangeView:
-        return self._spill.get(self._numbers[which])
+    def __getitem__(self, index: int, /) -> RangeView:
+        return self._spill.get(self._numbers[index])
 
     def __iter__(self) -> Iterator[RangeView]:
         return (self._spill.get(number) for number in self._numbers)
@@ -112,7 +112,7 @@ class StoredClouds:
         self._numbers.append((cloud.index, self._spill.put(cloud)))
 
     def of(self, indices: Container[int]) -> Iterator[CloudFrame]:
-        """Read the clouds of some frame indices, one at a time."""
+        """Read the clouds of these frame indices, one at a time."""
         return (self._spill.get(number) for index, number in self._numbers if index in indices)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""The texture of a surface, blended from the views that see each place best."""
+"""The texture of a surface, blended from the views that observe each point best."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from tofuse.registration.projection import Projection
 _TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02
 _BORDER = 0.08  # margin that is blended out, as a fraction of the image's height
 # Exponent of the weights, by which the best view dominates.
-_POWER = 4.0
+_WEIGHT_EXPONENT = 4.0
 _CHUNKS = 16
-_SAMPLED = 20_000  # vertices at which exposures are compared
-_TEXELS_AT_ONCE = 1 << 14
-# Robust limit of residuals of the logarithm of the intensity, and iterations.
-_ROBUST, _ROUNDS = 0.15, 4
+_MAX_SAMPLES = 20_000  # vertices at which exposures are compared
+_CHUNK_TEXELS = 1 << 14
+# Robust limit of residuals of the log intensity, and iterations.
+_ROBUST_LIMIT, _ITERATIONS = 0.15, 4
 _MAX_LOG_GAIN = 1.0
-# Smallest intensity that is compared, as a fraction of the brightest.
+# Minimum intensity that is compared, as a fraction of the maximum.
 _MIN_INTENSITY = 0.02
-# For colours of vertices: texels per vertex, vertices that a texel interpolates, smallest size.
-_TEXELS_PER_VERTEX, _NEAR, _MIN_SIZE = 2.0, 4, 64
+# For colours of vertices: texels per vertex, vertices that a texel interpolates, minimum size.
+_TEXELS_PER_VERTEX, _NEIGHBOURS, _MIN_SIZE = 2.0, 4, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,25 +48,25 @@ class Textured:
     mesh
         The surface.
     atlas
-        Where its triangles lie.
+        The layout of its triangles.
     image
         (H, W, 3) uint8 RGB.
     gains
         (V, C) exposure factor of each view.
-    seen
-        Fraction of the texture that views saw; the rest has the colours of the vertices.
+    coverage
+        Fraction of the texture that views observed; the rest has the colours of the vertices.
     """
 
     mesh: Mesh
     atlas: Atlas
     image: UInt8
     gains: Float64
-    seen: float
+    coverage: float
 
 
 @dataclass(frozen=True, eq=False)
 class TextureView:
-    """A view as it textures a surface.
+    """A view prepared for texturing.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class TextureView:
 def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int) -> Textured:
     """Texture a surface with the views.
 
-    Each texel is the weighted mean of the views that see it; near views with a small angle of
+    Each texel is the weighted mean of the views that observe it; close views with a small angle of
     incidence dominate. Exposures are equalised beforehand.
 
     Parameters
@@ -118,28 +118,28 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
     size
         Edge of the texture.
     """
-    sheet = _Sheet.of(mesh, size)
-    points, normals = sheet.points, sheet.normals
+    texels = _Texels.of(mesh, size)
+    points, normals = texels.points, texels.normals
     gains = exposures(mesh, views, poses)
     channels = views[0].intensity.shape[2]
     sums = np.zeros((len(points), channels), np.float32)
     weights = np.zeros(len(points), np.float32)
     for view, T, gain in zip(views, poses, gains, strict=True):
         _accumulate(view, T, points, normals, sums, weights, gain)
-    seen = weights > 0
-    intensity = sums[seen] / weights[seen, None]
+    observed = weights > 0
+    intensity = sums[observed] / weights[observed, None]
     if channels == 3:
         rgb = np.round(intensity.clip(0, 255)).astype(np.uint8)
     else:
         rgb = grey_of(intensity[:, 0].astype(float))
     colors = np.empty((len(points), 3), np.uint8)
-    colors[seen] = rgb
-    colors[~seen] = UNSEEN
+    colors[observed] = rgb
+    colors[~observed] = UNSEEN
     if mesh.color is not None:
-        own = sheet.at_texels(seen_colors(mesh.color), ~seen)
-        colors[~seen] = np.round(own.clip(0, 255)).astype(np.uint8)
-    fraction = float(seen.mean()) if len(seen) else 0.0
-    return Textured(mesh, sheet.atlas, sheet.filled(colors), gains, fraction)
+        vertex_colors = texels.at_texels(seen_colors(mesh.color), ~observed)
+        colors[~observed] = np.round(vertex_colors.clip(0, 255)).astype(np.uint8)
+    fraction = float(observed.mean()) if len(observed) else 0.0
+    return Textured(mesh, texels.atlas, texels.filled(colors), gains, fraction)
 
 
 def baked(mesh: Mesh, faces: int, size: int) -> Textured:
@@ -159,110 +159,112 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
         Maximum edge of the texture, in texels; smaller for fewer vertices.
     """
     assert mesh.color is not None
-    small = mesh.decimated(faces)
+    decimated = mesh.decimated(faces)
     size = int(np.clip(np.ceil(np.sqrt(_TEXELS_PER_VERTEX * len(mesh))), _MIN_SIZE, size))
-    sheet = _Sheet.of(small, size)
-    if small is mesh:
-        colors = sheet.at_texels(seen_colors(mesh.color))
+    texels = _Texels.of(decimated, size)
+    if decimated is mesh:
+        colors = texels.at_texels(seen_colors(mesh.color))
     else:
-        near, distance2 = KdTree(mesh.vertices).neighbours(sheet.points, _NEAR)
-        facing = np.einsum("nki,ni->nk", mesh.normals[near], sheet.normals) > 0
+        nearest, distance2 = KdTree(mesh.vertices).neighbours(texels.points, _NEIGHBOURS)
+        facing = np.einsum("nki,ni->nk", mesh.normals[nearest], texels.normals) > 0
         facing |= ~facing.any(1, keepdims=True)
         closest = distance2.min(1, keepdims=True)
-        weights = np.where((near >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
-        known = has_color(mesh.color)
-        lit = weights * known[near]
-        weights = np.where(lit.any(1, keepdims=True), lit, weights)
-        colors = np.einsum("nk,nki->ni", weights, seen_colors(mesh.color)[near].astype(float))
+        weights = np.where((nearest >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
+        colored = has_color(mesh.color)
+        colored_weights = weights * colored[nearest]
+        weights = np.where(colored_weights.any(1, keepdims=True), colored_weights, weights)
+        colors = np.einsum("nk,nki->ni", weights, seen_colors(mesh.color)[nearest].astype(float))
         colors /= weights.sum(1, keepdims=True)
-    image = sheet.filled(np.round(colors.clip(0, 255)).astype(np.uint8))
-    return Textured(small, sheet.atlas, image, np.zeros((0, 3)), 0.0)
+    image = texels.filled(np.round(colors.clip(0, 255)).astype(np.uint8))
+    return Textured(decimated, texels.atlas, image, np.zeros((0, 3)), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class _Sheet:
+class _Texels:
     """The texels on the triangles of a mesh.
 
     Attributes
     ----------
-    painted
-        (size, size) which texels; there are K.
+    mask
+        (size, size) True at these texels; there are K.
     points, normals
         (K, 3) of the surface at these texels.
     """
 
     atlas: Atlas
-    painted: Bool
+    mask: Bool
     corners: Int32
     barycentric: Float32
     points: Float32
     normals: Float32
 
     @classmethod
-    def of(cls, mesh: Mesh, size: int) -> _Sheet:
+    def of(cls, mesh: Mesh, size: int) -> _Texels:
         atlas = unwrap(mesh, size)
         owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
-        places = np.zeros((atlas.size, atlas.size, 2), np.float32)
-        draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
-        painted = owner != UNOWNED
-        corners = atlas.vertices[atlas.faces[owner[painted]]]
-        barycentric = places[painted]
+        coordinates = np.zeros((atlas.size, atlas.size, 2), np.float32)
+        draw_triangles(atlas.texels[atlas.faces], MARGIN, owner, coordinates)
+        mask = owner != UNOWNED
+        corners = atlas.vertices[atlas.faces[owner[mask]]]
+        barycentric = coordinates[mask]
         points = _interpolated(mesh.vertices, corners, barycentric)
         normals = _interpolated(mesh.normals, corners, barycentric)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        return cls(atlas, painted, corners, barycentric, points, normals)
+        return cls(atlas, mask, corners, barycentric, points, normals)
 
     def at_texels(self, values: NDArray[np.generic], where: Bool | None = None) -> Float32:
-        """Interpolate values of the vertices (N, C) at the texels (K, C), or at some of them."""
+        """Interpolate values of the vertices (N, C) at the texels (K, C), or at a subset."""
         if where is None:
             return _interpolated(values, self.corners, self.barycentric)
         return _interpolated(values, self.corners[where], self.barycentric[where])
 
     def filled(self, colors: UInt8) -> UInt8:
         """Return the image (size, size, 3) of the colours (K, 3), without empty texels."""
-        image = np.zeros((*self.painted.shape, 3), np.uint8)
-        image[self.painted] = colors
-        return _dilate_colors(image, self.painted)
+        image = np.zeros((*self.mask.shape, 3), np.uint8)
+        image[self.mask] = colors
+        return _dilate_colors(image, self.mask)
 
 
 def _interpolated(values: NDArray[np.generic], corners: Int32, barycentric: Float32) -> Float32:
     out = np.empty((len(corners), values.shape[1]), np.float32)
     # In chunks, as allocating large temporaries takes longer than the sums.
-    for start in range(0, len(out), _TEXELS_AT_ONCE):
-        rows = slice(start, start + _TEXELS_AT_ONCE)
+    for start in range(0, len(out), _CHUNK_TEXELS):
+        rows = slice(start, start + _CHUNK_TEXELS)
         b, c = barycentric[rows].T[:, :, None]
-        of = values[corners[rows]].astype(np.float32)
-        out[rows] = of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
+        corner_values = values[corners[rows]].astype(np.float32)
+        out[rows] = (
+            corner_values[:, 0] * (1 - b - c) + corner_values[:, 1] * b + corner_values[:, 2] * c
+        )
     return out
 
 
 def exposures(mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> Float64:
     """Return exposure factors (V, C) of the views at their poses (V, 4, 4).
 
-    Robust least squares of the differences between the log intensities of every two views that see
-    a place. The mean of the logarithms of the factors is 0.
+    Robust least squares of the differences between the log intensities of all pairs of views of a
+    point. The mean of the logarithms of the factors is 0.
     """
-    step = max(1, len(mesh) // _SAMPLED)
+    step = max(1, len(mesh) // _MAX_SAMPLES)
     points = np.ascontiguousarray(mesh.vertices[::step])
     normals = np.ascontiguousarray(mesh.normals[::step])
     count, channels = len(views), views[0].intensity.shape[2]
     logs = np.zeros((count, len(points), channels))
     weights = np.zeros((count, len(points)))
-    top = max(float(np.percentile(view.intensity, 99)) for view in views)
+    max_intensity = max(float(np.percentile(view.intensity, 99)) for view in views)
     for k, (view, T) in enumerate(zip(views, poses, strict=True)):
         sums, weight = (
             np.zeros((len(points), channels), np.float32),
             np.zeros(len(points), np.float32),
         )
         _accumulate(view, T, points, normals, sums, weight, np.ones(channels))
-        seen = weight > 0
-        intensity = sums[seen] / weight[seen, None]
+        observed = weight > 0
+        intensity = sums[observed] / weight[observed, None]
         # Nearly black or saturated intensities are not compared.
-        usable = (intensity > _MIN_INTENSITY * top).all(1) & (
+        usable = (intensity > _MIN_INTENSITY * max_intensity).all(1) & (
             (intensity < 250).all(1) if channels == 3 else True
         )
-        logs[k, seen] = np.log(np.maximum(intensity, _MIN_INTENSITY * top))
-        weights[k, seen] = usable
+        logs[k, observed] = np.log(np.maximum(intensity, _MIN_INTENSITY * max_intensity))
+        weights[k, observed] = usable
     return np.stack([_gains(logs[..., c], weights) for c in range(channels)], -1)
 
 
@@ -270,18 +272,18 @@ def _gains(logs: Float64, weights: Float64) -> Float64:
     """Return factors (V,) for log intensities (V, N) with weights (V, N)."""
     gain = np.zeros(len(logs))
     w = weights
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         total = np.maximum(w.sum(0), 1e-9)
         mean = (w * logs).sum(0) / total
-        # Normal equations of the views, with the intensities of the places eliminated.
+        # Normal equations of the views, with the intensities of the points eliminated.
         A = np.diag(w.sum(1)) - (w / total) @ w.T
         b = (w * (mean - logs)).sum(1)
         A += np.eye(len(A)) * (1e-3 * max(np.trace(A) / len(A), 1.0)) + 1e-3
         gain = np.linalg.solve(A, b)
         gain -= gain.mean()
         fitted = logs + gain[:, None]
-        rest = np.abs(fitted - (w * fitted).sum(0) / total)
-        w = weights * np.minimum(1, _ROBUST / np.maximum(rest, 1e-9))
+        residuals = np.abs(fitted - (w * fitted).sum(0) / total)
+        w = weights * np.minimum(1, _ROBUST_LIMIT / np.maximum(residuals, 1e-9))
     return np.asarray(np.exp(gain.clip(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)), np.float64)
 
 
@@ -299,22 +301,22 @@ def _accumulate(
     )
     T = se3.inverse(T_world_camera)
     border = max(2.0, _BORDER * view.z.shape[0])
-    colored = ColoredView(view.z, intensity, view.projection.lookup, view.projection.frame)
-    blending = Blending(_TOLERANCE_M, _TOLERANCE_FRACTION, border, _POWER)
+    colored_view = ColoredView(view.z, intensity, view.projection.lookup, view.projection.frame)
+    blending = Blending(_TOLERANCE_M, _TOLERANCE_FRACTION, border, _WEIGHT_EXPONENT)
     run_chunks(
-        lambda a, b: add_view(points, normals, colored, T, blending, sums, weights, a, b),
+        lambda a, b: add_view(points, normals, colored_view, T, blending, sums, weights, a, b),
         len(points),
         _CHUNKS,
     )
 
 
-def _dilate_colors(image: UInt8, painted: Bool) -> UInt8:
+def _dilate_colors(image: UInt8, mask: Bool) -> UInt8:
     """Fill empty texels with the nearest colour, so that mipmaps don't darken."""
-    if painted.all() or not painted.any():
+    if mask.all() or not mask.any():
         return image
-    _, label = cv2.distanceTransformWithLabels(
-        (~painted).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    _, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
-    of_label = np.zeros((int(label.max()) + 1, 3), np.uint8)
-    of_label[label[painted]] = image[painted]
-    return of_label[label]
+    label_colors = np.zeros((int(labels.max()) + 1, 3), np.uint8)
+    label_colors[labels[mask]] = image[mask]
+    return label_colors[labels]

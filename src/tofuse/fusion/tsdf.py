@@ -16,7 +16,7 @@ from tofuse.fusion.layout import CUBE_SPACING, REACH_SIGMAS, Layout, Region, cub
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import DECODED, RangeView
-from tofuse.fusion.stitching import Piece, colored, stitch
+from tofuse.fusion.stitching import Piece, stitch, to_rgb
 from tofuse.fusion.stored_views import Views, summaries
 from tofuse.geometry import se3
 from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, index_of, mark_eighths, neighbours_of
@@ -33,21 +33,21 @@ from tofuse.kernels.tsdf import (
 
 _CHUNKS = 16
 _BATCH = 16  # views
-# Largest second difference, in pixels, of the lookup of a distortion-free camera.
-_STRAIGHT = 1e-3
-# Number of nodes within which the lookup of any other camera is linear.
-_LINEAR_NODES = 2.0
-_MAX_SIGMA_VOXELS = 2.0  # the largest standard deviation of a surface, voxels
+# Maximum second difference of the lookup of a distortion-free camera, pixels.
+_MAX_SECOND_DIFFERENCE = 1e-3
+# Number of nodes within which the lookup of any other camera counts as linear.
+_DISTORTED_LINEAR_NODES = 2.0
+_MAX_SIGMA_VOXELS = 2.0  # maximum standard deviation of a surface, voxels
 
 
 def fitting_voxel(views: Views) -> float:
     """Return a voxel edge in m for the sensor and the scene: 2 mm to 10 cm."""
-    seen = [each for each in summaries(views) if each.depth > 0]
-    if not seen:
+    nonempty = [summary for summary in summaries(views) if summary.depth > 0]
+    if not nonempty:
         return 0.01
-    depth = float(np.median([each.depth for each in seen]))
+    depth = float(np.median([summary.depth for summary in nonempty]))
     # Depth noise grows with depth: finer voxels would represent mostly noise.
-    size = max(float(np.median([each.pitch for each in seen])), 0.004) * depth
+    size = max(float(np.median([summary.pitch for summary in nonempty])), 0.004) * depth
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 
 
@@ -55,18 +55,18 @@ def fitting_voxel(views: Views) -> float:
 class Volume:
     """Truncated signed distances to the surfaces of views, in blocks near these surfaces.
 
-    Each view is integrated into the blocks that it sees. Blocks are distributed among threads, and
-    each is changed by one of them. The values of a block do not depend on which others are in the
-    volume.
+    Each view is integrated into the blocks in its frustum. Blocks are distributed among threads,
+    and each is changed by one of them. The values of a block do not depend on which others are in
+    the volume.
 
     Attributes
     ----------
     voxel_m, reach_m
         Edge of a voxel, and the truncation distance.
     keys
-        (B,) the blocks: those of a region, ascending, then the layer around it.
-    numbers, own
-        (B,) their numbers among all blocks, and the number of the region's own.
+        (B,) of the blocks: those the region owns, ascending, then the layer around them.
+    numbers, owned
+        (B,) their numbers among all blocks, and how many of them the region owns.
     distance, weight, seen, color, free
         See `tofuse.kernels.blocks.Blocks`.
     free_space_stride, added
@@ -77,7 +77,7 @@ class Volume:
     reach_m: float
     keys: Int64
     numbers: Int64
-    own: int
+    owned: int
     distance: Float32
     weight: Float32
     seen: UInt16
@@ -88,7 +88,7 @@ class Volume:
 
     @property
     def blocks(self) -> Blocks:
-        """The blocks as the kernels take them."""
+        """The blocks in the format of the kernels."""
         return Blocks(
             self.keys, self.numbers, self.distance, self.weight, self.seen, self.color, self.free
         )
@@ -102,7 +102,7 @@ class Volume:
     def around(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Volume:
         """Return the empty volume of all blocks near the surfaces of views at poses (N, 4, 4)."""
         layout = Layout.of(views, poses, voxel_m)
-        return cls.of(layout, layout.whole())
+        return cls.of(layout, layout.single_region())
 
     @classmethod
     def of(cls, layout: Layout, region: Region) -> Volume:
@@ -113,7 +113,7 @@ class Volume:
             layout.reach_m,
             layout.keys[region.rows],
             region.rows,
-            region.own,
+            region.owned,
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.uint16),
@@ -138,8 +138,8 @@ class Volume:
 
         def flush() -> None:
             if batch:
-                at = np.array(numbers, np.int64)
-                self._add(batch, poses[at - self.added], at)
+                selected = np.array(numbers, np.int64)
+                self._add(batch, poses[selected - self.added], selected)
             batch.clear()
             numbers.clear()
 
@@ -156,9 +156,9 @@ class Volume:
         self.added += len(views)
 
     def _add(self, views: Views, poses: Float64, numbers: Int64) -> None:
-        """Integrate a batch of views of one camera, which loads each block once for all of them.
+        """Integrate a batch of views of one camera; each block is loaded once for all of them.
 
-        `numbers` (N,) are theirs among all views.
+        `numbers` (N,) are their positions among all views.
         """
         if len(self.keys) == 0:
             return
@@ -177,69 +177,77 @@ class Volume:
         )
         decoding = Decoding(DECODED, _free_space_limits(self.reach_m), self.reach_m)
 
-        def open_views(a: int, b: int) -> None:
+        def unpack(a: int, b: int) -> None:
             for s in range(a, b):
                 view = views[s]
                 unpack_view(view.stored, projection.frame, decoding, batch, s)
                 if self.free_space_stride > 1:
                     number = int(numbers[s])
-                    cubes = cubes_near(view, poses[s], edge, self.reach_m, CUBE_SPACING, number, 2)
-                    mark_eighths(cubes, *self.index, close[s])
+                    cubes = cubes_near(
+                        view, poses[s], cube_m, self.reach_m, CUBE_SPACING, number, 2
+                    )
+                    mark_eighths(cubes, *self.index, near_surface[s])
                 # Albedo is ignored if other views have colour.
                 if view.intensity is not None and channels == view.channels:
                     batch.intensity[s] = view.intensity.reshape(-1, channels)
 
-        close = np.zeros((count, len(self.keys)), np.uint8)
-        edge = 0.5 * EDGE * self.voxel_m
-        run_chunks(open_views, count, count)
-        nodes = _straight_nodes(projection.lookup)
+        near_surface = np.zeros((count, len(self.keys)), np.uint8)
+        cube_m = 0.5 * EDGE * self.voxel_m
+        run_chunks(unpack, count, count)
+        nodes = _linear_nodes(projection.lookup)
         camera = Camera((rows, columns), projection.lookup, projection.frame, nodes)
-        blocks, turns = self.blocks, self.free_space_stride
+        blocks, stride = self.blocks, self.free_space_stride
         run_chunks(
             lambda a, b: integrate(
-                blocks, self.voxel_m, batch, camera, decoding, close, turns, a, b
+                blocks, self.voxel_m, batch, camera, decoding, near_surface, stride, a, b
             ),
             len(self.keys),
             _CHUNKS,
         )
 
     def surface(self, min_views: int = 1) -> Mesh:
-        """Return the zero surface of the distances, between voxels that views saw.
+        """Return the zero surface of the distances, between observed voxels.
 
         Vertices with a standard deviation above a few voxels are left out, as there the surface is
-        noise. The surface of a region's own blocks is a `piece`.
+        noise. The surface of the blocks that a region owns is a `piece`.
         """
-        net = self._net(min_views)
-        points, normals, tints, sigma, views = net.vertices
+        net = self._extract(min_views)
+        points, normals, intensity, sigma, views = net.vertices
         return Mesh(
-            points.astype(np.float32), net.faces, normals, colored(tints), sigma, views, np.zeros(3)
+            points.astype(np.float32),
+            net.faces,
+            normals,
+            to_rgb(intensity),
+            sigma,
+            views,
+            np.zeros(3),
         )
 
     def piece(self, min_views: int = 1) -> Piece:
-        """Return the surface of the region's own blocks, to be stitch to those of others."""
-        net = self._net(min_views)
-        points, normals, tints, sigma, views = net.vertices
+        """Return the surface of the owned blocks, to be stitched to those of other regions."""
+        net = self._extract(min_views)
+        points, normals, intensity, sigma, views = net.vertices
         block, voxel = np.nonzero(net.cells >= 0)
-        names = self.numbers[block] * VOXELS + voxel
-        mine = int(np.searchsorted(block, self.own))
-        used = np.zeros(len(names), bool)
-        used[:mine] = True
+        ids = self.numbers[block] * VOXELS + voxel
+        num_owned = int(np.searchsorted(block, self.owned))
+        used = np.zeros(len(ids), bool)
+        used[:num_owned] = True
         used[net.faces] = True
-        place = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        row_of = np.cumsum(used, dtype=np.int32) - np.int32(1)
         return Piece(
-            names[used],
-            points[:mine].astype(np.float32),
-            normals[:mine].copy(),
-            tints[:mine].copy(),
-            sigma[:mine].copy(),
-            views[:mine].copy(),
-            place[net.faces].reshape(-1, 3),
-            self.numbers[: self.own],
+            ids[used],
+            points[:num_owned].astype(np.float32),
+            normals[:num_owned].copy(),
+            intensity[:num_owned].copy(),
+            sigma[:num_owned].copy(),
+            views[:num_owned].copy(),
+            row_of[net.faces].reshape(-1, 3),
+            self.numbers[: self.owned],
             net.per_block,
         )
 
-    def _net(self, min_views: int) -> _Net:
-        """Return vertices of all cells, and the triangles of the region's own blocks."""
+    def _extract(self, min_views: int) -> _SurfaceNet:
+        """Return the vertices of all cells, and the triangles of the owned blocks."""
         count, blocks = len(self.keys), self.blocks
         run_chunks(lambda a, b: apply_free_space(blocks, self.reach_m, a, b), count, _CHUNKS)
         neighbours = np.empty((count, 27), np.int32)
@@ -269,7 +277,7 @@ class Volume:
             _CHUNKS,
         )
         faces, per_block = self._faces(neighbours, cells, starts, vertices.points)
-        return _Net(vertices, faces, per_block, cells)
+        return _SurfaceNet(vertices, faces, per_block, cells)
 
     def _faces(
         self,
@@ -278,8 +286,8 @@ class Volume:
         starts: Int64,
         points: Float64,
     ) -> tuple[Int32, Int64]:
-        """Return the triangles of the own blocks, and their number per block."""
-        counts = np.zeros(self.own, np.int64)
+        """Return the triangles of the owned blocks, and their number per block."""
+        counts = np.zeros(self.owned, np.int64)
 
         def run(firsts: Int64, faces: Int32, fill: bool) -> Int32:
             run_chunks(
@@ -296,42 +304,44 @@ class Volume:
                     a,
                     b,
                 ),
-                self.own,
+                self.owned,
                 _CHUNKS,
             )
             return faces
 
         run(counts, np.empty((0, 3), np.int32), fill=False)
-        found = np.empty((int(counts.sum()), 3), np.int32)
-        return run(np.cumsum(counts) - counts, found, fill=True), counts
+        triangles = np.empty((int(counts.sum()), 3), np.int32)
+        return run(np.cumsum(counts) - counts, triangles, fill=True), counts
 
 
 @dataclass(frozen=True, eq=False)
-class _Net:
+class _SurfaceNet:
     """The surface net of a volume: vertices (V,), and faces (M, 3)."""
 
     vertices: Vertices
     faces: Int32
-    per_block: Int64  # (own,) faces of each block
+    per_block: Int64  # (owned,) faces of each block
     cells: Int32  # (B, VOXELS) number of the vertex within its block, or -1
 
 
-def _free_space_limits(reach: float) -> Float32:
+def _free_space_limits(reach_m: float) -> Float32:
     """Return the distance behind its surface up to which a pixel is integrated, m, by weight code.
 
-    (256,) several sigmas: else any noisy pixel that errs to the back would create a surface of its
-    own.
+    (256,) several sigmas: else any noisy pixel that errs to the back would create a separate
+    surface.
     """
     sigma = 1 / np.sqrt(np.maximum(DECODED, np.float32(1e-12)))
-    return np.where(DECODED > 0, np.maximum(REACH_SIGMAS * sigma, reach), reach).astype(np.float32)
+    return np.where(DECODED > 0, np.maximum(REACH_SIGMAS * sigma, reach_m), reach_m).astype(
+        np.float32
+    )
 
 
-def _straight_nodes(lookup: Float32) -> float:
+def _linear_nodes(lookup: Float32) -> float:
     """Return the number of nodes within which a lookup is linear."""
-    bends = [np.abs(np.diff(lookup, 2, axis)) for axis in (0, 1)]
-    if max(bend.max() for bend in bends) < _STRAIGHT:
+    differences = [np.abs(np.diff(lookup, 2, axis)) for axis in (0, 1)]
+    if max(difference.max() for difference in differences) < _MAX_SECOND_DIFFERENCE:
         return float(np.inf)
-    return _LINEAR_NODES
+    return _DISTORTED_LINEAR_NODES
 
 
 def fuse_surface(
@@ -355,8 +365,8 @@ def fuse_surface(
 
     Returns
     -------
-    The surface without islands; without faces if the views show none. If its voxels exceed the
-    memory of the options, it is made region by region, with the same result.
+    The surface without islands; without faces if the views contain none. If its voxels exceed the
+    memory of the options, it is fused region by region, with the same result.
     """
     options = options or Fusion()
     layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views))
@@ -367,10 +377,10 @@ def fuse_surface(
         mesh = volume.surface(options.min_views)
         del volume
         return mesh.without_islands(options.island)
-    return _by_regions(layout, regions, views, poses, options, advance)
+    return _fuse_by_regions(layout, regions, views, poses, options, advance)
 
 
-def _by_regions(
+def _fuse_by_regions(
     layout: Layout,
     regions: Sequence[Region],
     views: Views,
@@ -378,7 +388,7 @@ def _by_regions(
     options: Fusion,
     advance: Callable[[], None] | None,
 ) -> Mesh:
-    """Fuse the surface region by region: the same to the byte as of a single region."""
+    """Fuse the surface region by region, byte-identical to that of a single region."""
     frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
     block_m = EDGE * layout.voxel_m
     done = 0
@@ -392,7 +402,7 @@ def _by_regions(
     store: Spill[Piece] = Spill(0)
     with closing(store) as pieces:
         for region in regions:
-            # One more block, as blocks are tested by their bounding spheres.
+            # With a margin of one block, as blocks are tested by their bounding spheres.
             low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
             touching = frusta.touching(block_m * low, block_m * high)
             volume = Volume.of(layout, region)

@@ -53,28 +53,28 @@ def unknown_rays(camera: Camera) -> Bool | None:
 
 
 # Cache by camera, as these are needed for every frame.
-_computed: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
 
 
 def _derived(camera: Camera) -> tuple[Float32, Bool | None]:
-    found = _computed.get(camera)
-    if found is None:
+    derived = _cache.get(camera)
+    if derived is None:
         rays = camera.rays()
         unknown: Bool = np.isnan(rays.sum(-1))
         lengths = _frozen(np.sqrt(1 + (rays * rays).sum(-1)))
-        found = (lengths, unknown if unknown.any() else None)
-        _computed[camera] = found
-    return found
+        derived = (lengths, unknown if unknown.any() else None)
+        _cache[camera] = derived
+    return derived
 
 
 def z_from_range(camera: Camera, radial_range: ArrayLike) -> Float32:
     """Convert radial range (H, W) to z depth (H, W), in m (eq 2.3); 0 stays 0."""
-    return _zero_nan(np.asarray(radial_range, np.float32) / ray_lengths(camera))
+    return _nan_to_zero(np.asarray(radial_range, np.float32) / ray_lengths(camera))
 
 
 def range_from_z(camera: Camera, z: ArrayLike) -> Float32:
     """Convert z depth (H, W) to radial range (H, W), in m; 0 stays 0."""
-    return _zero_nan(np.asarray(z, np.float32) * ray_lengths(camera))
+    return _nan_to_zero(np.asarray(z, np.float32) * ray_lengths(camera))
 
 
 def points_from_z(camera: Camera, z: ArrayLike) -> Float32:
@@ -83,10 +83,10 @@ def points_from_z(camera: Camera, z: ArrayLike) -> Float32:
     out = np.empty((*z.shape, 3), np.float32)
     out[..., :2] = camera.rays() * z[..., None]
     out[..., 2] = z
-    return _zero_nan(out)
+    return _nan_to_zero(out)
 
 
-def _zero_nan(a: Float32) -> Float32:
+def _nan_to_zero(a: Float32) -> Float32:
     return np.where(np.isfinite(a), a, np.float32(0))
 
 
@@ -141,7 +141,7 @@ class Pinhole:
         shape = xy.shape
         xy = xy.reshape(-1, 2)
         out = xy.copy()
-        # Only those that have not converged; beyond a fold of the lens, some never do.
+        # Indices that have not converged; beyond a fold of the distortion, some never do.
         active = np.arange(len(xy))
         step = 1e-6
         for _ in range(30):
@@ -223,26 +223,30 @@ class Fisheye(Pinhole):
         r = np.sqrt((xy * xy).sum(-1))
         theta = np.arctan(r)
         t2 = theta * theta
-        bent = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
-        return xy * np.where(r > 1e-9, bent / np.where(r > 1e-9, r, 1), 1.0)[..., None]
+        distorted = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        return xy * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1), 1.0)[..., None]
 
     def _undistort(self, xy: Float64) -> Float64:
         # Solve for the angle, which has no pole, rather than for its tangent.
-        bent = np.sqrt((xy * xy).sum(-1))
-        theta = np.minimum(bent, 1.5)
+        distorted = np.sqrt((xy * xy).sum(-1))
+        theta = np.minimum(distorted, 1.5)
         for _ in range(50):
             t2 = theta * theta
-            value = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+            estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
             slope = 1 + t2 * (
                 3 * self.k1 + t2 * (5 * self.k2 + t2 * (7 * self.k3 + t2 * 9 * self.k4))
             )
             with np.errstate(all="ignore"):
-                theta = theta - np.clip((value - bent) / slope, -0.3, 0.3)
+                theta = theta - np.clip((estimate - distorted) / slope, -0.3, 0.3)
         t2 = theta * theta
-        value = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
-        seen = (np.abs(value - bent) < 1e-7) & (theta >= 0) & (theta < np.pi / 2 - 1e-3)
-        scale = np.where(bent > 1e-9, np.tan(theta) / np.where(bent > 1e-9, bent, 1), 1.0)
-        return np.where(seen[..., None], xy * scale[..., None], np.nan)
+        estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        converged = (
+            (np.abs(estimate - distorted) < 1e-7) & (theta >= 0) & (theta < np.pi / 2 - 1e-3)
+        )
+        scale = np.where(
+            distorted > 1e-9, np.tan(theta) / np.where(distorted > 1e-9, distorted, 1), 1.0
+        )
+        return np.where(converged[..., None], xy * scale[..., None], np.nan)
 
 
 def _is_mirrored(table: NDArray[np.generic]) -> bool:

@@ -1,4 +1,4 @@
-"""Places of a camera, and how often it was there."""
+"""Places visited by a camera, and the number of visits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.arrays import Float64
 
 @dataclass
 class PlaceCounts:
-    """Thins the images of a camera that stays at a place or often returns to it.
+    """Thins the images of a camera that stays at a place or returns to it often.
 
     A place is a cell of positions and viewing directions. All of the first `enough` images of a
     place are kept, then every second one of twice as many, every fourth one of four times as many,
@@ -37,7 +37,7 @@ class PlaceCounts:
         Parameters
         ----------
         depth
-            Median distance of what it sees, m.
+            Median depth of the image, m.
         T_component_camera
             (4, 4) pose in the frame of its component.
         component
@@ -46,7 +46,7 @@ class PlaceCounts:
         # Not the depth itself, which changes with every image.
         octave = round(math.log2(max(depth, 1e-3)))
         T, size = T_component_camera, self.distance * 2.0**octave
-        # A component begins in the middle of a cell: a camera that stays there is in one place.
+        # A component begins at the centre of a cell: a camera that stays there is in one place.
         cell = np.rint(np.concatenate([T[:3, 3] / size, T[:3, 2] / self.angle]))
         place = np.append(cell, [octave, component]).astype(np.int64).tobytes()
         count = self._count.get(place, 0)

@@ -1,1 +1,1 @@
-"""Frames as they come: cameras that are plugged in, and recordings played like one."""
+"""Live frames: connected cameras, and recordings played like one."""

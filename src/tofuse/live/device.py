@@ -58,7 +58,7 @@ class Stream(ABC):
     Attributes
     ----------
     settings
-        Known when the stream is opened.
+        Available when the stream is opened.
     """
 
     settings: Settings

@@ -19,9 +19,9 @@ from tofuse.live.device import DeviceError, Stream
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 
-_PATIENCE_S = 5.0  # for a camera's last frame
-QUEUE_FRAMES = 64  # that may wait for the disk
-FINEST_SIGMA_M = 1e-5
+_JOIN_TIMEOUT_S = 5.0  # for a camera's last frame
+QUEUE_FRAMES = 64  # maximum number that may wait for the disk
+MIN_SIGMA_UNIT_M = 1e-5
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Recorded:
     dropped
         Number of frames dropped, as the disk was too slow.
     ended_by
-        Why it ended: "asked" as requested, or the camera's error.
+        Reason for the end: "asked" as requested, or the camera's error.
     """
 
     folder: Path
@@ -58,7 +58,7 @@ def record(
     """Write the frames of a camera as a native recording.
 
     The camera is read on its own thread, so that a slow disk drops frames without delaying others.
-    If the camera fails, the frames so far are kept. The folder appears when all is written.
+    If the camera fails, the frames so far are kept. The folder appears when it is complete.
 
     Parameters
     ----------
@@ -97,9 +97,9 @@ def record(
             if len(writer) == frames or stopped():
                 break
             frame = reader.next()
-        ended = str(reader.error) if frame is None and reader.error else "asked"
+        ended_by = str(reader.error) if frame is None and reader.error else "asked"
         writer.finish()
-    return Recorded(Path(folder), len(writer), reader.dropped, ended)
+    return Recorded(Path(folder), len(writer), reader.dropped, ended_by)
 
 
 class _Reader:
@@ -126,7 +126,7 @@ class _Reader:
     ) -> None:
         self._stop.set()
         # A camera that has gone silent may never return from `read`; the thread is a daemon.
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_JOIN_TIMEOUT_S)
 
     def _work(self) -> None:
         index = 0
@@ -153,19 +153,19 @@ class _Reader:
 
 
 def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
-    about = stream.settings
+    settings = stream.settings
     sigma_unit = None
     if first.sigma_image is not None:
-        largest = float(np.nanmax(first.sigma_image, initial=0.0))
+        max_sigma = float(np.nanmax(first.sigma_image, initial=0.0))
         # Later frames may be noisier than the first.
-        sigma_unit = max(FINEST_SIGMA_M, 4 * largest / 65535)
+        sigma_unit = max(MIN_SIGMA_UNIT_M, 4 * max_sigma / 65535)
     return RecordingWriter(
         folder,
-        about.camera,
-        depth_unit_m=about.depth_unit_m,
-        depth_kind=about.depth_kind,
-        frame_rate_hz=about.frame_rate_hz,
-        amplitude_kind=about.amplitude_kind,
-        sensor=about.sensor,
+        settings.camera,
+        depth_unit_m=settings.depth_unit_m,
+        depth_kind=settings.depth_kind,
+        frame_rate_hz=settings.frame_rate_hz,
+        amplitude_kind=settings.amplitude_kind,
+        sensor=settings.sensor,
         sigma_unit_m=sigma_unit,
     )

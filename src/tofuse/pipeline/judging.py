@@ -459,7 +459,7 @@ def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviati
     rows = [row_of[view.index] for view in posed]
     depth_m = float(np.median([view.depth for view in posed]))
     fit = fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
-    return deviation_of(fit, poses[rows]) if fit.unknowns > 0 else None
+    return deviation_of(fit, poses[rows]) if fit.dof > 0 else None
 
 
 def _reasons(

@@ -27,15 +27,15 @@ _CUT = "crop the background with --max-depth, a box or a mask"
 _MIN_FRAMES = 6
 # Neighbouring depths that differ by more than this fraction are on different surfaces.
 _JUMP = 0.04
-# A pixel is static if this fraction of the frames see its background, and swept by the object if
-# this fraction do not.
+# A pixel is static if its background is visible in this fraction of the frames, and swept by the
+# object if it is not visible in this fraction.
 _STATIC, _SWEPT = 0.8, 0.04
 # Fraction of an image border that must be static.
 _STATIC_BORDER = 0.6
 # Smallest fraction of foreground pixels of an object.
 _MIN_OBJECT = 0.002
 # The object's rim has mixed pixels; its depth is taken from the interior within this distance.
-_NEAR_PIXELS = 6
+_FILL_PIXELS = 6
 # Smallest fraction of the rim of an object's segment that must continue the passing object.
 _MIN_JOINED = 0.25
 # Foreground components smaller than this fraction of the largest are speckle.
@@ -45,8 +45,8 @@ _MIN_OUTLINE = 0.5
 # Fraction of the foreground that must be farther than a pixel from its outline.
 _MIN_INNER = 0.4
 # Percentiles of the depths of the object, and the relative margin around their interval. Mixed
-# pixels of object and background can have any depth, even one nearer than both.
-_REACH = (2, 98)
+# pixels of object and background can have any depth, even nearer than both.
+_DEPTH_PERCENTILES = (2, 98)
 _MARGIN = 0.5
 
 
@@ -76,7 +76,7 @@ def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
     Parameters
     ----------
     frames
-        At least 3, of the same size, in which the objects before the background moved.
+        At least 3, of the same size, in which the objects in front of the background moved.
     """
     z = np.stack([frame.z for frame in frames])
     z[~np.stack([frame.valid for frame in frames])] = 0
@@ -86,13 +86,13 @@ def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
     descending = np.sort(z, axis=0)[::-1]
     tolerance = _SIGMAS * _spatial_sigma(z) + np.float32(_RELATIVE) * descending[0]
     centre = np.zeros_like(descending[0])
-    found = np.zeros(centre.shape, bool)
+    assigned = np.zeros(centre.shape, bool)
     for k in range(count - min_frames + 1):
         low = descending[k + min_frames - 1]
-        fits = ~found & (low > 0) & (descending[k] - low <= tolerance)
-        centre[fits] = descending[k + min_frames // 2][fits]
-        found |= fits
-    agree = valid & found & (np.abs(z - centre) <= tolerance)
+        agreeing = ~assigned & (low > 0) & (descending[k] - low <= tolerance)
+        centre[agreeing] = descending[k + min_frames // 2][agreeing]
+        assigned |= agreeing
+    agree = valid & assigned & (np.abs(z - centre) <= tolerance)
     depth = _median(z, agree)
     sigma = _median(np.abs(z - depth), agree) / np.float32(MEDIAN_OF_NORMAL)
     missing = ~valid
@@ -106,32 +106,32 @@ def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """An object that moves before a static background, segmented by its depth.
+    """An object that moves in front of a static background, segmented by its depth.
 
     Attributes
     ----------
     far
         The farthest surface at each pixel.
     limit
-        (H, W) float32 z in m below which a point is before the background. Infinite where the
-        object always hides it.
+        (H, W) float32 z in m below which a point is in front of the background. Infinite where the
+        object always occludes it.
     own
-        (H, W) mask of the pixels at which the object always hides the background.
-    reach
+        (H, W) mask of the pixels at which the object always occludes the background.
+    depth_range
         (min, max) z in m of the object.
     """
 
     far: FarSurface
     limit: Float32
     own: Bool
-    reach: tuple[float, float]
+    depth_range: tuple[float, float]
 
     def mask(self, z: Float32) -> Bool:
         """Return the (H, W) mask of the object in a z image (H, W), 0 where invalid."""
-        near, far = self.reach
+        near, far = self.depth_range
         margin = _MARGIN * (far - near)
-        in_reach = (z > 0) & (z >= near - margin) & (z <= far + margin)
-        return _without_speckle(in_reach & (z < self.limit))
+        in_range = (z > 0) & (z >= near - margin) & (z <= far + margin)
+        return _without_speckle(in_range & (z < self.limit))
 
 
 def moving_object(
@@ -161,22 +161,24 @@ def moving_object(
     if len({frame.depth.shape for frame in frames}) > 1:
         raise InputError("needs images of the same size", where=_OPTION, remedy=_CUT)
     far = far_surface(frames)
-    far_z = _filled(far.z)
-    background = np.isfinite(far_z)
-    limit = far_z.copy()
-    limit[background] -= (sigmas * far.sigma + np.float32(relative) * far_z)[background]
+    background_z = _filled(far.z)
+    observed = np.isfinite(background_z)
+    limit = background_z.copy()
+    limit[observed] -= (sigmas * far.sigma + np.float32(relative) * background_z)[observed]
     z = np.stack([frame.z for frame in frames])
     z[~np.stack([frame.valid for frame in frames])] = 0
     front = np.stack([_without_speckle((image > 0) & (image < limit)) for image in z])
     frequency = front.mean(0)
-    if background.any():
-        _check_still(far, frequency)
-    inner = np.stack([ndimage.binary_erosion(image, np.ones((3, 3))) for image in front])
-    own = _always_hidden(ndimage.median_filter(far_z, 3), _filled(_median(z, inner)), frequency)
-    limit[own] = np.inf
-    depths = np.concatenate([z[inner], far.z[own & background & (far.z > 0)]])
-    low, high = np.percentile(depths, _REACH) if len(depths) else (0.0, np.inf)
-    segmentation = MovingObject(far, limit, own, (float(low), float(high)))
+    if observed.any():
+        _check_static(far, frequency)
+    interior = np.stack([ndimage.binary_erosion(image, np.ones((3, 3))) for image in front])
+    always_occluded = _always_occluded(
+        ndimage.median_filter(background_z, 3), _filled(_median(z, interior)), frequency
+    )
+    limit[always_occluded] = np.inf
+    depths = np.concatenate([z[interior], far.z[always_occluded & observed & (far.z > 0)]])
+    low, high = np.percentile(depths, _DEPTH_PERCENTILES) if len(depths) else (0.0, np.inf)
+    segmentation = MovingObject(far, limit, always_occluded, (float(low), float(high)))
     _check_complete([segmentation.mask(image) for image in z], z)
     return segmentation
 
@@ -185,16 +187,16 @@ def _spatial_sigma(z: Float32) -> Float32:
     """(H, W) noise of z (N, H, W), from second differences of neighbouring pixels."""
     by_axis = []
     for axis in (1, 2):
-        line = np.moveaxis(z, axis, 2)
-        bend = np.full(line.shape, np.nan, np.float32)
-        three = (line[..., 2:] > 0) & (line[..., 1:-1] > 0) & (line[..., :-2] > 0)
-        second = np.abs(line[..., 2:] - 2 * line[..., 1:-1] + line[..., :-2])
-        bend[..., 1:-1] = np.where(three, second, np.nan)
-        by_axis.append(_median(np.moveaxis(bend, 2, axis), None))
+        lines = np.moveaxis(z, axis, 2)
+        second_difference = np.full(lines.shape, np.nan, np.float32)
+        valid = (lines[..., 2:] > 0) & (lines[..., 1:-1] > 0) & (lines[..., :-2] > 0)
+        magnitude = np.abs(lines[..., 2:] - 2 * lines[..., 1:-1] + lines[..., :-2])
+        second_difference[..., 1:-1] = np.where(valid, magnitude, np.nan)
+        by_axis.append(_median(np.moveaxis(second_difference, 2, axis), None))
     # The second difference of independent noise has six times its variance.
     sigma = np.fmin(*by_axis) / np.float32(np.sqrt(6) * MEDIAN_OF_NORMAL)
-    known = sigma[np.isfinite(sigma)]
-    typical = np.float32(np.median(known)) if len(known) else np.float32(0)
+    finite = sigma[np.isfinite(sigma)]
+    typical = np.float32(np.median(finite)) if len(finite) else np.float32(0)
     return np.where(np.isfinite(sigma), sigma, typical)
 
 
@@ -204,16 +206,16 @@ def _median(values: Float32, where: Bool | None) -> Float32:
         warnings.simplefilter("ignore", RuntimeWarning)  # for empty slices
         if where is None:
             return np.nanmedian(values, axis=0).astype(np.float32)
-        found = np.nanmedian(np.where(where, values, np.nan), axis=0)
-    return np.nan_to_num(found).astype(np.float32)
+        median = np.nanmedian(np.where(where, values, np.nan), axis=0)
+    return np.nan_to_num(median).astype(np.float32)
 
 
-def _check_still(far: FarSurface, frequency: Float64) -> None:
+def _check_static(far: FarSurface, frequency: Float64) -> None:
     """Refuse images whose borders are not static, and those without a moving object."""
     static = far.static_fraction >= _STATIC
     borders = (static[0], static[-1], static[:, 0], static[:, -1])
     sides = sorted(float(border.mean()) for border in borders)
-    # The object may extend beyond one border, such as one that stands on the floor.
+    # The object may extend beyond one border, for example if it stands on the floor.
     if sides[1] < _STATIC_BORDER:
         raise InputError(
             "needs a stationary camera and a background around the object, and "
@@ -232,8 +234,8 @@ def _check_still(far: FarSurface, frequency: Float64) -> None:
 def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
     """Refuse an object of which only parts or the rim were segmented."""
     outline = float(np.mean([_outline(mask, image) for mask, image in zip(masks, z, strict=True)]))
-    inner = sum(int(ndimage.binary_erosion(mask, np.ones((3, 3))).sum()) for mask in masks)
-    if outline < _MIN_OUTLINE or inner < _MIN_INNER * np.sum(masks):
+    interior = sum(int(ndimage.binary_erosion(mask, np.ones((3, 3))).sum()) for mask in masks)
+    if outline < _MIN_OUTLINE or interior < _MIN_INNER * np.sum(masks):
         raise InputError(
             "the moving object can't be separated from the background",
             where=_OPTION,
@@ -241,37 +243,39 @@ def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
         )
 
 
-def _always_hidden(z: Float32, passing: Float32, frequency: Float64) -> Bool:
-    """Mask (H, W) where the far surface z is the object itself, as it always hides the background.
+def _always_occluded(z: Float32, passing: Float32, frequency: Float64) -> Bool:
+    """Mask (H, W) where the far surface z is the object: it always occludes the background.
 
-    Such a segment of the far surface is nearer than the segments around it. Where the object passes
-    before these (in the fraction `frequency` of the frames), its depth (`passing`, 0 where unknown)
-    is about that of the segment. Only part of the rim must satisfy this: the object may stand on
-    something.
+    Such a segment of the far surface is nearer than the adjacent segments. Where the object passes
+    in front of these (in the fraction `frequency` of the frames), its depth (`passing`, 0 where
+    unknown) is close to that of the segment. Only part of the rim must satisfy this: the object may
+    stand on a support.
     """
     label = _segments(z)
     count = int(label.max()) + 1
     rim, joined = np.zeros(count), np.zeros(count)
     for a, b in _neighbours():
         for p, q in ((a, b), (b, a)):
-            apart = label[p] != label[q]
-            here, own = label[p][apart], z[p][apart]
-            behind = np.minimum(z[q][apart], 2 * own)  # finite even where nothing is measured
-            before, passes = passing[q][apart], frequency[q][apart]
-            # Nearer to the segment than to the surface behind.
-            near = np.abs(before - own) < 0.5 * np.abs(behind - own)
-            continues = (own < behind) & (passes > _SWEPT) & near
-            rim += np.bincount(here, minlength=count)
-            joined += np.bincount(here, weights=continues, minlength=count)
-    is_own = joined > _MIN_JOINED * np.maximum(rim, 1)
-    is_own[0] = False
-    return np.asarray(is_own[label])
+            boundary = label[p] != label[q]
+            segment, z_segment = label[p][boundary], z[p][boundary]
+            z_adjacent = np.minimum(
+                z[q][boundary], 2 * z_segment
+            )  # finite even where nothing is measured
+            z_object, frequency_adjacent = passing[q][boundary], frequency[q][boundary]
+            # Nearer to the segment than to the adjacent surface.
+            nearer_to_segment = np.abs(z_object - z_segment) < 0.5 * np.abs(z_adjacent - z_segment)
+            continues = (z_segment < z_adjacent) & (frequency_adjacent > _SWEPT) & nearer_to_segment
+            rim += np.bincount(segment, minlength=count)
+            joined += np.bincount(segment, weights=continues, minlength=count)
+    is_object = joined > _MIN_JOINED * np.maximum(rim, 1)
+    is_object[0] = False
+    return np.asarray(is_object[label])
 
 
 def _filled(z: Float32) -> Float32:
     """Fill the zeros of an image (H, W) from the nearest valid pixel within `_NEAR_PIXELS`."""
     distance, nearest = ndimage.distance_transform_edt(z <= 0, return_indices=True)
-    return np.where(distance <= _NEAR_PIXELS, z[tuple(nearest)], np.float32(0))
+    return np.where(distance <= _FILL_PIXELS, z[tuple(nearest)], np.float32(0))
 
 
 def _segments(z: Float32) -> Int32:
@@ -284,10 +288,10 @@ def _segments(z: Float32) -> Int32:
     pairs = []
     for a, b in _neighbours():
         with np.errstate(invalid="ignore"):
-            near = np.abs(z[a] - z[b]) <= _JUMP * np.minimum(z[a], z[b])
-        near |= np.isinf(z[a]) & np.isinf(z[b])
-        near &= (z[a] > 0) & (z[b] > 0)
-        pairs.append(np.stack([pixel[a][near], pixel[b][near]]))
+            connected = np.abs(z[a] - z[b]) <= _JUMP * np.minimum(z[a], z[b])
+        connected |= np.isinf(z[a]) & np.isinf(z[b])
+        connected &= (z[a] > 0) & (z[b] > 0)
+        pairs.append(np.stack([pixel[a][connected], pixel[b][connected]]))
     i, j = np.concatenate(pairs, axis=1)
     graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(z.size, z.size))
     _, label = connected_components(graph, directed=False)
@@ -315,7 +319,9 @@ def _outline(mask: Bool, z: Float32) -> float:
     for a, b in _neighbours():
         for p, q in ((a, b), (b, a)):
             rim = mask[p] & ~mask[q]
-            here, there = z[p][rim], z[q][rim]
-            total += len(here)
-            ends += int(np.count_nonzero((there <= 0) | (np.abs(there - here) > _JUMP * here)))
+            inside, outside = z[p][rim], z[q][rim]
+            total += len(inside)
+            ends += int(
+                np.count_nonzero((outside <= 0) | (np.abs(outside - inside) > _JUMP * inside))
+            )
     return ends / total if total else 1.0

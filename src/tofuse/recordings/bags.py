@@ -16,7 +16,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_folder, read_text
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import check_size
-from tofuse.recordings.ros_messages import GREY, image, taken
+from tofuse.recordings.ros_messages import GREY, header_time, image
 
 MISSING = "run `pip install 'tofuse[ros]'`, which installs rosbags"
 MAX_GAP_S = 0.02  # between the images of one frame
@@ -56,10 +56,10 @@ def _rosbags(path: Path) -> Any:
 
 
 def _check_folder(path: Path) -> None:
-    """Reject what rosbags would block on, or read without end.
+    """Reject files on which rosbags would block or never finish.
 
-    It opens whatever metadata.yaml names, and a YAML file of some hundred bytes that refers to its
-    own parts can expand to gigabytes.
+    It opens any file that metadata.yaml names, and a YAML file of a few hundred bytes with aliases
+    of its own parts can expand to gigabytes.
     """
     try:
         for entry in path.iterdir():
@@ -87,9 +87,9 @@ def _check_folder(path: Path) -> None:
         return  # rosbags raises a better error
 
 
-def _opened(path: Path, make: Callable[[Path], Any]) -> Any:
+def _opened(path: Path, factory: Callable[[Path], Any]) -> Any:
     try:
-        bag = make(path)
+        bag = factory(path)
         bag.open()
         return bag
     except InputError:
@@ -130,28 +130,30 @@ class Track:
 
     def __init__(self, bag: Any, connection: Any) -> None:
         self.bag, self.connection = bag, connection
-        stamps = [(t, taken(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()]
-        self._arrived = [arrived for arrived, _ in stamps]
-        self.times: Float64 = np.array([when or t / 1e9 for t, when in stamps])
-        self._running: Iterator[tuple[Any, int, Any]] | None = None
+        times_of_messages = [
+            (t, header_time(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()
+        ]
+        self._arrival_times = [arrival for arrival, _ in times_of_messages]
+        self.times: Float64 = np.array([stamp or t / 1e9 for t, stamp in times_of_messages])
+        self._iterator: Iterator[tuple[Any, int, Any]] | None = None
         self._next = 0
 
     def __len__(self) -> int:
-        return len(self._arrived)
+        return len(self._arrival_times)
 
     def raw(self, index: int) -> Any:
         """Return the bytes of a message; reading in order needs no search."""
-        if self._running is None or index != self._next:
+        if self._iterator is None or index != self._next:
             # Skip earlier messages with the same arrival time.
-            time = self._arrived[index]
-            self._running = self._messages(time)
-            for _ in range(index - self._arrived.index(time)):
-                next(self._running)
+            time = self._arrival_times[index]
+            self._iterator = self._messages(time)
+            for _ in range(index - self._arrival_times.index(time)):
+                next(self._iterator)
         self._next = index + 1
         try:
-            return next(self._running)[2]
+            return next(self._iterator)[2]
         except BaseException:
-            self._running = None
+            self._iterator = None
             raise
 
     def message(self, index: int) -> Any:
@@ -160,10 +162,10 @@ class Track:
         try:
             return self.bag.deserialize(raw, self.connection.msgtype)
         except BaseException:
-            self._running = None
+            self._iterator = None
             raise
 
-    def near(self, time: float, limit: float) -> int | None:
+    def nearest(self, time: float, limit: float) -> int | None:
         """Return the index of the message nearest to `time`, or None beyond `limit`, both in s."""
         if not len(self.times):
             return None
@@ -184,7 +186,7 @@ def amplitude_at(
     where: str,
     read: Callable[[Track, int], Any] = Track.message,
 ) -> Float32 | None:
-    """Return the amplitude (H, W) of the time of a depth image; zeros if there is none.
+    """Return the amplitude (H, W) at the time of a depth image; zeros if there is none.
 
     Parameters
     ----------
@@ -206,7 +208,7 @@ def amplitude_at(
     """
     if track is None:
         return None
-    k = track.near(time, MAX_GAP_S)
+    k = track.nearest(time, MAX_GAP_S)
     if k is None:
         return np.zeros((camera.height, camera.width), np.float32)
     counts = image(read(track, k), f"{where}, amplitude", GREY)
@@ -217,8 +219,8 @@ def amplitude_at(
 
 def first_message(bag: Any, topic: str) -> Any:
     """Return the first message of a topic, or None if there is none."""
-    chosen = [c for c in bag.connections if c.topic == topic]
-    if chosen:
-        for connection, _, raw in bag.messages(connections=chosen):
+    connections = [c for c in bag.connections if c.topic == topic]
+    if connections:
+        for connection, _, raw in bag.messages(connections=connections):
             return bag.deserialize(raw, connection.msgtype)
     return None

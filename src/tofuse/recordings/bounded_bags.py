@@ -1,6 +1,6 @@
 """Readers of the package rosbags with bounded memory, disk space and time.
 
-rosbags decompresses whatever a bag contains, and a compressed kilobyte may expand to gigabytes. The
+rosbags decompresses all that a bag contains, and a compressed kilobyte may expand to gigabytes. The
 limits are set in subclasses, and in a private copy of one module, without effect on other users of
 rosbags in this process. Importing this module needs rosbags.
 """
@@ -40,14 +40,14 @@ MAX_RATIO = 100  # of a whole file beyond MAX_CHUNK_BYTES; depth images reach 2 
 _BLOCK_BYTES = 1 << 20
 
 
-def _limited(make: Callable[[], Any]) -> Callable[[bytes, int], bytes]:
+def _limited(factory: Callable[[], Any]) -> Callable[[bytes, int], bytes]:
     def decompress(data: bytes, size: int) -> bytes:
         limit = min(size, MAX_CHUNK_BYTES)
-        decompressor = make()
-        found: bytes = decompressor.decompress(data, limit)
+        decompressor = factory()
+        content: bytes = decompressor.decompress(data, limit)
         if not decompressor.eof:
             raise ValueError(f"a chunk is cut off, or has more than {limit} bytes")
-        return found
+        return content
 
     return decompress
 
@@ -58,7 +58,7 @@ _ZSTD = _limited(zstd.ZstdDecompressor)
 
 
 def _private_copy(name: str) -> Any:
-    """Return a new instance of a module, with globals of its own."""
+    """Return a new instance of a module, with separate globals."""
     spec = importlib.util.find_spec(name)
     if spec is None or spec.loader is None:
         raise ImportError(name)
@@ -73,7 +73,7 @@ _mcap.DECOMPRESSORS |= {"lz4": _LZ4, "zstd": _ZSTD}
 
 
 class Rosbag1(rosbag1.Reader):
-    """A ROS 1 bag. It holds one chunk in memory at a time."""
+    """A ROS 1 bag, with one chunk in memory at a time."""
 
     def read_chunk(self) -> Chunk:
         """Read a chunk's header at the current position."""
@@ -144,30 +144,35 @@ class _Folder(DirectoryReader):
     ) -> Messages:
         """Yield connection, time in ns and data of the messages from `start` to before `stop`."""
         for connection, time, data in super().messages(connections, start, stop):
-            whole = _ZSTD(data, MAX_CHUNK_BYTES) if self._compressed_messages else data
-            yield connection, time, whole
+            content = _ZSTD(data, MAX_CHUNK_BYTES) if self._compressed_messages else data
+            yield connection, time, content
 
     def _expand(self) -> None:
         try:
             content = YAML(typ="safe").load((self._folder / "metadata.yaml").read_text())
-            about = content["rosbag2_bagfile_information"]
-            packed = (about["compression_mode"].lower(), about["compression_format"])
-            paths = [self._folder / PurePath(name).name for name in about["relative_file_paths"]]
+            information = content["rosbag2_bagfile_information"]
+            compression = (
+                information["compression_mode"].lower(),
+                information["compression_format"],
+            )
+            paths = [
+                self._folder / PurePath(name).name for name in information["relative_file_paths"]
+            ]
         except Exception:  # rosbags raises a better error, or needs no such entry
             return
-        if packed != ("file", "zstd") or not all(path.is_file() for path in paths):
+        if compression != ("file", "zstd") or not all(path.is_file() for path in paths):
             return
-        left = limit = _limit(sum(path.stat().st_size for path in set(paths)))
+        remaining = limit = _limit(sum(path.stat().st_size for path in set(paths)))
         self._expanded = TemporaryDirectory(prefix="tofuse-bag-")
         for path in paths:
             with zstd.open(path) as file, Path(self._expanded.name, path.stem).open("wb") as out:
                 while block := file.read(_BLOCK_BYTES):
-                    left -= len(block)
-                    if left < 0:
-                        raise _too_large(self._folder, limit)
+                    remaining -= len(block)
+                    if remaining < 0:
+                        raise _expansion_error(self._folder, limit)
                     out.write(block)
-        about |= {"compression_mode": "", "compression_format": ""}
-        about["relative_file_paths"] = [path.stem for path in paths]
+        information |= {"compression_mode": "", "compression_format": ""}
+        information["relative_file_paths"] = [path.stem for path in paths]
         temporary = Path(self._expanded.name)
         (temporary / "metadata.yaml").write_text(json.dumps(content))  # JSON is YAML
         self.path = temporary
@@ -198,7 +203,7 @@ class _Rosbag2(Reader):
             limit = _limit(storage.path.stat().st_size)
             if sum(chunk.uncompressed_size for chunk in chunks) > limit:
                 self.close()
-                raise _too_large(storage.path, limit)
+                raise _expansion_error(storage.path, limit)
 
 
 class AnyReader(highlevel.AnyReader):
@@ -215,7 +220,7 @@ def _limit(size: int) -> int:
     return max(MAX_CHUNK_BYTES, MAX_RATIO * size)
 
 
-def _too_large(path: Path, limit: int) -> InputError:
+def _expansion_error(path: Path, limit: int) -> InputError:
     return InputError(
         f"expands to more than {limit / 1e9:.3g} GB",
         where=path,

@@ -97,7 +97,7 @@ class CameraFile:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What a recording's metadata state of its depth and sensor."""
+        """Metadata of a recording's depth and sensor."""
         sensor = {} if self.sensor is None else {"sensor": self.sensor}
         return {"depth_kind": self.depth_kind, **sensor}
 
@@ -259,25 +259,25 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
     return description, camera
 
 
-def camera_file_of(folder: Path, given: Path | None, lacking: str) -> Path:
-    """Return the camera.json that is given, or else that of a recording's folder.
+def camera_file_of(folder: Path, camera_file: Path | None, content: str) -> Path:
+    """Return the camera.json passed by the user, or else that of a recording's folder.
 
     Parameters
     ----------
-    folder, given
-        The recording, and the file that the user gave, if any.
-    lacking
-        What files of this format don't contain, such as "neither size nor lens".
+    folder, camera_file
+        The recording, and the file passed by the user, if any.
+    content
+        Content of files of this format, for the message, such as "neither size nor lens".
 
     Raises
     ------
     InputError
         If there is no such file.
     """
-    path = given or folder / "camera.json"
+    path = camera_file or folder / "camera.json"
     if not is_file(path):
         raise InputError(
-            f"is missing: such files contain {lacking}",
+            f"is missing: such files contain {content}",
             where=path,
             remedy="pass a camera.json with --camera",
         )
@@ -415,20 +415,20 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
     for name in ("cx", "cy"):
         values[name] = get.number(name, required=True) or 0.0
     order = DISTORTION_ORDER[model]
-    given = get.data.get("distortion")
-    given = [] if given is None else given
-    if not isinstance(given, list):
-        raise get.error("distortion", f"is {given!r:.60}", f"use a list [{' '.join(order)}]")
-    for k, value in enumerate(given):
+    coefficients = get.data.get("distortion")
+    coefficients = [] if coefficients is None else coefficients
+    if not isinstance(coefficients, list):
+        raise get.error("distortion", f"is {coefficients!r:.60}", f"use a list [{' '.join(order)}]")
+    for k, value in enumerate(coefficients):
         _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", required=True)
-    extra = given[len(order) :]
+    extra = coefficients[len(order) :]
     if any(extra):
         raise get.error(
             "distortion",
-            f"has {len(given)} numbers, the model {model!r} takes {len(order)}",
+            f"has {len(coefficients)} numbers, the model {model!r} takes {len(order)}",
             f"use [{' '.join(order)}], or another model",
         )
-    values |= {name: float(v) for name, v in zip(order, given, strict=False)}
+    values |= {name: float(v) for name, v in zip(order, coefficients, strict=False)}
     cls = MODELS[model]
     parameters = {f.name for f in fields(cls)}
     values = {name: v for name, v in values.items() if name in parameters}

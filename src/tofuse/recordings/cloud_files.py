@@ -58,7 +58,7 @@ class CloudFileSource(FileSource):
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
         self.load_frame, self.load_shifted = load_frame, load_shifted
-        self._warned_far = False
+        self._warned_rounding = False
         self._cached: dict[int, Frame] = {}  # read to determine shift and camera
         self._deprojection: Deprojection | None = None
         if is_folder(path):
@@ -84,8 +84,8 @@ class CloudFileSource(FileSource):
         if self._deprojection is not None and isinstance(frame, CloudFrame):
             return self._deprojection.image(frame)
         farthest = float(np.abs(frame.points).max(initial=0))
-        if farthest > MAP_COORDINATES_M and not self._warned_far:
-            self._warned_far = True
+        if farthest > MAP_COORDINATES_M and not self._warned_rounding:
+            self._warned_rounding = True
             step = float(np.spacing(np.float32(farthest)))
             self.warnings.append(
                 f"{self.files[index]}: coordinates of up to {farthest:.3g} m are rounded to "
@@ -117,7 +117,7 @@ class CloudFileSource(FileSource):
             clouds.append(frame)
             if candidate is None:
                 candidate = find_deprojection(clouds)
-                if candidate is None:  # as for most clouds: one is sufficient to see it
+                if candidate is None:  # as for most clouds: one is sufficient to tell
                     return None
         return find_deprojection(clouds) if len(clouds) > 1 else candidate
 
@@ -182,7 +182,7 @@ def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
     return np.round((low + high) / 2 / _STEP_M) * _STEP_M
 
 
-def shift_words(shift: Float64) -> str:
+def describe_shift(shift: Float64) -> str:
     """Return the note on a shift (3,) of coordinates."""
     text = ", ".join(f"{value:.0f}" for value in shift)
     return f"coordinates are those of the files minus ({text}) m"
@@ -193,11 +193,11 @@ def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
     if not shift.any():
         return
     source.metadata["shift_m"] = shift.tolist()
-    source.warnings.append(f"{path}: {shift_words(shift)}")
-    back = np.eye(4)
-    back[:3, 3] = shift
-    source.reference = None if source.reference is None else source.reference @ back
-    source.odometry = None if source.odometry is None else source.odometry @ back
+    source.warnings.append(f"{path}: {describe_shift(shift)}")
+    T_file_frame = np.eye(4)
+    T_file_frame[:3, 3] = shift
+    source.reference = None if source.reference is None else source.reference @ T_file_frame
+    source.odometry = None if source.odometry is None else source.odometry @ T_file_frame
 
 
 def cloud_files(path: Path, *suffixes: str) -> list[Path]:

@@ -73,21 +73,21 @@ def _write(
     sample = recording.readable(_SAMPLED_FRAMES)
     if not sample:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
-    own = not _same_camera(sample)
-    writer = _writer(recording, sample, folder, own)
+    camera_per_frame = not _same_camera(sample)
+    writer = _writer(recording, sample, folder, camera_per_frame)
     channels = _channels(sample)
     written: list[int] = []
     for k, item in enumerate(recording.read_all()):
         if isinstance(item, UnreadableFrameError):
             warnings.append(f"skipped: {item}")
             continue
-        if not own and not _same_camera([sample[0], item]):
+        if not camera_per_frame and not _same_camera([sample[0], item]):
             raise InputError(
                 "has another camera than the frames sampled before",
                 where=f"{recording.path}: frame {item.index}",
                 remedy="convert the parts of the recording one by one",
             )
-        writer.add(_completed(item, channels))
+        writer.add(_with_channels(item, channels))
         written.append(k)
         if progress is not None:
             progress(len(written))
@@ -110,9 +110,9 @@ def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | Non
     if not isinstance(source, NativeSource) or source.correction is None:
         return recording, None
     correction = source.correction
-    bare = copy.copy(source)
-    bare.correction = None
-    return replace(recording, source=bare), correction
+    uncorrected = copy.copy(source)
+    uncorrected.correction = None
+    return replace(recording, source=uncorrected), correction
 
 
 def _same_camera(frames: list[Frame]) -> bool:
@@ -120,36 +120,38 @@ def _same_camera(frames: list[Frame]) -> bool:
     return all(camera == cameras[0] for camera in cameras)
 
 
-def _writer(recording: Recording, sample: list[Frame], folder: Path, own: bool) -> RecordingWriter:
-    about = recording.metadata
+def _writer(
+    recording: Recording, sample: list[Frame], folder: Path, camera_per_frame: bool
+) -> RecordingWriter:
+    metadata = recording.metadata
     first = sample[0]
-    facts: dict[str, Any] = {
-        name: about.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor")
+    properties: dict[str, Any] = {
+        name: metadata.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor")
     }
     if isinstance(first, CloudFrame):
-        return RecordingWriter(folder, None, **facts)
+        return RecordingWriter(folder, None, **properties)
     images = [f for f in sample if isinstance(f, RangeFrame)]
     camera = _common_camera([f.camera for f in images])
     sigmas = [float(f.sigma_image.max()) for f in images if f.sigma_image is not None]
-    sigma_unit = about.get("sigma_unit_m")
+    sigma_unit = metadata.get("sigma_unit_m")
     if sigma_unit is None and sigmas:
         sigma_unit = max(FINEST_SIGMA_M, _round_up(max(sigmas) / MAX_COUNTS))
-    unit = about.get("depth_unit_m")
+    unit = metadata.get("depth_unit_m")
     if unit is None:
         farthest = max(float(f.depth.max()) for f in images)
         unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / MAX_COUNTS))
     if any(f.amplitude_image is not None for f in images):
-        facts["amplitude_kind"] = first.amplitude_kind
+        properties["amplitude_kind"] = first.amplitude_kind
     return RecordingWriter(
         folder,
         camera,
         depth_unit_m=unit,
         depth_kind=first.depth_kind,
-        ambiguity_m=first.ambiguity_m or about.get("ambiguity_m"),
+        ambiguity_m=first.ambiguity_m or metadata.get("ambiguity_m"),
         sigma_unit_m=sigma_unit if sigmas else None,
         color_registered=all(f.color_registered for f in images),
-        own_cameras=own,
-        **facts,
+        camera_per_frame=camera_per_frame,
+        **properties,
     )
 
 
@@ -180,18 +182,18 @@ def _channels(sample: list[Frame]) -> tuple[str, ...]:
     )
 
 
-def _completed(frame: Frame, channels: tuple[str, ...]) -> Frame:
-    """The frame with exactly these channels, zeros where it has none."""
+def _with_channels(frame: Frame, channels: tuple[str, ...]) -> Frame:
+    """The frame with exactly these channels, zeros for missing ones."""
     if isinstance(frame, CloudFrame):
         return frame
     shape = frame.depth.shape
     missing: dict[str, Any] = {}
     for name in channels:
         if getattr(frame, name) is None:
-            kind = np.float32 if name == "amplitude_image" else np.uint8
-            missing[name] = np.zeros((*shape, 3) if name == "color_image" else shape, kind)
-    drop = {n: None for n in _CHANNELS if n not in channels and getattr(frame, n) is not None}
-    changes: dict[str, Any] = missing | drop
+            dtype = np.float32 if name == "amplitude_image" else np.uint8
+            missing[name] = np.zeros((*shape, 3) if name == "color_image" else shape, dtype)
+    dropped = {n: None for n in _CHANNELS if n not in channels and getattr(frame, n) is not None}
+    changes: dict[str, Any] = missing | dropped
     return replace(frame, **changes) if changes else frame
 
 
@@ -202,8 +204,8 @@ def _finish(
     correction: DepthCorrection | None,
 ) -> None:
     columns = getattr(recording.source, "frame_columns", None)
-    own = recording.indices[written]
-    lens = ("fx", "fy", "cx", "cy")
+    source_indices = recording.indices[written]
+    lens_columns = ("fx", "fy", "cx", "cy")
     writer.finish(
         groundtruth=None if recording.reference is None else recording.reference[written],
         odometry=None if recording.odometry is None else recording.odometry[written],
@@ -211,5 +213,9 @@ def _finish(
         imu=getattr(recording.source, "imu", None),
         frames=None
         if columns is None
-        else {n: c[own] for n, c in columns.items() if not (writer.own_cameras and n in lens)},
+        else {
+            n: c[source_indices]
+            for n, c in columns.items()
+            if not (writer.camera_per_frame and n in lens_columns)
+        },
     )

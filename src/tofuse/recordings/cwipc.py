@@ -36,14 +36,14 @@ class CwipcCamera:
         Its recording.
     trafo
         (4, 4) maps points in m into the world frame.
-    of_color
-        Whether these are points of the colour camera's frame; otherwise of the depth camera's.
+    in_color_frame
+        Whether these points are in the colour camera's frame; otherwise in the depth camera's.
     """
 
     name: str
     recording: Path
     trafo: Float64
-    of_color: bool
+    in_color_frame: bool
 
 
 def is_camera_config(path: Path) -> bool:
@@ -102,7 +102,7 @@ def rig_of(cameras: Sequence[CwipcCamera], recordings: Sequence[Recording]) -> R
         If a recording lacks the transform between its depth and colour camera, where it is needed.
     """
     T_world = [
-        camera.trafo @ _T_color_depth(recording) if camera.of_color else camera.trafo
+        camera.trafo @ _T_color_depth(recording) if camera.in_color_frame else camera.trafo
         for camera, recording in zip(cameras, recordings, strict=True)
     ]
     T_rig_world = inverse(T_world[0])
@@ -135,13 +135,13 @@ def _disabled(row: object) -> bool:
 
 
 def _camera(row: object, k: int, data: dict[str, Any], path: Path) -> CwipcCamera:
-    at = f"camera[{k}]"
+    location = f"camera[{k}]"
     if not isinstance(row, dict):
-        raise InputError(f"{at} is not an object", where=path, remedy=_REMEDY)
+        raise InputError(f"{location} is not an object", where=path, remedy=_REMEDY)
     kind = str(row.get("type", data.get("type"))).partition("_")[0]
     if kind not in _SUFFIXES:
         raise InputError(
-            f"{at}.type is {row.get('type')!s:.40}, of which no recordings are read",
+            f"{location}.type is {row.get('type')!s:.40}, of which no recordings are read",
             where=path,
             remedy=f"use cameras of the types {', '.join(_SUFFIXES)}",
         )
@@ -151,24 +151,28 @@ def _camera(row: object, k: int, data: dict[str, Any], path: Path) -> CwipcCamer
     for text, field in ((name, "serial"), (file, "filename")):
         if not isinstance(text, str) or not text.strip() or not is_plain_name(text):
             raise InputError(
-                f"{at}.{field} is {text!r:.80}, not the name of a file in the same folder",
+                f"{location}.{field} is {text!r:.80}, not the name of a file in the same folder",
                 where=path,
                 remedy="put the recordings next to the file, and set their names",
             )
-    return CwipcCamera(name, path.parent / file, _trafo(row, at, path), _of_color(kind, data))
+    return CwipcCamera(
+        name, path.parent / file, _trafo(row, location, path), _in_color_frame(kind, data)
+    )
 
 
-def _trafo(row: dict[str, Any], at: str, path: Path) -> Float64:
+def _trafo(row: dict[str, Any], location: str, path: Path) -> Float64:
     try:
         T = np.asarray(row.get("trafo"), np.float64)
     except (TypeError, ValueError):
         T = np.zeros(0)
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(f"{at}.trafo is not 4 x 4 finite numbers", where=path, remedy=_REMEDY)
-    return orthonormalise(check_pose(T, where=f"{path}: {at}.trafo"))
+        raise InputError(
+            f"{location}.trafo is not 4 x 4 finite numbers", where=path, remedy=_REMEDY
+        )
+    return orthonormalise(check_pose(T, where=f"{path}: {location}.trafo"))
 
 
-def _of_color(kind: str, data: dict[str, Any]) -> bool:
+def _in_color_frame(kind: str, data: dict[str, Any]) -> bool:
     """Whether cwipc computes points in the colour camera's frame.
 
     It always does for Kinect and Orbbec; for RealSense only if depth is mapped to colour.

@@ -102,7 +102,7 @@ class RangeFrame:
     camera
         Rays of the pixels.
     depth
-        (H, W) float32 in m, 0 where invalid. Radial range or z depth: `depth_kind` says which.
+        (H, W) float32 in m, 0 where invalid: radial range or z depth, see `depth_kind`.
     depth_kind
         "z" or "range".
     amplitude_image
@@ -161,9 +161,9 @@ class RangeFrame:
                 )
         depth = np.asarray(self.depth, np.float32)
         # Frames of readers rarely need this copy.
-        good = (depth >= 0) & (depth < np.inf)
-        if not good.all():
-            depth = np.where(good, depth, np.float32(0))
+        valid = (depth >= 0) & (depth < np.inf)
+        if not valid.all():
+            depth = np.where(valid, depth, np.float32(0))
         object.__setattr__(self, "depth", depth)
 
     @cached_property
@@ -222,12 +222,12 @@ class RangeFrame:
 
     def keep(self, mask: Bool) -> Self:
         """Return the frame with every pixel outside the (H, W) mask made invalid."""
-        kept = object.__new__(type(self))
+        frame = object.__new__(type(self))
         # Without the checks of __post_init__, which this frame has passed.
-        for each in fields(self):
-            object.__setattr__(kept, each.name, getattr(self, each.name))
-        object.__setattr__(kept, "depth", np.where(mask, self.depth, np.float32(0)))
-        return kept
+        for attribute in fields(self):
+            object.__setattr__(frame, attribute.name, getattr(self, attribute.name))
+        object.__setattr__(frame, "depth", np.where(mask, self.depth, np.float32(0)))
+        return frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,13 +82,13 @@ def from_arrays(
     frames = []
     for k, image in enumerate(images):
         metres = to_metres(image)
-        good = np.isfinite(metres) & (metres > 0)
+        valid = np.isfinite(metres) & (metres > 0)
         frames.append(
             RangeFrame(
                 k,
                 float(times[k]),
                 checked_camera,
-                np.where(good, metres, 0).astype(np.float32),
+                np.where(valid, metres, 0).astype(np.float32),
                 depth_kind,
                 amplitude_image=None if amplitudes is None else amplitudes[k],
                 confidence_image=None if confidences is None else confidences[k],
@@ -104,9 +104,9 @@ def from_arrays(
     return Recording.of(source, "arrays", "arrays")
 
 
-def _images(name: str, given: Any, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
+def _images(name: str, values: Any, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
     try:
-        images = [np.asarray(image) for image in given]
+        images = [np.asarray(image) for image in values]
     except TypeError as error:
         raise InputError(
             "is not an array of images", where=name, remedy="pass (N, H, W)"
@@ -124,30 +124,30 @@ def _images(name: str, given: Any, shape: tuple[int, ...] | None) -> list[NDArra
 
 def _optional(
     name: str,
-    given: Any,
+    values: Any,
     images: list[NDArray[Any]],
     dtype: type[np.generic],
     channels: int | None = None,
 ) -> list[NDArray[Any]] | None:
-    if given is None:
+    if values is None:
         return None
     shape = images[0].shape if channels is None else (*images[0].shape, channels)
-    optional = _images(name, given, shape)
-    if len(optional) != len(images):
-        raise InputError(f"contains {len(optional)} images, and depth {len(images)}", where=name)
-    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in optional):
-        raise InputError(f"is {optional[0].dtype}", where=name, remedy="use uint8, from 0 to 255")
-    return [image.astype(dtype, copy=False) for image in optional]
+    converted = _images(name, values, shape)
+    if len(converted) != len(images):
+        raise InputError(f"contains {len(converted)} images, and depth {len(images)}", where=name)
+    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in converted):
+        raise InputError(f"is {converted[0].dtype}", where=name, remedy="use uint8, from 0 to 255")
+    return [image.astype(dtype, copy=False) for image in converted]
 
 
 def _to_metres(
     images: list[NDArray[Any]], unit_m: float | None
 ) -> Callable[[NDArray[Any]], Float64]:
-    whole = images[0].dtype.kind in "iub"
-    scale = unit_m if unit_m is not None else (_MILLIMETRES if whole else 1.0)
+    is_integer = images[0].dtype.kind in "iub"
+    scale = unit_m if unit_m is not None else (_MILLIMETRES if is_integer else 1.0)
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"is {scale}", where="depth_unit_m", remedy="use metres, above 0")
-    if unit_m is None and not whole:
+    if unit_m is None and not is_integer:
         sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
         sample = sample[np.isfinite(sample) & (sample > 0)]
         if len(sample) and np.median(sample) > _MAX_MEDIAN_M:
@@ -159,22 +159,22 @@ def _to_metres(
 
     def to_metres(image: NDArray[Any]) -> Float64:
         metres = image.astype(np.float64) * scale
-        return np.where(image == INVALID_DEPTH, 0.0, metres) if whole else metres
+        return np.where(image == INVALID_DEPTH, 0.0, metres) if is_integer else metres
 
     return to_metres
 
 
-def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
+def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
     height, width = shape
-    if isinstance(given, Pinhole | RayTable):
-        if (given.height, given.width) != (height, width):
+    if isinstance(camera, Pinhole | RayTable):
+        if (camera.height, camera.width) != (height, width):
             raise InputError(
-                f"has {given.width} x {given.height} pixels, and depth {width} x {height}",
+                f"has {camera.width} x {camera.height} pixels, and depth {width} x {height}",
                 where="camera",
             )
-        return given
+        return camera
     try:
-        K = np.asarray(given, float)
+        K = np.asarray(camera, float)
     except (TypeError, ValueError) as error:
         raise InputError(
             "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
@@ -188,10 +188,10 @@ def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
     return Pinhole(width, height, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
-def _times(given: ArrayLike | None, count: int) -> Float64:
-    if given is None:
+def _times(timestamps: ArrayLike | None, count: int) -> Float64:
+    if timestamps is None:
         return np.arange(count) / 30
-    times = np.asarray(given, float)
+    times = np.asarray(timestamps, float)
     if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError(
             "must be one finite number for each image, ascending",
@@ -201,10 +201,10 @@ def _times(given: ArrayLike | None, count: int) -> Float64:
     return times
 
 
-def _poses(name: str, given: ArrayLike | None, count: int) -> Float64 | None:
-    if given is None:
+def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:
+    if values is None:
         return None
-    poses = np.asarray(given, float)
+    poses = np.asarray(values, float)
     if poses.shape != (count, 4, 4):
         raise InputError(
             f"has shape {poses.shape}", where=name, remedy=f"pass ({count}, 4, 4) T_world_camera"

@@ -16,18 +16,18 @@ from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.camera_file import MAX_SLOPE
 
 BOUGUET, FISHEYE = 0, 2
-# version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.
+# version, units of distance and amplitude, 3 factors, 6 of the mounting, model and parameters.
 _INFO = struct.Struct("<I2f3f6fI32f")
-_NUMBERS = 10
+_PARAMETERS = 10
 
 
 @dataclass(frozen=True)
 class HeadInfo:
-    """Unit of the distances in m, and model and numbers of the lens."""
+    """Unit of the distances in m, and model and parameters of the lens."""
 
     distance_unit_m: float
     model: int
-    numbers: tuple[float, ...]
+    parameters: tuple[float, ...]
 
     def metres(self, image: NDArray[Any]) -> Float32:
         """Convert distances or their noise to m: integers are counts, floats are in m already."""
@@ -45,12 +45,12 @@ def read_info(data: bytes, where: str) -> HeadInfo:
     """
     if len(data) < _INFO.size:
         raise InputError("is cut off", where=where, remedy="copy the file again")
-    _, unit, *rest = _INFO.unpack_from(data)
-    model, numbers = rest[10], tuple(rest[11:21])
-    return checked_info(float(unit), int(model), numbers, where)
+    _, unit, *values = _INFO.unpack_from(data)
+    model, parameters = values[10], tuple(values[11:21])
+    return checked_info(float(unit), int(model), parameters, where)
 
 
-def checked_info(unit: float, model: int, numbers: tuple[float, ...], where: str) -> HeadInfo:
+def checked_info(unit: float, model: int, parameters: tuple[float, ...], where: str) -> HeadInfo:
     """Return the information with a unit in m, a lens model and its first ten parameters.
 
     Raises
@@ -58,9 +58,9 @@ def checked_info(unit: float, model: int, numbers: tuple[float, ...], where: str
     InputError
         If they are implausible.
     """
-    if not 1e-6 < unit < 1 or len(numbers) != _NUMBERS or not np.isfinite(numbers).all():
+    if not 1e-6 < unit < 1 or len(parameters) != _PARAMETERS or not np.isfinite(parameters).all():
         raise InputError("has implausible calibration values", where=where, remedy="copy it again")
-    return HeadInfo(unit, model, numbers)
+    return HeadInfo(unit, model, parameters)
 
 
 @lru_cache(maxsize=16)
@@ -72,12 +72,12 @@ def head_camera(info: HeadInfo, width: int, height: int, where: str) -> RayTable
     model = info.model
     if model not in (BOUGUET, FISHEYE):
         raise InputError(f"has the lens model {model}, not 0 or 2", where=where)
-    fx, fy, mx, my, skew, *k = info.numbers
+    fx, fy, cx, cy, skew, *k = info.parameters
     if not (1 < fx < 1e5 and 1 < fy < 1e5):
         raise InputError(f"has focal lengths of {fx:g} and {fy:g} pixels", where=where)
     v, u = np.mgrid[:height, :width] + 0.5
-    y = (v - my) / fy
-    x = (u - mx) / fx - skew * y
+    y = (v - cy) / fy
+    x = (u - cx) / fx - skew * y
     with np.errstate(all="ignore"):
         rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
         rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan

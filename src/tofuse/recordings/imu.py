@@ -14,9 +14,9 @@ GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
 # A sample is assigned to the nearest frame in time, within this distance in s.
 _MAX_GAP_S = 0.25
 # Largest relative deviation of the measured acceleration from its median.
-_PLAUSIBLE = 0.5
+_MAX_DEVIATION = 0.5
 # Error of the fused direction of phones, and the smallest error of any direction, rad.
-_FUSED, _MIN_SIGMA = 0.01, 0.002
+_FUSED_SIGMA, _MIN_SIGMA = 0.01, 0.002
 
 
 def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
@@ -46,34 +46,36 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
     if "timestamp" not in imu or not all(name in imu for name in names) or not len(times):
         return None
     samples = np.stack([imu[name] for name in names], 1) * (1.0 if fused else -1.0)
-    at = np.asarray(imu["timestamp"], float)
-    good = np.isfinite(samples).all(1) & np.isfinite(at)
-    samples, at = samples[good], at[good]
+    sample_times = np.asarray(imu["timestamp"], float)
+    finite = np.isfinite(samples).all(1) & np.isfinite(sample_times)
+    samples, sample_times = samples[finite], sample_times[finite]
     out = np.full((len(times), 4), np.nan)
-    if not len(at):
+    if not len(sample_times):
         return out
-    owner = _nearest(np.asarray(times, float), at)
-    near = np.abs(at - times[owner]) <= _MAX_GAP_S
-    count = np.bincount(owner[near], minlength=len(times))
+    frame_index = _nearest(np.asarray(times, float), sample_times)
+    assigned = np.abs(sample_times - times[frame_index]) <= _MAX_GAP_S
+    count = np.bincount(frame_index[assigned], minlength=len(times))
     mean = np.zeros((len(times), 3))
-    np.add.at(mean, owner[near], samples[near])
+    np.add.at(mean, frame_index[assigned], samples[assigned])
     mean /= np.maximum(count, 1)[:, None]
     length = np.linalg.norm(mean, axis=1)
-    known = (count > 0) & (length > 0)
-    if not known.any():
+    valid = (count > 0) & (length > 0)
+    if not valid.any():
         return out
-    typical = float(np.median(length[known]))
-    off = np.abs(length / typical - 1)
-    spread = robust_sigma(off[known])
-    known &= off < _PLAUSIBLE
-    out[known, :3] = mean[known] / length[known, None]
-    out[known, 3] = _FUSED if fused else np.sqrt(spread**2 + off[known] ** 2 + _MIN_SIGMA**2)
+    typical = float(np.median(length[valid]))
+    deviation = np.abs(length / typical - 1)
+    spread = robust_sigma(deviation[valid])
+    valid &= deviation < _MAX_DEVIATION
+    out[valid, :3] = mean[valid] / length[valid, None]
+    out[valid, 3] = (
+        _FUSED_SIGMA if fused else np.sqrt(spread**2 + deviation[valid] ** 2 + _MIN_SIGMA**2)
+    )
     return out
 
 
-def _nearest(times: Float64, at: Float64) -> Intp:
-    """(S,) index of the nearest of the times (N,) to each of `at` (S,); ties go to the earlier."""
+def _nearest(times: Float64, queries: Float64) -> Intp:
+    """(S,) index of the time (N,) nearest to each of the queries (S,); the earlier one in ties."""
     order = np.argsort(times, kind="stable")
     ordered = times[order]
     midpoints = 0.5 * (ordered[1:] + ordered[:-1])
-    return order[np.searchsorted(midpoints, at, side="left")]
+    return order[np.searchsorted(midpoints, queries, side="left")]

@@ -60,11 +60,11 @@ def convert_to(
 
 def _write(recording: Recording, folder: Path, layout: Layout) -> tuple[int, list[str]]:
     warnings: list[str] = []
-    colors = "rgb" if layout == "tum" else "color"
+    color_folder = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None
     white = 0.0
     written: list[int] = []
-    beyond = 0
+    out_of_range = 0
     for k, item in enumerate(recording.read_all()):
         if isinstance(item, UnreadableFrameError):
             warnings.append(f"skipped: {item}")
@@ -85,17 +85,17 @@ def _write(recording: Recording, folder: Path, layout: Layout) -> tuple[int, lis
                 white = float(np.percentile(positive, _WHITE_PERCENTILE))
         frame = rectifier(item)
         counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
-        beyond += int((counts >= MAX_COUNTS).sum())
+        out_of_range += int((counts >= MAX_COUNTS).sum())
         counts[counts >= MAX_COUNTS] = 0
         name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
         write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
-        write_png(make_folder(folder / colors) / name, _color(frame, white))
+        write_png(make_folder(folder / color_folder) / name, _color(frame, white))
         written.append(k)
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
-    if beyond:
+    if out_of_range:
         farthest = MAX_COUNTS / COUNTS_PER_M[layout]
-        warnings.append(f"{beyond} pixels beyond {farthest:.1f} m don't fit, and are dropped")
+        warnings.append(f"{out_of_range} pixels beyond {farthest:.1f} m don't fit, and are dropped")
     finish = _finish_tum if layout == "tum" else _finish_open3d
     finish(recording, folder, rectifier.pinhole, written)
     return len(written), warnings
@@ -126,16 +126,16 @@ def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: li
     if recording.reference is not None:
         write_tum(folder / "groundtruth.txt", times, recording.reference[written])
     # The layout does not store the camera; this file is for --camera.
-    about = {"schema": SCHEMA, **camera_fields(camera)}
-    about |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
-    write_text(folder / "lens.json", json.dumps(about, indent=1) + "\n")
+    description = {"schema": SCHEMA, **camera_fields(camera)}
+    description |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
+    write_text(folder / "lens.json", json.dumps(description, indent=1) + "\n")
 
 
 def _finish_open3d(recording: Recording, folder: Path, camera: Pinhole, written: list[int]) -> None:
     columns = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
-    about = {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
-    write_text(folder / "camera_intrinsic.json", json.dumps(about, indent=1) + "\n")
+    description = {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
+    write_text(folder / "camera_intrinsic.json", json.dumps(description, indent=1) + "\n")
     if recording.reference is not None:
         poses = recording.reference[written]
-        known = np.isfinite(poses[:, 0, 0])
-        write_log(folder / "trajectory.log", poses[known], np.flatnonzero(known))
+        posed = np.isfinite(poses[:, 0, 0])
+        write_log(folder / "trajectory.log", poses[posed], np.flatnonzero(posed))

@@ -78,5 +78,5 @@ def simplest_lens(
         name = "rational"
     elif any(k.values()):
         name = "brown"
-    kept = {key: k[key] for key in DISTORTION_ORDER[name]}
-    return checked_lens(MODELS[name], size, values | kept, where)
+    coefficients = {key: k[key] for key in DISTORTION_ORDER[name]}
+    return checked_lens(MODELS[name], size, values | coefficients, where)

@@ -35,28 +35,28 @@ from tofuse.recordings.sources import FileSource
 def topics(path: Path) -> frozenset[str]:
     """Return the topics of a bag, none if it can't be opened."""
     try:
-        now = path.stat()
+        status = path.stat()
     except OSError:
         return frozenset()
-    return _topics_of(path, now.st_mtime_ns, now.st_size)
+    return _topics_of(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)
 def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
-    """See `topics`; cached, as several readers ask and opening a large bag is slow."""
+    """See `topics`; cached, as several readers call it and opening a large bag is slow."""
     try:
         if is_folder(path):
             is_bag = is_file(path / "metadata.yaml") and bool(
                 files_with(path, ".db3", ".mcap", ".zstd")
             )
-            old = False
+            is_ros1 = False
         else:
             head = read_head(path, 16)
-            old = head.startswith(ROS1_MAGIC)
-            is_bag = old or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
+            is_ros1 = head.startswith(ROS1_MAGIC)
+            is_bag = is_ros1 or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
         if not is_bag:
             return frozenset()
-        bag = open_container(path) if old else open_bag(path)
+        bag = open_container(path) if is_ros1 else open_bag(path)
     except InputError:
         return frozenset()
     try:
@@ -88,13 +88,13 @@ class BagSource(FileSource):
         weakref.finalize(self, self.bag.close)
         super().__init__(np.zeros(0))
         try:
-            self.find()
+            self.find_streams()
             if options.camera is None:
                 self.camera = self.lens()
             else:
-                about, self.camera = load_camera(options.camera)
-                self.unit, self.kind = about.depth_unit_m, about.depth_kind
-                self.color_camera = about.color
+                description, self.camera = load_camera(options.camera)
+                self.unit, self.kind = description.depth_unit_m, description.depth_kind
+                self.color_camera = description.color
             self._find_color()
         except InputError:
             raise
@@ -110,7 +110,7 @@ class BagSource(FileSource):
         """Open the bag, so that its messages can be decoded."""
         return open_bag(path)
 
-    def find(self) -> None:
+    def find_streams(self) -> None:
         """Set `unit` and `depth`, and `amplitude` and `color` if the bag has them."""
         raise NotImplementedError
 
@@ -164,7 +164,7 @@ class BagSource(FileSource):
 
     def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
         """The frame with the colour image nearest in time, if there is one."""
-        k = None if self.color is None else self.color.near(frame.timestamp, MAX_GAP_S)
+        k = None if self.color is None else self.color.nearest(frame.timestamp, MAX_GAP_S)
         if k is None or self.color is None or self.color_camera is None:
             return frame
         where = f"{where}, colour"
@@ -179,11 +179,11 @@ class BagSource(FileSource):
                 return track if len(track) else None
         return None
 
-    def required_track(self, topic: str, what: str) -> Track:
-        """Return the messages of a topic, called `what` in the error if there are none."""
+    def required_track(self, topic: str, noun: str) -> Track:
+        """Return the messages of a topic, called `noun` in the error if there are none."""
         track = self.track(topic)
         if track is None:
             raise InputError(
-                f"has no {what} ({topic})", where=self.path, remedy="record the depth stream"
+                f"has no {noun} ({topic})", where=self.path, remedy="record the depth stream"
             )
         return track

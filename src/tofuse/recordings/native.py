@@ -67,7 +67,7 @@ class RecordingWriter:
         Metres per count of sigma; None: frames' sigma is not written.
     color_registered
         Whether colour is registered to depth.
-    own_cameras
+    camera_per_frame
         Whether to write a camera per frame: its lens if it has the model and distortion of
         `camera`, else its rays.
 
@@ -97,22 +97,22 @@ class RecordingWriter:
         sensor: str | None = None,
         sigma_unit_m: float | None = None,
         color_registered: bool = True,
-        own_cameras: bool = False,
+        camera_per_frame: bool = False,
     ) -> None:
         self.folder = make_folder(folder)
         if any(self.folder.iterdir()):
             raise OutputError("isn't empty", where=self.folder, remedy="choose a new folder")
         self.camera = camera
         self.depth_unit_m, self.depth_kind = depth_unit_m, depth_kind
-        self.sigma_unit_m, self.own_cameras = sigma_unit_m, own_cameras
+        self.sigma_unit_m, self.camera_per_frame = sigma_unit_m, camera_per_frame
         self.out_of_range = 0
         self._lenses: list[tuple[float, ...]] = []
         self._channels: frozenset[str] | None = None
         self._times: list[float] = []
-        self._about: dict[str, Any] = {"schema": SCHEMA}
+        self._description: dict[str, Any] = {"schema": SCHEMA}
         if camera is not None:
-            self._about |= camera_fields(camera)
-            self._about |= {"depth_unit_m": float(depth_unit_m), "depth_kind": depth_kind}
+            self._description |= camera_fields(camera)
+            self._description |= {"depth_unit_m": float(depth_unit_m), "depth_kind": depth_kind}
         optional: dict[str, Any] = {
             "frame_rate_hz": frame_rate_hz,
             "ambiguity_m": ambiguity_m,
@@ -122,7 +122,7 @@ class RecordingWriter:
             "sigma_unit_m": sigma_unit_m,
             "color_registered": None if color_registered else False,
         }
-        self._about |= {key: value for key, value in optional.items() if value is not None}
+        self._description |= {key: value for key, value in optional.items() if value is not None}
 
     def __len__(self) -> int:
         return len(self._times)
@@ -141,7 +141,7 @@ class RecordingWriter:
             self._write_images(frame)
         self._times.append(float(frame.timestamp))
 
-    def _name(self, channel: str, suffix: str) -> Path:
+    def _frame_path(self, channel: str, suffix: str) -> Path:
         return make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"
 
     def _write_cloud(self, frame: CloudFrame) -> None:
@@ -149,7 +149,7 @@ class RecordingWriter:
             raise InputError("is a cloud", where=f"frame {frame.index}", remedy="add only images")
         self._check_channels(frame, "cloud")
         write_ply(
-            self._name("cloud", ".ply"),
+            self._frame_path("cloud", ".ply"),
             GeometryRecord(
                 frame.points,
                 normals=frame.normals,
@@ -176,32 +176,34 @@ class RecordingWriter:
         }
         self._check_channels(frame, *(name for name, image in images.items() if image is not None))
         depth = frame.z if self.depth_kind == "z" else frame.radial_range
-        write_png(self._name("depth", ".png"), self._counts(depth))
+        write_png(self._frame_path("depth", ".png"), self._counts(depth))
         if frame.amplitude_image is not None:
-            write_png(self._name("amplitude", ".png"), self._amplitude(frame.amplitude_image))
+            write_png(self._frame_path("amplitude", ".png"), self._amplitude(frame.amplitude_image))
         if frame.confidence_image is not None:
             confidence = frame.confidence_image.astype(np.uint8, copy=False)
-            write_png(self._name("confidence", ".png"), confidence)
+            write_png(self._frame_path("confidence", ".png"), confidence)
         if frame.color_image is not None:
-            write_png(self._name("color", ".png"), frame.color_image)
+            write_png(self._frame_path("color", ".png"), frame.color_image)
         if self.sigma_unit_m is not None and frame.sigma_image is not None:
             counts = np.rint(frame.sigma_image.astype(float) / self.sigma_unit_m)
-            write_png(self._name("sigma", ".png"), np.clip(counts, 0, MAX_COUNTS).astype(np.uint16))
-        if self.own_cameras:
+            write_png(
+                self._frame_path("sigma", ".png"), np.clip(counts, 0, MAX_COUNTS).astype(np.uint16)
+            )
+        if self.camera_per_frame:
             self._write_camera(frame.camera, camera)
 
-    def _write_camera(self, own: Camera, common: Camera) -> None:
+    def _write_camera(self, camera: Camera, common: Camera) -> None:
         if isinstance(common, Pinhole):
-            if not isinstance(own, Pinhole) or not same_distortion(own, common):
+            if not isinstance(camera, Pinhole) or not same_distortion(camera, common):
                 raise InputError(
                     "has another lens model than the first",
                     where=f"frame {len(self)}",
                     remedy="use a RayTable as the common camera",
                 )
-            self._lenses.append((own.fx, own.fy, own.cx, own.cy))
+            self._lenses.append((camera.fx, camera.fy, camera.cx, camera.cy))
             return
-        with replacing(self._name("rays", ".npy")) as temporary, temporary.open("wb") as file:
-            np.save(file, np.asarray(own.rays(), np.float32))
+        with replacing(self._frame_path("rays", ".npy")) as temporary, temporary.open("wb") as file:
+            np.save(file, np.asarray(camera.rays(), np.float32))
 
     def _check_channels(self, frame: Frame, *names: str) -> None:
         if self._channels is None:
@@ -215,15 +217,15 @@ class RecordingWriter:
 
     def _counts(self, depth: Float32) -> UInt16:
         counts = np.rint(depth.astype(float) / self.depth_unit_m)
-        beyond = counts >= INVALID_DEPTH
-        self.out_of_range += int(beyond.sum())
-        return np.where(beyond, 0, counts).astype(np.uint16)
+        overflow = counts >= INVALID_DEPTH
+        self.out_of_range += int(overflow.sum())
+        return np.where(overflow, 0, counts).astype(np.uint16)
 
     def _amplitude(self, amplitude: Float32) -> UInt16:
         counts = np.rint(np.nan_to_num(amplitude.astype(float)))
-        beyond = (counts >= SATURATED_AMPLITUDE) & (amplitude != SATURATED_AMPLITUDE)
-        self.out_of_range += int(beyond.sum())
-        counts[beyond] = SATURATED_AMPLITUDE - 1
+        overflow = (counts >= SATURATED_AMPLITUDE) & (amplitude != SATURATED_AMPLITUDE)
+        self.out_of_range += int(overflow.sum())
+        counts[overflow] = SATURATED_AMPLITUDE - 1
         return np.clip(counts, 0, SATURATED_AMPLITUDE).astype(np.uint16)
 
     def finish(
@@ -235,7 +237,7 @@ class RecordingWriter:
         imu: Mapping[str, NDArray[np.generic]] | None = None,
         frames: Mapping[str, NDArray[np.generic]] | None = None,
     ) -> Path:
-        """Write the files of the whole recording, camera.json last, and return the folder.
+        """Write the files common to all frames, camera.json last, and return the folder.
 
         Parameters
         ----------
@@ -276,5 +278,5 @@ class RecordingWriter:
             with replacing(self.folder / "rays.npy") as temporary:
                 np.save(temporary, np.asarray(self.camera.table, np.float32))
         write_text(self.folder / "timestamps.txt", "".join(exact(t) + "\n" for t in self._times))
-        write_text(self.folder / "camera.json", json.dumps(self._about, indent=1) + "\n")
+        write_text(self.folder / "camera.json", json.dumps(self._description, indent=1) + "\n")
         return self.folder

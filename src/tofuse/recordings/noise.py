@@ -15,8 +15,8 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NOISE, AmplitudeLaw, NoiseModel
 
-# Words in a sensor's name, in lower case, the more specific ones first.
-_WORDS = (
+# Keywords in a sensor's name, in lower case, the more specific ones first.
+_SENSOR_KEYWORDS = (
     (("sr4000", "swissranger"), "sr4000"),
     (("kinect v2", "kinect2", "kinectv2"), "kinect2"),
     (("azure",), "azure-nfov"),
@@ -53,10 +53,10 @@ def noise_model_for(recording: Recording) -> NoiseModel:
     InputError
         If there is an invalid noise.json.
     """
-    given = _in_folder(recording)
-    if given is not None:
-        return given
-    frames = _some_frames(recording)
+    stored = _in_folder(recording)
+    if stored is not None:
+        return stored
+    frames = _sampled_frames(recording)
     model = NOISE[family_of(recording, frames[0] if frames else None)]
     if model.amplitude is None:
         return model
@@ -67,8 +67,8 @@ def noise_model_for(recording: Recording) -> NoiseModel:
 def family_of(recording: Recording, frame: RangeFrame | None) -> str:
     """Return the name of the camera family in `NOISE`; "unknown" if it can't be determined."""
     sensor = str(recording.metadata.get("sensor", "")).lower()
-    for words, family in _WORDS:
-        if any(word in sensor for word in words):
+    for keywords, family in _SENSOR_KEYWORDS:
+        if any(keyword in sensor for keyword in keywords):
             return family
     if frame is None:
         return "unknown"
@@ -85,10 +85,10 @@ def _in_folder(recording: Recording) -> NoiseModel | None:
     return None
 
 
-def _some_frames(recording: Recording) -> list[RangeFrame]:
-    chosen = np.unique(np.linspace(0, len(recording) - 1, _SAMPLED_FRAMES).astype(int))
+def _sampled_frames(recording: Recording) -> list[RangeFrame]:
+    positions = np.unique(np.linspace(0, len(recording) - 1, _SAMPLED_FRAMES).astype(int))
     frames = []
-    for k in chosen:
+    for k in positions:
         try:
             frame = recording[int(k)]
         except UnreadableFrameError:
@@ -118,15 +118,15 @@ def _rescaled(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) ->
 
 def _log_excess(model: NoiseModel, frames: list[RangeFrame]) -> float:
     """Median log ratio of the noise in second differences along rows to that of the model."""
-    ratios_of = []
+    ratios_by_frame = []
     for frame in frames:
-        values, ok = frame.radial_range.astype(float), frame.valid
+        values, valid = frame.radial_range.astype(float), frame.valid
         second = values[:, :-2] - 2 * values[:, 1:-1] + values[:, 2:]
         # Variance of the second difference: 1 + 4 + 1.
         expected = model.sigma(frame).astype(float)[:, 1:-1] * np.sqrt(6.0)
-        seen = ok[:, :-2] & ok[:, 1:-1] & ok[:, 2:] & (expected > 0)
-        ratios_of.append(np.abs(second[seen]) / expected[seen])
-    ratios: Float64 = np.concatenate(ratios_of) if ratios_of else np.empty(0)
+        usable = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:] & (expected > 0)
+        ratios_by_frame.append(np.abs(second[usable]) / expected[usable])
+    ratios: Float64 = np.concatenate(ratios_by_frame) if ratios_by_frame else np.empty(0)
     if len(ratios) < 200 or not (median := float(np.median(ratios))) > 0:
         return float("nan")
     return float(np.log(median / MEDIAN_OF_NORMAL))

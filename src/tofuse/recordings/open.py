@@ -69,8 +69,8 @@ def open_recording(
     Raises
     ------
     InputError
-        If the format is ambiguous (with what was found, and the option to state it), or nothing
-        can be read.
+        If the format is ambiguous (with the evidence, and the option to select it), or nothing can
+        be read.
     """
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
@@ -86,17 +86,17 @@ def open_recording(
         return Recording.of(rig, str(paths[0]), "rig")
     for path in paths:
         _check_kind(Path(path))
-    found = [item for path in paths for item in _resolve(Path(path), format)]
-    sources = [item.reader.open(item.path, options) for item in found]
+    located = [item for path in paths for item in _resolve(Path(path), format)]
+    sources = [item.reader.open(item.path, options) for item in located]
     source: Source = sources[0]
     if len(sources) > 1:
-        source = JoinedSource(sources, _short_names([item.path for item in found]))
+        source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
         )
-    names = dict.fromkeys(name_of(item.reader) for item in found)
+    names = dict.fromkeys(name_of(item.reader) for item in located)
     return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
 
 
@@ -114,12 +114,12 @@ def _rig_source(
                 where=rig_file.parent,
                 remedy=f"put it into {path}, or remove the camera from {rig_file.name}",
             )
-        found = _resolve(path, format)
-        if len(found) > 1:
+        located = _resolve(path, format)
+        if len(located) > 1:
             raise InputError("contains several recordings", where=path, remedy="leave one")
-        source = found[0].reader.open(found[0].path, options)
+        source = located[0].reader.open(located[0].path, options)
         _check_usable(source, path)
-        recordings.append(Recording.of(source, path, name_of(found[0].reader)))
+        recordings.append(Recording.of(source, path, name_of(located[0].reader)))
     return RigSource(rig_from(rig_file, recordings), recordings)
 
 
@@ -157,23 +157,23 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     sniffs = _sniff(path)
     # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
-    sure = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, SURE)}
-    if len(sure) == 1:
-        return [_Located(path, readers()[next(iter(sure))])]
-    if len(sure) > 1:
-        evidence = "; ".join(f"{name}: {sniff.evidence}" for name, sniff in sure.items())
+    confident = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, SURE)}
+    if len(confident) == 1:
+        return [_Located(path, readers()[next(iter(confident))])]
+    if len(confident) > 1:
+        evidence = "; ".join(f"{name}: {sniff.evidence}" for name, sniff in confident.items())
         raise InputError(
             f"could be several formats ({evidence})",
             where=path,
-            remedy=f"use --format {' or '.join(sure)}",
+            remedy=f"use --format {' or '.join(confident)}",
         )
-    if not sniffs and (parts := _parts(path)):
+    if not sniffs and (parts := _recordings_in(path)):
         return parts
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     for suffix in suffixes & CLOSED.keys():
         problem, remedy = CLOSED[suffix]
         raise InputError(problem, where=path, remedy=remedy)
-    raise _unsure(path, sniffs, children)
+    raise _unidentified(path, sniffs, children)
 
 
 def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
@@ -193,8 +193,8 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
 
 
 def _sniff(path: Path) -> dict[str, Sniff]:
-    found = {name: reader.sniff(path) for name, reader in readers().items()}
-    return {name: sniff for name, sniff in found.items() if sniff is not None}
+    sniffs = {name: reader.sniff(path) for name, reader in readers().items()}
+    return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
 
 
 def is_recording(path: Path) -> bool:
@@ -202,22 +202,22 @@ def is_recording(path: Path) -> bool:
     return any(sniff.confidence >= SURE for sniff in _sniff(path).values())
 
 
-def _parts(path: Path) -> list[_Located]:
+def _recordings_in(path: Path) -> list[_Located]:
     """The recordings in a folder, if any; InputError if they can't be joined."""
     if not is_folder(path):
         return []
-    found: dict[Path, str] = {}
+    format_of: dict[Path, str] = {}
     for folder in list_folder(path):
         if not is_folder(folder):
             continue
         sniffs = _sniff(folder)
-        sure = [name for name, s in sniffs.items() if s.confidence >= SURE]
-        if sure:
-            found[folder] = max(sure, key=lambda name: sniffs[name].confidence)
-    if not found:
+        confident = [name for name, s in sniffs.items() if s.confidence >= SURE]
+        if confident:
+            format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
+    if not format_of:
         return []
-    formats = sorted(set(found.values()))
-    listed = ", ".join(f"{p.name} ({name})" for p, name in list(found.items())[:6])
+    formats = sorted(set(format_of.values()))
+    listed = ", ".join(f"{p.name} ({name})" for p, name in list(format_of.items())[:6])
     reader = readers()[formats[0]]
     if len(formats) > 1 or not reader.joinable:
         raise InputError(
@@ -225,10 +225,10 @@ def _parts(path: Path) -> list[_Located]:
             where=path,
             remedy="pass one of them, or several in order",
         )
-    return [_Located(p, reader) for p in found]
+    return [_Located(p, reader) for p in format_of]
 
 
-def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     if sniffs:
         evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
         remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
@@ -251,13 +251,13 @@ def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> Input
     )
 
 
-def _check_depths(nearest: float | None, farthest: float | None) -> None:
-    for name, value in (("--min-depth", nearest), ("--max-depth", farthest)):
+def _check_depths(min_depth: float | None, max_depth: float | None) -> None:
+    for name, value in (("--min-depth", min_depth), ("--max-depth", max_depth)):
         if value is not None and not value >= 0:
             raise InputError(f"is {value}", where=name, remedy="use metres, 0 or more")
-    if nearest is not None and farthest is not None and nearest >= farthest:
+    if min_depth is not None and max_depth is not None and min_depth >= max_depth:
         raise InputError(
-            f"{nearest} and {farthest} leave no points",
+            f"{min_depth} and {max_depth} leave no points",
             where="--min-depth, --max-depth",
             remedy="pass the smaller one first",
         )
@@ -265,26 +265,28 @@ def _check_depths(nearest: float | None, farthest: float | None) -> None:
 
 def _check_usable(source: Source, path: str | Path) -> None:
     """Refuse a recording without a readable frame; stops at the first readable one."""
-    first: UnreadableFrameError | None = None
+    first_error: UnreadableFrameError | None = None
     for index in range(len(source.timestamps)):
         try:
             source.read(index)
             return
         except UnreadableFrameError as error:
-            first = first or error
-    if first is None:
+            first_error = first_error or error
+    if first_error is None:
         raise InputError("has no frames", where=path, remedy="pass a recording")
     count = len(source.timestamps)
-    problem = first.problem if count == 1 else f"none of {count} frames can be read: {first}"
+    problem = (
+        first_error.problem if count == 1 else f"none of {count} frames can be read: {first_error}"
+    )
     raise InputError(
         problem,
-        where=first.where if count == 1 else path,
-        remedy=first.remedy if count == 1 else None,
+        where=first_error.where if count == 1 else path,
+        remedy=first_error.remedy if count == 1 else None,
     )
 
 
 def _short_names(paths: list[Path]) -> list[str]:
-    """The last part of each path, or whole paths if these are not unique."""
+    """The last part of each path, or the full paths if these are not unique."""
     names = [p.name for p in paths]
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
 
@@ -321,5 +323,5 @@ def read_reference(path: str | Path) -> TimedPoses:
             where=path,
             remedy="pass a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
         )
-    known = np.isfinite(poses).all((1, 2))
-    return TimedPoses(poses[known], timestamps=recording.timestamps[known])
+    posed = np.isfinite(poses).all((1, 2))
+    return TimedPoses(poses[posed], timestamps=recording.timestamps[posed])

@@ -40,7 +40,7 @@ class Opening:
 
     @classmethod
     def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
-        """Return how files or folders are opened by options that have the names of the fields.
+        """Return the opening of files or folders with options named like the fields.
 
         Fields without an option keep their defaults.
         """

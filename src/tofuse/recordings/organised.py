@@ -46,7 +46,7 @@ class Raster:
     signs: tuple[int, int, int] = (1, 1, 1)
 
     @property
-    def turned(self) -> str:
+    def reversed_axes(self) -> str:
         """The axes that are reversed, in words; empty if none."""
         names = [name for name, sign in zip("xyz", self.signs, strict=True) if sign < 0]
         return f"{' and '.join(names)} run{'s'[: len(names) == 1]}" if names else ""
@@ -82,7 +82,7 @@ def find_raster(points: Float32, width: int | None = None) -> Raster | None:
     return None if best is None else best[1]
 
 
-def _raster_fit(slopes: NDArray[np.floating], forward: int) -> tuple[float, Raster] | None:
+def _raster_fit(slopes: NDArray[np.floating], z_sign: int) -> tuple[float, Raster] | None:
     """The variation of slopes (H, W, 2) along columns and rows, and the raster; None if none."""
     height, width = slopes.shape[:2]
     signs, worst = [], 0.0
@@ -94,17 +94,17 @@ def _raster_fit(slopes: NDArray[np.floating], forward: int) -> tuple[float, Rast
             return None
         centre = np.nanmedian(lines[:, used], axis=0)
         spread = float(np.nanpercentile(centre, 95) - np.nanpercentile(centre, 5))
-        off = float(np.nanmean(np.abs(lines[:, used] - centre)))
+        deviation = float(np.nanmean(np.abs(lines[:, used] - centre)))
         rising = np.diff(centre)
         sign = 1 if np.median(rising) > 0 else -1
-        if not off < COLUMN_FRACTION * spread or np.mean(rising * sign > 0) < 0.8:
+        if not deviation < COLUMN_FRACTION * spread or np.mean(rising * sign > 0) < 0.8:
             return None
         signs.append(sign)
-        worst = max(worst, off / spread)
-    return worst, Raster(width, height, (signs[0], signs[1], forward))
+        worst = max(worst, deviation / spread)
+    return worst, Raster(width, height, (signs[0], signs[1], z_sign))
 
 
-def origin_behind(images: Sequence[Float32]) -> float:
+def ray_origin_offset(images: Sequence[Float32]) -> float:
     """Return the distance in m at which the pixels' rays meet behind the origin; 0 if unknown.
 
     Determined from pixels whose z varies between images (H, W, 3): x = a (z + distance).
@@ -113,21 +113,21 @@ def origin_behind(images: Sequence[Float32]) -> float:
         return 0.0
     z = np.stack([np.where(_measured(image), image[..., 2], np.nan) for image in images])
     z = z.astype(float)
-    top = bottom = 0.0
+    numerator = denominator = 0.0
     with np.errstate(all="ignore"):
         count = np.isfinite(z).sum(0)
         mean = np.nansum(z, 0) / count
-        around = np.where(np.isfinite(z), z - mean, 0.0)
-        spread = (around**2).sum(0)
+        centred = np.where(np.isfinite(z), z - mean, 0.0)
+        spread = (centred**2).sum(0)
         usable = (count > 1) & (spread > MIN_SPREAD_M**2)
         for axis in (0, 1):
             x = np.stack([image[..., axis] for image in images]).astype(float)
             x = np.where(np.isfinite(z), x, 0.0)
-            slope = (around * x).sum(0) / spread
-            start = x.sum(0) / count - slope * mean
-            top += float((spread * slope * start)[usable].sum())
-            bottom += float((spread * slope**2)[usable].sum())
-    return top / bottom if bottom > 0 else 0.0
+            slope = (centred * x).sum(0) / spread
+            intercept = x.sum(0) / count - slope * mean
+            numerator += float((spread * slope * intercept)[usable].sum())
+            denominator += float((spread * slope**2)[usable].sum())
+    return numerator / denominator if denominator > 0 else 0.0
 
 
 def common_camera(images: Sequence[Float32]) -> Camera | None:
@@ -144,8 +144,8 @@ def common_camera(images: Sequence[Float32]) -> Camera | None:
         return None
     if min(fit.fx, fit.fy) < 0.1:
         return table
-    known = np.asarray(np.isfinite(rays).all(-1))
-    error = np.abs((fit.rays() - rays)[known]) * (fit.fx, fit.fy)
+    has_ray = np.asarray(np.isfinite(rays).all(-1))
+    error = np.abs((fit.rays() - rays)[has_ray]) * (fit.fx, fit.fy)
     return fit if error.max() < PINHOLE_PIXELS else table
 
 
@@ -178,17 +178,17 @@ def organised_frame(
     z = points[..., 2]
     measured = _measured(points)
     rays = camera.rays()
-    known = np.asarray(np.isfinite(rays).all(-1))
-    if not _fits(points, measured & known, rays):
+    has_ray = np.asarray(np.isfinite(rays).all(-1))
+    if not _fits(points, measured & has_ray, rays):
         raise InputError(
             "has points off the rays of the previous clouds",
             where=where,
             remedy="keep the clouds of each camera apart",
         )
-    if (measured & ~known).any():
+    if (measured & ~has_ray).any():
         # Pixels without measurements in the sampled clouds get the ray of their point.
-        own = points[..., :2] / np.where(measured, z, np.nan)[..., None]
-        camera = RayTable(np.where(known[..., None], rays, own))
+        point_slopes = points[..., :2] / np.where(measured, z, np.nan)[..., None]
+        camera = RayTable(np.where(has_ray[..., None], rays, point_slopes))
     return RangeFrame(
         index,
         timestamp,
@@ -225,8 +225,8 @@ def _common_rays(images: Sequence[Float32]) -> Float32 | None:
 
 def _fits(points: Float32, mask: Bool, rays: Float32) -> bool:
     z = points[mask][:, 2:]
-    off = np.abs(points[mask][:, :2] - rays[mask] * z)
-    return bool((off <= TOLERANCE_M + TOLERANCE_FRACTION * z).all())
+    residual = np.abs(points[mask][:, :2] - rays[mask] * z)
+    return bool((residual <= TOLERANCE_M + TOLERANCE_FRACTION * z).all())
 
 
 def _measured(points: Float32) -> Bool:

@@ -81,9 +81,11 @@ class PhoneSource(FileSource):
         colored = sum(path is not None for path in self.color)
         if 0 < colored < len(self.color):
             self.warnings.append(f"only {colored} of {len(self.color)} frames have colour")
-        sure = sum(path is not None for path in self.confidence)
-        if sure < len(self.confidence):
-            self.warnings.append(f"{len(self.confidence) - sure} frames have no confidence image")
+        present = sum(path is not None for path in self.confidence)
+        if present < len(self.confidence):
+            self.warnings.append(
+                f"{len(self.confidence) - present} frames have no confidence image"
+            )
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -109,8 +111,8 @@ class PhoneSource(FileSource):
         """Return the confidence (H, W) of an image file, 0 to `CONFIDENCE_MAX`."""
         return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
 
-    def whole_color(self, index: int) -> UInt8 | None:
-        """See `FileSource.whole_color`."""
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.full_resolution_color`."""
         path = self.color[index]
         return None if path is None else read_color(path)
 
@@ -119,8 +121,8 @@ class PhoneSource(FileSource):
         return self.color[index] or self.files[index]
 
     def _read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
-        whole = self.whole_color(index)
-        return None if whole is None else resized(whole, size, self.color_path(index))
+        full = self.full_resolution_color(index)
+        return None if full is None else resized(full, size, self.color_path(index))
 
 
 def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:

@@ -24,7 +24,7 @@ class Sniff:
         0 to 1; a path is opened automatically from `SURE` on. 1 is for names and contents that
         no other format has.
     evidence
-        What indicates the format, for messages.
+        The evidence for the format, for messages.
     remedy
         What to do if the confidence is below `SURE`.
     """
@@ -36,7 +36,7 @@ class Sniff:
 
 @dataclass(frozen=True)
 class ReaderOptions:
-    """What the user may state in addition to the recording.
+    """Options of the user for opening a recording.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Reader(Protocol):
 
 
 def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> None:
-    """Raise InputError if a camera was given for the format `name`, because of what it stores."""
+    """Raise InputError if a camera was passed for the format `name`, which stores `stores`."""
     if options.camera is not None:
         raise InputError(
             f"does not apply to the format {name!r}, which stores {stores}",

@@ -20,7 +20,7 @@ R = TypeVar("R")
 
 
 class Source(Protocol):
-    """What a reader returns for a path: metadata at once, frames on demand.
+    """The result of opening a path: metadata at once, frames on demand.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Source(Protocol):
     warnings
         Notes for the user on how the recording was read, one line each.
     metadata
-        Facts for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
+        Properties for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
     """
 
     timestamps: Float64
@@ -153,7 +153,7 @@ class Recording:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Facts about the recording."""
+        """Properties of the recording."""
         return self.source.metadata
 
     def select(self, start: int = 0, end: int | None = None, every: int = 1) -> Recording:
@@ -166,14 +166,14 @@ class Recording:
         """
         if every < 1:
             raise InputError(f"is {every}", where="--every", remedy="use 1 or more")
-        chosen = self.indices[slice(start, end, every)]
-        if len(chosen) == 0:
+        indices = self.indices[slice(start, end, every)]
+        if len(indices) == 0:
             raise InputError(
                 f"has {len(self)} frames, of which the selection leaves none",
                 where=self.path,
                 remedy="change --start, --end or --every",
             )
-        return Recording(self.source, self.path, self.format, chosen)
+        return Recording(self.source, self.path, self.format, indices)
 
     def sample(self, count: int) -> list[Frame | UnreadableFrameError]:
         """Read up to `count` evenly spaced frames, including the first and the last.
@@ -221,13 +221,13 @@ class Recording:
         return (item for item, _ in self.read_with(lambda frame: None, ahead, first=first))
 
     def read_with(
-        self, work: Callable[[Frame], R], ahead: int = 8, *, first: int = 0
+        self, process: Callable[[Frame], R], ahead: int = 8, *, first: int = 0
     ) -> Iterator[tuple[Frame | UnreadableFrameError, R | None]]:
         """Iterate as `read_all` does, with the result of a function of each frame.
 
         Parameters
         ----------
-        work
+        process
             Called with each frame on the thread that read it, in no particular order. The result
             is None for frames that can't be read.
         ahead
@@ -241,16 +241,16 @@ class Recording:
                 frame = self.source.read(index)
             except UnreadableFrameError as error:
                 return error, None
-            return frame, work(frame)
+            return frame, process(frame)
 
         workers = 2 if getattr(self.source, "concurrent", False) else 1
         pool = job_pool(workers, "tofuse-reader")
         indices = iter(self.indices[first:].tolist())
-        waiting = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
+        pending = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
         try:
-            while waiting:
-                item = waiting.popleft().result()
-                waiting.extend(pool.submit(read, k) for k in islice(indices, 1))
+            while pending:
+                item = pending.popleft().result()
+                pending.extend(pool.submit(read, k) for k in islice(indices, 1))
                 yield item
         finally:
             pool.shutdown(cancel_futures=True)

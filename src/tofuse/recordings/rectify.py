@@ -32,8 +32,8 @@ def pinhole_of(camera: Camera) -> Pinhole:
     )
     dx = np.nanmedian(np.diff(rays[rows, columns, 0], axis=1))
     dy = np.nanmedian(np.diff(rays[rows, columns, 1], axis=0))
-    near = np.nan_to_num(np.hypot(rays[..., 0], rays[..., 1]), nan=np.inf) < MAX_SLOPE
-    x, y = rays[near].T
+    within_limit = np.nan_to_num(np.hypot(rays[..., 0], rays[..., 1]), nan=np.inf) < MAX_SLOPE
+    x, y = rays[within_limit].T
     # Covers the camera's field of view, at no finer resolution.
     fx = min(1 / dx, (width - 1) / float(np.ptp(x)))
     fy = min(1 / dy, (height - 1) / float(np.ptp(y)))
@@ -42,7 +42,7 @@ def pinhole_of(camera: Camera) -> Pinhole:
     return Pinhole(width, height, float(fx), float(fy), cx, cy)
 
 
-def _sources(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
+def _nearest_pixels(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
     """Row and column (H, W, 2) of the pixel nearest to each pinhole ray, and whether it exists."""
     rays = pinhole.rays().astype(float)
     points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
@@ -53,8 +53,8 @@ def _sources(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
         & (uv[..., 0] < camera.width)
         & (uv[..., 1] < camera.height)
     )
-    at = np.where(inside[..., None], uv, 0).astype(np.intp)[..., ::-1]
-    return at, inside
+    pixels = np.where(inside[..., None], uv, 0).astype(np.intp)[..., ::-1]
+    return pixels, inside
 
 
 class Rectifier:
@@ -67,23 +67,23 @@ class Rectifier:
     def __init__(self, pinhole: Pinhole) -> None:
         self.pinhole = pinhole
         self._camera: Camera | None = None
-        self._at: tuple[Intp, Bool] | None = None
+        self._mapping: tuple[Intp, Bool] | None = None
 
     def __call__(self, frame: RangeFrame) -> RangeFrame:
         """Return a frame with z depth of the pinhole camera."""
         if frame.camera == self.pinhole:
             return _as_z(frame)
-        if self._at is None or frame.camera != self._camera:
-            self._camera, self._at = frame.camera, _sources(frame.camera, self.pinhole)
-        return _resampled(frame, self.pinhole, *self._at)
+        if self._mapping is None or frame.camera != self._camera:
+            self._camera, self._mapping = frame.camera, _nearest_pixels(frame.camera, self.pinhole)
+        return _resampled(frame, self.pinhole, *self._mapping)
 
 
 def _as_z(frame: RangeFrame) -> RangeFrame:
     return replace(frame, depth=frame.z, depth_kind="z")
 
 
-def _resampled(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> RangeFrame:
-    rows, columns = at[..., 0], at[..., 1]
+def _resampled(frame: RangeFrame, pinhole: Pinhole, pixels: Intp, inside: Bool) -> RangeFrame:
+    rows, columns = pixels[..., 0], pixels[..., 1]
 
     def sampled(image: NDArray[Any] | None) -> NDArray[Any] | None:
         if image is None:
@@ -94,9 +94,9 @@ def _resampled(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> R
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(frame.valid, 1 / frame.z, np.nan)
         slopes = _slopes(inverse, frame.camera.rays())
-        off = pinhole.rays() - frame.camera.rays()[rows, columns]
-        moved = inverse[rows, columns] + (slopes[rows, columns] * off).sum(-1)
-        z = np.where(inside & (moved > 0), 1 / moved, 0)
+        offset = pinhole.rays() - frame.camera.rays()[rows, columns]
+        inverse_at_ray = inverse[rows, columns] + (slopes[rows, columns] * offset).sum(-1)
+        z = np.where(inside & (inverse_at_ray > 0), 1 / inverse_at_ray, 0)
     return RangeFrame(
         frame.index,
         frame.timestamp,
@@ -126,7 +126,7 @@ def _slopes(inverse: Float32, rays: Float32) -> Float32:
 def _smaller_step(inverse: Float32, rays: Float32, axis: int) -> tuple[Float64, Float64, Float64]:
     """Differences of inverse depth, x and y to the neighbour with the smaller depth difference.
 
-    On a surface both differ alike; next to a jump that neighbour is on the same surface.
+    On a surface both differences are similar; at a jump that neighbour is on the same surface.
     """
     values = np.concatenate([inverse[..., None], rays], axis=-1).astype(np.float64)
     step = np.diff(values, axis=axis)
@@ -138,5 +138,5 @@ def _smaller_step(inverse: Float32, rays: Float32, axis: int) -> tuple[Float64, 
     size_before, size_after = (
         np.nan_to_num(np.abs(s[..., 0]), nan=np.inf) for s in (before, after)
     )
-    chosen = np.where((size_before < size_after)[..., None], before, after)
-    return chosen[..., 0], chosen[..., 1], chosen[..., 2]
+    smaller = np.where((size_before < size_after)[..., None], before, after)
+    return smaller[..., 0], smaller[..., 1], smaller[..., 2]

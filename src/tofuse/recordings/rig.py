@@ -161,47 +161,47 @@ def is_plain_name(name: str) -> bool:
 
 
 def _camera(row: object, k: int, path: str | Path) -> RigCamera:
-    at = f"cameras[{k}]"
+    location = f"cameras[{k}]"
     if not isinstance(row, dict):
-        raise InputError(f"{at} is not an object", where=path, remedy=_REMEDY)
+        raise InputError(f"{location} is not an object", where=path, remedy=_REMEDY)
     name, recording = row.get("name"), row.get("recording", "")
     if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{at}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
+        raise InputError(f"{location}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
     if not is_plain_name(name):
         raise InputError(
-            f"{at}.name is {name!r:.80}, which is not a folder name",
+            f"{location}.name is {name!r:.80}, which is not a folder name",
             where=path,
             remedy="choose one without / \\ : and not . or ..",
         )
     if not isinstance(recording, str):
-        raise InputError(f"{at}.recording is not a path", where=path, remedy=_REMEDY)
+        raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
     T = check_pose(
-        _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=str(path)
+        _numbers(row.get("T_rig_camera"), (4, 4), f"{location}.T_rig_camera", path), where=str(path)
     )
-    C = _covariance(row.get("covariance", [0.0] * 36), f"{at}.covariance", path)
+    C = _covariance(row.get("covariance", [0.0] * 36), f"{location}.covariance", path)
     random = row.get("random_covariance")
     if random is not None:
-        random = _covariance(random, f"{at}.random_covariance", path)
-    time = _number(row.get("time_offset_s", 0.0), _MAX_SECONDS, f"{at}.time_offset_s", path)
-    depth = _number(row.get("depth_offset_m", 0.0), _MAX_METRES, f"{at}.depth_offset_m", path)
+        random = _covariance(random, f"{location}.random_covariance", path)
+    time = _number(row.get("time_offset_s", 0.0), _MAX_SECONDS, f"{location}.time_offset_s", path)
+    depth = _number(row.get("depth_offset_m", 0.0), _MAX_METRES, f"{location}.depth_offset_m", path)
     return RigCamera(name, recording, T, C, time, depth, random)
 
 
 def _covariance(value: object, name: str, path: str | Path) -> Float64:
     C = _numbers(value, (6, 6), name, path)
-    smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
+    min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
-    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or smallest < -tolerance:
+    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
         raise InputError(f"{name} is not a covariance", where=path, remedy=_REMEDY)
     return np.asarray(0.5 * (C + C.T), np.float64)
 
 
 def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:
-    at = f"disagreement[{k}]"
+    location = f"disagreement[{k}]"
     if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
-        raise InputError(f"{at} does not name two cameras", where=path, remedy=_REMEDY)
-    median = _number(row.get("median_m"), 1e6, f"{at}.median_m", path)
-    pixels = _number(row.get("pixels", 0), 1e15, f"{at}.pixels", path)
+        raise InputError(f"{location} does not name two cameras", where=path, remedy=_REMEDY)
+    median = _number(row.get("median_m"), 1e6, f"{location}.median_m", path)
+    pixels = _number(row.get("pixels", 0), 1e15, f"{location}.pixels", path)
     return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
 
 

@@ -15,7 +15,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig
 
-# Largest distance in time within an instant, as a fraction of the frame interval.
+# Largest time difference within an instant, as a fraction of the frame interval.
 _SAME_INSTANT = 0.6
 
 
@@ -83,11 +83,11 @@ class RigSource:
         instant = 0
         for k, t in enumerate(times[0]):
             images = [(0, k)]
-            for c, own in enumerate(times[1:], 1):
-                near = int(np.abs(own - t).argmin())
-                interval = float(np.median(np.diff(own))) if len(own) > 1 else 0.0
-                if single or abs(own[near] - t) <= _SAME_INSTANT * interval:
-                    images.append((c, near))
+            for c, other in enumerate(times[1:], 1):
+                nearest = int(np.abs(other - t).argmin())
+                interval = float(np.median(np.diff(other))) if len(other) > 1 else 0.0
+                if single or abs(other[nearest] - t) <= _SAME_INSTANT * interval:
+                    images.append((c, nearest))
             if len(images) == len(times):
                 rows += [(instant, c, row) for c, row in images]
                 instant += 1
@@ -111,6 +111,6 @@ def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
     """Return the image with `metres` added to its ranges."""
     if metres == 0:
         return frame
-    along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
-    depth = np.where(frame.valid, np.maximum(frame.depth + metres * along, 0), 0)
+    scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+    depth = np.where(frame.valid, np.maximum(frame.depth + metres * scale, 0), 0)
     return replace(frame, depth=np.nan_to_num(depth).astype(np.float32))

@@ -17,8 +17,8 @@ from tofuse.recordings.camera_file import checked_lens
 
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = {"mono8": "u1", "8UC1": "u1", **ENCODINGS}
-# Bytes a pixel, and the channels that are red, green and blue, or how YUV is packed.
-_ALL_COLORS: dict[str, tuple[int, list[int] | str]] = {
+# Bytes per pixel, and the channels that are red, green and blue, or the packing of YUV.
+_COLOR_LAYOUTS: dict[str, tuple[int, list[int] | str]] = {
     "rgb8": (3, [0, 1, 2]),
     "bgr8": (3, [2, 1, 0]),
     "rgba8": (4, [0, 1, 2]),
@@ -27,7 +27,7 @@ _ALL_COLORS: dict[str, tuple[int, list[int] | str]] = {
     **dict.fromkeys(("yuv422", "uyvy"), (2, "uyvy")),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "yuyv")),
 }
-COLORS = frozenset(_ALL_COLORS) - {"mono8"}
+COLORS = frozenset(_COLOR_LAYOUTS) - {"mono8"}
 _JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COMPRESSED_HEAD = 12
@@ -36,8 +36,8 @@ _AMPLITUDES = ("intensity", "amplitude", "i")
 _MAX_SIDE = 16384
 
 
-def taken(raw: Any, is2: bool) -> float:
-    """Return the timestamp in s of the header at the beginning of a message; 0 if not given.
+def header_time(raw: Any, is2: bool) -> float:
+    """Return the timestamp in s of the header at the beginning of a message; 0 if it is not set.
 
     After four bytes (ROS 1: the sequence number; ROS 2: the encoding) come seconds and nanoseconds.
     """
@@ -60,8 +60,8 @@ def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> ND
     if message.encoding not in encodings:
         raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
     order = ">" if message.is_bigendian else "<"
-    kind = np.dtype(order + encodings[message.encoding])
-    return np.ascontiguousarray(_rows(message, kind.itemsize, where)).view(kind)
+    dtype = np.dtype(order + encodings[message.encoding])
+    return np.ascontiguousarray(_rows(message, dtype.itemsize, where)).view(dtype)
 
 
 def _rows(message: Any, pixel_bytes: int, where: str) -> UInt8:
@@ -88,9 +88,9 @@ def color_image(message: Any, where: str) -> UInt8:
     if data.startswith(_JPEG):
         return as_color(parse_image(data, where, size=(width, height)))
     encoding = str(message.encoding).lower()
-    if encoding not in _ALL_COLORS:
+    if encoding not in _COLOR_LAYOUTS:
         raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
-    channels, order = _ALL_COLORS[encoding]
+    channels, order = _COLOR_LAYOUTS[encoding]
     pixels = _rows(message, channels, where).reshape(height, width, channels)
     if isinstance(order, str):
         if width % 2:
@@ -105,15 +105,15 @@ def color_image(message: Any, where: str) -> UInt8:
 def decompressed(message: Any, where: str) -> NDArray[Any]:
     """Return the image of compressed_depth_image_transport: PNG, of inverse depth for floats."""
     data = bytes(message.data)
-    at = data.find(_PNG, 0, 64)
-    if at < 0:
+    start = data.find(_PNG, 0, 64)
+    if start < 0:
         raise InputError("isn't compressed as PNG", where=where, remedy="record it as PNG or raw")
-    counts = parse_image(data[at:], where, dtype="uint16")
+    counts = parse_image(data[start:], where, dtype="uint16")
     if not str(message.format).startswith("32FC1"):
         return counts
-    if at < _COMPRESSED_HEAD:
+    if start < _COMPRESSED_HEAD:
         raise InputError("lacks the parameters of its depth", where=where)
-    a, b = np.frombuffer(data, "<f4", 2, at - 8)
+    a, b = np.frombuffer(data, "<f4", 2, start - 8)
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (counts.astype(np.float32) - np.float32(b))
     return np.where(counts > 0, depth, np.float32(np.nan)).astype(np.float32)
@@ -156,7 +156,7 @@ def lens(message: Any, where: str) -> Pinhole:
     Raises
     ------
     InputError
-        If its model is none of ROS's own, or has more coefficients than that takes.
+        If its model is none of ROS's own, or it has more coefficients than the model.
     """
     info = camera_info(message, where)
     model, D = info.model, info.coefficients
@@ -184,7 +184,7 @@ def lens(message: Any, where: str) -> Pinhole:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points (N, 3) of a PointCloud2, their amplitude (N,) or None, and how they are organised."""
+    """Points (N, 3) of a PointCloud2, their amplitude (N,) or None, and their organised size."""
 
     points: Float32
     amplitude: Float32 | None
@@ -213,11 +213,11 @@ def cloud(message: Any, where: str) -> Cloud:
 
     def column(name: str) -> Float32:
         field = fields[name]
-        kind = np.dtype(order + _FIELD_TYPES[field.datatype])
+        dtype = np.dtype(order + _FIELD_TYPES[field.datatype])
         start = int(field.offset)
-        if start + kind.itemsize > step:
+        if start + dtype.itemsize > step:
             raise InputError(f"has its field {name!r} outside of a point", where=where)
-        values = np.ascontiguousarray(rows[:, start : start + kind.itemsize]).view(kind)[:, 0]
+        values = np.ascontiguousarray(rows[:, start : start + dtype.itemsize]).view(dtype)[:, 0]
         with np.errstate(all="ignore"):
             return values.astype(np.float32)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.recordings.cloud_files import shift_words
+from tofuse.recordings.cloud_files import describe_shift
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 
@@ -82,8 +82,8 @@ def open_view(
         )
     shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
     # The shift is returned with the view, so a warning about it would mislead.
-    moved = shift_words(shift)
-    warnings = tuple(line for line in recording.warnings if not line.endswith(moved))
+    shift_note = describe_shift(shift)
+    warnings = tuple(line for line in recording.warnings if not line.endswith(shift_note))
     return SingleView(name, path, recording.format, index, frame, shift, warnings)
 
 

@@ -47,7 +47,7 @@ class FileSource(ABC):
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
 
-    def whole_color(self, index: int) -> UInt8 | None:
+    def full_resolution_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame at its recorded resolution, if it has the view of depth.
 
         (H, W, 3) RGB, or None if there is none. Raise InputError if it can't be read.
@@ -69,7 +69,7 @@ class FileSource(ABC):
 
 
 def tum_poses(source: FileSource, path: Path) -> Float64:
-    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN if none is near."""
+    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match."""
     times, poses = read_tum(path)
     out = associated_poses(source.timestamps, times, poses)
     posed = int(np.isfinite(out[:, 0, 0]).sum())
@@ -113,14 +113,14 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     return orthonormalise(check_pose(table, where=where))
 
 
-def read_timestamps(path: Path, count: int, things: str, warnings: list[str]) -> Float64:
-    """Read a timestamps.txt: (N,) seconds for `count` images or clouds (`things`)."""
+def read_timestamps(path: Path, count: int, noun: str, warnings: list[str]) -> Float64:
+    """Read a timestamps.txt: (N,) seconds for `count` images or clouds (`noun`, for errors)."""
     table = read_numbers(path)
     if table.shape != (count, 1):
         raise InputError(
-            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {things}s",
+            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {noun}s",
             where=path,
-            remedy=f"use one time in seconds for each {things}",
+            remedy=f"use one time in seconds for each {noun}",
         )
     times = table[:, 0]
     check_timestamps(times, path, warnings)
@@ -214,7 +214,7 @@ class JoinedSource:
         self.gravity = _joined([p.gravity for p in self.parts], counts, (4,))
         self.metadata: dict[str, Any] = dict(self.parts[0].metadata)
         for part in self.parts[1:]:
-            # Only facts that are common to all of them.
+            # Only values common to all parts.
             self.metadata = {
                 key: value
                 for key, value in self.metadata.items()
@@ -227,15 +227,15 @@ class JoinedSource:
     def _joined_times(self, names: Sequence[str]) -> Float64:
         times: list[Float64] = []
         for part, name in zip(self.parts, names, strict=True):
-            own = part.timestamps
+            part_times = part.timestamps
             last = max((float(t.max()) for t in times), default=-np.inf)
-            if own.min() <= last:
-                steps = np.diff(own)
+            if part_times.min() <= last:
+                steps = np.diff(part_times)
                 step = float(np.median(steps)) if len(steps) else 1.0
-                shift = last + max(step, 1e-3) - float(own.min())
-                own = own + shift
+                shift = last + max(step, 1e-3) - float(part_times.min())
+                part_times = part_times + shift
                 self.warnings.append(f"{name}: timestamps start again, shifted by {shift:.6g} s")
-            times.append(own)
+            times.append(part_times)
         return np.concatenate(times)
 
     def read(self, index: int) -> Frame:
@@ -258,19 +258,21 @@ def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]
 
 
 def _joined(
-    known: Sequence[Float64 | None], counts: Sequence[int], shape: tuple[int, ...]
+    arrays: Sequence[Float64 | None], counts: Sequence[int], shape: tuple[int, ...]
 ) -> Float64 | None:
-    if all(k is None for k in known):
+    if all(array is None for array in arrays):
         return None
-    parts = zip(known, counts, strict=True)
-    return np.concatenate([np.full((n, *shape), np.nan) if k is None else k for k, n in parts])
+    parts = zip(arrays, counts, strict=True)
+    return np.concatenate(
+        [np.full((n, *shape), np.nan) if array is None else array for array, n in parts]
+    )
 
 
 class LimitedSource:
     """A source restricted to points between two depths in m: z of images, distance in clouds."""
 
-    def __init__(self, source: Source, nearest: float, farthest: float) -> None:
-        self.source, self.nearest, self.farthest = source, nearest, farthest
+    def __init__(self, source: Source, min_depth: float, max_depth: float) -> None:
+        self.source, self.min_depth, self.max_depth = source, min_depth, max_depth
         self.concurrent = getattr(source, "concurrent", False)
         self.timestamps = source.timestamps
         self.reference = source.reference
@@ -283,6 +285,6 @@ class LimitedSource:
         """See `Source.read`."""
         frame = self.source.read(index)
         if isinstance(frame, RangeFrame):
-            return frame.keep((frame.z >= self.nearest) & (frame.z <= self.farthest))
+            return frame.keep((frame.z >= self.min_depth) & (frame.z <= self.max_depth))
         distance = np.linalg.norm(frame.points - frame.origin, axis=1)
-        return frame.keep((distance >= self.nearest) & (distance <= self.farthest))
+        return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))

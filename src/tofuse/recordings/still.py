@@ -1,6 +1,6 @@
 """Detection of stationary intervals, and one averaged frame for each.
 
-Noise is nearly independent between pixels; motion changes neighbouring pixels alike. They are
+Noise is nearly independent between pixels; motion changes neighbouring pixels together. They are
 distinguished by averaging frame differences over blocks of two sizes: the variance of block means
 is inversely proportional to the block's area for noise, and does not depend on it for motion. No
 threshold in metres is needed, so the test applies to cameras of any noise.
@@ -68,18 +68,18 @@ def change_between(a: RangeFrame, b: RangeFrame, model: NoiseModel) -> ImageChan
     """
     if a.depth.shape != b.depth.shape:
         return ImageChange(1.0, 1.0)
-    both = a.valid & b.valid
-    if both.sum() < _MIN_PIXELS:
+    valid = a.valid & b.valid
+    if valid.sum() < _MIN_PIXELS:
         return ImageChange(1.0, 1.0)
-    sigma = np.where(both, model.sigma(a), 1)
-    change = np.where(both, b.radial_range - a.radial_range, 0)
-    changes = [_coherence(change / sigma, both)]
+    sigma = np.where(valid, model.sigma(a), 1)
+    change = np.where(valid, b.radial_range - a.radial_range, 0)
+    changes = [_coherence(change / sigma, valid)]
     if a.amplitude_image is not None and b.amplitude_image is not None:
-        usable = both & _usable(a.amplitude_image) & _usable(b.amplitude_image)
+        usable = valid & _usable(a.amplitude_image) & _usable(b.amplitude_image)
         if usable.sum() >= _MIN_PIXELS:
             ratio = np.where(usable, b.amplitude_image, 1) / np.where(usable, a.amplitude_image, 1)
             change = np.log(ratio)
-            # Exposure changes all pixels alike.
+            # Exposure scales all pixels by the same factor.
             change -= np.median(change[usable])
             # The noise of the phasor is isotropic: equal for range and log amplitude.
             changes.append(_coherence(change / sigma, usable))
@@ -94,30 +94,30 @@ def _usable(amplitude: Float32) -> Bool:
     return np.asarray((amplitude > 0) & (amplitude < SATURATED_AMPLITUDE))
 
 
-def _coherence(change: NDArray[Any], ok: Bool) -> ImageChange:
+def _coherence(change: NDArray[Any], valid: Bool) -> ImageChange:
     """The coherent part of a difference image (H, W) in units of its noise."""
-    values = np.abs(change[ok])
+    values = np.abs(change[valid])
     if not values.any():
         return ImageChange(0.0, 0.0, identical=True)
-    typical = float(np.median(values)) / MEDIAN_OF_NORMAL
-    limit = 2.5 * typical if typical > 0 else float(values.max())
-    clipped = np.where(ok, np.clip(change, -limit, limit), 0).astype(float)
-    noise = float(np.sqrt((clipped[ok] ** 2).mean()))
-    small = max(2, min(8, min(ok.shape) // (6 * _RATIO)))
-    fine = _block_means(clipped, ok, small)
-    coarse = _block_means(clipped, ok, small * _RATIO)
+    scale = float(np.median(values)) / MEDIAN_OF_NORMAL
+    limit = 2.5 * scale if scale > 0 else float(values.max())
+    clipped = np.where(valid, np.clip(change, -limit, limit), 0).astype(float)
+    noise = float(np.sqrt((clipped[valid] ** 2).mean()))
+    small = max(2, min(8, min(valid.shape) // (6 * _RATIO)))
+    fine = _block_means(clipped, valid, small)
+    coarse = _block_means(clipped, valid, small * _RATIO)
     if len(coarse) < 4:
         return ImageChange(1.0, 1.0)
-    of_fine, of_coarse = (float((x**2).mean()) for x in (fine, coarse))
+    fine_variance, coarse_variance = (float((x**2).mean()) for x in (fine, coarse))
     area = _RATIO * _RATIO
-    common = max(area * of_coarse - of_fine, 0.0) / (area - 1)
+    coherent_variance = max(area * coarse_variance - fine_variance, 0.0) / (area - 1)
     # Blocks at flickering edges are noisier, and so are their means.
-    own = np.maximum(_block_means(clipped**2, ok, small * _RATIO), noise**2)
-    moved = float((coarse**2 > _MOVED_BLOCK**2 * own).mean())
-    return ImageChange(float(np.sqrt(common)) / noise, moved)
+    block_variance = np.maximum(_block_means(clipped**2, valid, small * _RATIO), noise**2)
+    moved = float((coarse**2 > _MOVED_BLOCK**2 * block_variance).mean())
+    return ImageChange(float(np.sqrt(coherent_variance)) / noise, moved)
 
 
-def _block_means(values: Float64, ok: Bool, size: int) -> Float64:
+def _block_means(values: Float64, valid: Bool, size: int) -> Float64:
     """Means of the square blocks that are at least half valid."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
 
@@ -125,7 +125,7 @@ def _block_means(values: Float64, ok: Bool, size: int) -> Float64:
         cut = x[: rows * size, : columns * size]
         return cut.reshape(rows, size, columns, size).sum((1, 3), dtype=float)
 
-    count = sums(ok)
+    count = sums(valid)
     full = count >= size * size / 2
     return sums(values)[full] / count[full]
 
@@ -150,18 +150,18 @@ def stationary_intervals(
     (start, stop) positions in the recording, contiguous.
     """
     model = model or noise_model_for(recording)
-    out: list[tuple[int, int]] = []
+    intervals: list[tuple[int, int]] = []
     start, first = 0, None
     for k, item in enumerate(recording.read_all()):
         frame = item if isinstance(item, RangeFrame) else None
         if k > 0 and not (
             first is not None and frame is not None and change_between(first, frame, model).still
         ):
-            out.append((start, k))
+            intervals.append((start, k))
             start, first = k, None
         first = first or frame
-    out.append((start, len(recording)))
-    return out
+    intervals.append((start, len(recording)))
+    return intervals
 
 
 def average_still(recording: Recording, model: NoiseModel | None = None) -> Recording:
@@ -250,23 +250,25 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     valid = depth > 0
     count = valid.sum(0)
     centre = _median(depth, valid, count)
-    off = np.abs(depth - centre)
+    residual = np.abs(depth - centre)
     # Scale of the actual noise relative to the model, so that inliers are not rejected.
-    scale = float(np.median(off[valid] / sigma[valid])) / MEDIAN_OF_NORMAL if valid.any() else 1.0
-    near = valid & (off <= _OUTLIER_SIGMAS * max(scale, 1.0) * sigma)
-    kept = near.sum(0)
-    enough = (2 * count >= len(frames)) & (kept > 0)
-    number = np.maximum(kept, 1)
-    mean = (depth * near).sum(0, dtype=float) / number
-    variance = (sigma.astype(float) ** 2 * near).sum(0) / number
-    averaged = np.sqrt(variance / number)
+    scale = (
+        float(np.median(residual[valid] / sigma[valid])) / MEDIAN_OF_NORMAL if valid.any() else 1.0
+    )
+    inlier = valid & (residual <= _OUTLIER_SIGMAS * max(scale, 1.0) * sigma)
+    inlier_count = inlier.sum(0)
+    enough = (2 * count >= len(frames)) & (inlier_count > 0)
+    divisor = np.maximum(inlier_count, 1)
+    mean = (depth * inlier).sum(0, dtype=float) / divisor
+    variance = (sigma.astype(float) ** 2 * inlier).sum(0) / divisor
+    sigma_of_mean = np.sqrt(variance / divisor)
     return replace(
         middle,
         camera=_mean_camera(frames),
         depth=np.where(enough, mean, 0).astype(np.float32),
-        sigma_image=np.where(enough, averaged, 0).astype(np.float32),
-        amplitude_image=_mean_amplitude(frames, near),
-        confidence_image=_best_confidence(frames, near),
+        sigma_image=np.where(enough, sigma_of_mean, 0).astype(np.float32),
+        amplitude_image=_mean_amplitude(frames, inlier),
+        confidence_image=_best_confidence(frames, inlier),
         color_image=_mean_color(frames),
         normal_image=None,
     )
@@ -285,31 +287,31 @@ def _mean_camera(frames: Sequence[RangeFrame]) -> Camera:
     if all(f.camera is frames[0].camera for f in frames):
         return frames[0].camera
     rays = np.stack([f.camera.rays() for f in frames]).astype(float)
-    known = np.isfinite(rays).all(-1, keepdims=True)
-    count = known.sum(0)
-    mean = np.where(known, rays, 0).sum(0) / np.maximum(count, 1)
+    valid = np.isfinite(rays).all(-1, keepdims=True)
+    count = valid.sum(0)
+    mean = np.where(valid, rays, 0).sum(0) / np.maximum(count, 1)
     return RayTable(np.where(count > 0, mean, np.nan).astype(np.float32))
 
 
-def _mean_amplitude(frames: Sequence[RangeFrame], near: Bool) -> Float32 | None:
+def _mean_amplitude(frames: Sequence[RangeFrame], inlier: Bool) -> Float32 | None:
     """The mean over the frames whose depth was used; saturated where most of them are."""
     images = [f.amplitude_image for f in frames if f.amplitude_image is not None]
     if len(images) < len(frames):
         return None
     stack = np.stack(images)
-    full = (stack >= SATURATED_AMPLITUDE) & near
-    used = near & ~full
+    saturated = (stack >= SATURATED_AMPLITUDE) & inlier
+    used = inlier & ~saturated
     count = used.sum(0)
     mean = np.where(used, stack, 0).sum(0, dtype=float) / np.maximum(count, 1)
-    mean = np.where(near.any(0), mean, stack.mean(0, dtype=float))
-    return np.where(full.sum(0) > count, SATURATED_AMPLITUDE, mean).astype(np.float32)
+    mean = np.where(inlier.any(0), mean, stack.mean(0, dtype=float))
+    return np.where(saturated.sum(0) > count, SATURATED_AMPLITUDE, mean).astype(np.float32)
 
 
-def _best_confidence(frames: Sequence[RangeFrame], near: Bool) -> UInt8 | None:
+def _best_confidence(frames: Sequence[RangeFrame], inlier: Bool) -> UInt8 | None:
     images = [f.confidence_image for f in frames if f.confidence_image is not None]
     if len(images) < len(frames):
         return None
-    return np.where(near, np.stack(images), 0).max(0).astype(np.uint8)
+    return np.where(inlier, np.stack(images), 0).max(0).astype(np.uint8)
 
 
 def _mean_color(frames: Sequence[RangeFrame]) -> UInt8 | None:

@@ -25,9 +25,9 @@ def packed(s: Subject) -> dict[str, Any]:
     """
     index = s.index.astype(int)
     records = {r.index: r for r in s.result.diagnostics.frames}
-    known = [records.get(int(k)) for k in index]
+    frame_records = [records.get(int(k)) for k in index]
     errors = position_errors(s)
-    levels = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
+    error_bytes = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
     before = s.result.diagnostics.sequential
     if before.shape != s.result.trajectory.shape:
         before = np.full_like(s.result.trajectory, np.nan)
@@ -37,10 +37,10 @@ def packed(s: Subject) -> dict[str, Any]:
         if rig is None
         else {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
         "index": pack(index.astype("<u4")),
-        "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in known),
-        "errors": pack(levels) if np.isfinite(errors).any() else None,
-        "after": _poses(s.result.trajectory, s.straight),
-        "before": _poses(before, s.straight),
+        "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in frame_records),
+        "errors": pack(error_bytes) if np.isfinite(errors).any() else None,
+        "after": _poses(s.result.trajectory, s.R_display_world),
+        "before": _poses(before, s.R_display_world),
     }
 
 
@@ -55,26 +55,26 @@ def position_errors(s: Subject) -> Float64:
     `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed.
     """
     records = {r.index: r for r in s.result.diagnostics.frames}
-    out = np.full(len(s.index), np.nan)
+    errors = np.full(len(s.index), np.nan)
     unbounded = set(s.result.diagnostics.accuracy.unbounded)
     for row, index in enumerate(s.index.astype(int)):
         record = records.get(int(index))
         if index in unbounded:
-            out[row] = OF_95_PERCENT * UNKNOWN_M
+            errors[row] = OF_95_PERCENT * UNKNOWN_M
         elif record is not None:
-            out[row] = _bound(record)
-    out[~s.result.has_pose] = np.nan
-    return out
+            errors[row] = _bound(record)
+    errors[~s.result.has_pose] = np.nan
+    return errors
 
 
 def _bound(record: FrameRecord) -> float:
     C = record.covariance
     if C is None or not np.isfinite(C).all():
         return float("nan")
-    worst = float(np.linalg.eigvalsh(C[:3, :3])[-1])
-    return OF_95_PERCENT * float(np.sqrt(max(worst, 0.0)))
+    variance = float(np.linalg.eigvalsh(C[:3, :3])[-1])
+    return OF_95_PERCENT * float(np.sqrt(max(variance, 0.0)))
 
 
 def _poses(poses: Float64, axes: Float64) -> str:
-    shown = np.nan_to_num(axes @ poses[:, :3, :]).reshape(len(poses), 12)
-    return pack(shown.astype("<f4"))
+    displayed = np.nan_to_num(axes @ poses[:, :3, :]).reshape(len(poses), 12)
+    return pack(displayed.astype("<f4"))

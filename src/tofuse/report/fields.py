@@ -1,4 +1,4 @@
-"""Values that the 3D view can colour the model by, in addition to its own colours."""
+"""Values by which the 3D view can colour the model, in addition to its colours."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.report.packing import pack
 from tofuse.report.scene import Scene, height_range
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
-_FINEST_M = 1e-4
+_MIN_ACCURACY_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +80,14 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     points = scene.points if mesh is None else mesh.vertices.astype(float)
     sigma = scene.sigma if mesh is None else mesh.sigma
     views = scene.views if mesh is None else mesh.views
-    out = [] if sigma is None else [_accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
-    out.append(_height(-points[:, 1], height_range(points)))
+    available = [] if sigma is None else [_accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
+    available.append(_height(-points[:, 1], height_range(points)))
     if views is not None:
-        low, high = _ends(views.astype(float))
+        low, high = _percentile_range(views.astype(float))
         labels = (f"{low:.0f}", "", f"{high:.0f}")
         values = views.astype(float)
-        out.append(Field("views", "Number of views", values, low, high, labels, (low, high)))
-    return out
+        available.append(Field("views", "Number of views", values, low, high, labels, (low, high)))
+    return available
 
 
 def normalized_accuracy(metres: Float64) -> Float64:
@@ -102,23 +102,23 @@ def _height(heights: Float64, ends: tuple[float, float]) -> Field:
 
 
 def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
-    unknown = OF_95_PERCENT * UNKNOWN_M
-    low, high = _ends(values[values < UNKNOWN_M])  # so that these can be distinguished
+    max_bound = OF_95_PERCENT * UNKNOWN_M
+    low, high = _percentile_range(values[values < UNKNOWN_M])  # so that these can be distinguished
     if errors is not None and (errors < UNKNOWN_M).any():
-        others = _ends(errors[errors < UNKNOWN_M])
-        low, high = min(low, others[0]), max(high, others[1])
-    low = max(low, _FINEST_M)
+        error_range = _percentile_range(errors[errors < UNKNOWN_M])
+        low, high = min(low, error_range[0]), max(high, error_range[1])
+    low = max(low, _MIN_ACCURACY_M)
     high = max(high, 1.01 * low)
-    beyond = " or not constrained" if (values >= UNKNOWN_M).mean() > 0.001 else ""
+    suffix = " or not constrained" if (values >= UNKNOWN_M).mean() > 0.001 else ""
     middle = float(np.sqrt(low * high))
     labels = (
-        f"±{words.length(low)}", f"±{words.length(middle)}", f"±{words.length(high)}{beyond}"
+        f"±{words.length(low)}", f"±{words.length(middle)}", f"±{words.length(high)}{suffix}"
     )  # fmt: skip
-    span = (_FINEST_M, unknown)
+    span = (_MIN_ACCURACY_M, max_bound)
     return Field("accuracy", "Accuracy (95 %)", values, low, high, labels, span, logarithmic=True)
 
 
-def _ends(values: Float64) -> tuple[float, float]:
+def _percentile_range(values: Float64) -> tuple[float, float]:
     """Values that bound the middle 96 %."""
     values = values[np.isfinite(values)]
     if not len(values):

@@ -1,4 +1,4 @@
-"""`report.html`: the result laid out for a person, in one file without outside resources."""
+"""`report.html`: the result for a human reader, in one file without external resources."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
 
 def render(result: Reconstruction, extras: ReportExtras) -> str:
     """Return the report as HTML."""
-    shown: dict[str, Any] = sections(result, extras)
+    values: dict[str, Any] = sections(result, extras)
     from jinja2.utils import htmlsafe_json_dumps
 
-    scene, player = shown.pop("scene"), shown.pop("player")
+    scene, player = values.pop("scene"), values.pop("player")
     return template("report.html.j2").render(
-        **shown,
+        **values,
         version=__version__,
         style=asset("style.css"),
         script=script(),
@@ -54,7 +54,7 @@ def readable(text: str) -> str:
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
-# What the pages' script is made of, each file a few functions that those behind it use.
+# Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (
     "bytes.js",
     "eye.js",

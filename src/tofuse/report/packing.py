@@ -24,10 +24,14 @@ def pack(array: NDArray[Any]) -> str:
         return base64.b64encode(zlib.compress(b"")).decode()
     columns = np.ascontiguousarray(array).reshape(len(array), -1)
     words = columns.view(f"u{columns.itemsize}")
-    steps = words.copy()
-    steps[1:] -= words[:-1]
-    low_first = steps.astype(steps.dtype.newbyteorder("<"), copy=False)
-    planes = low_first.view(np.uint8).reshape(*steps.shape, steps.itemsize).transpose(1, 2, 0)
+    differences = words.copy()
+    differences[1:] -= words[:-1]
+    low_first = differences.astype(differences.dtype.newbyteorder("<"), copy=False)
+    planes = (
+        low_first.view(np.uint8)
+        .reshape(*differences.shape, differences.itemsize)
+        .transpose(1, 2, 0)
+    )
     packed = zlib.compress(np.ascontiguousarray(planes).tobytes(), _LEVEL)
     return base64.b64encode(packed).decode()
 
@@ -37,12 +41,12 @@ def unpack(text: str, dtype: str, columns: int) -> NDArray[Any]:
     kind = np.dtype(dtype)
     raw = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
     planes = raw.reshape(columns, kind.itemsize, -1).transpose(2, 0, 1)
-    steps = np.ascontiguousarray(planes).view(f"<u{kind.itemsize}")[..., 0]
-    words = np.cumsum(steps, axis=0, dtype=f"u{kind.itemsize}")
+    differences = np.ascontiguousarray(planes).view(f"<u{kind.itemsize}")[..., 0]
+    words = np.cumsum(differences, axis=0, dtype=f"u{kind.itemsize}")
     return np.ascontiguousarray(words).view(kind)
 
 
-def steps_of(points: Float64, low: Float64, extent: Float64) -> UInt16:
+def quantized(points: Float64, low: Float64, extent: Float64) -> UInt16:
     """Quantise points (N, 3) to 16 bits in a box with corner `low` (3,) and size `extent` (3,)."""
     return np.round((points - low) / extent * 65535).astype("<u2")
 

@@ -43,8 +43,8 @@ def render_pair(result: PairResult) -> str:
     """Return the page as HTML."""
     scene = pair_scene(result)
     head, tail = pair_words.decision(result)
-    drawn = render_modes(scene)
-    pictures = {mode: thumbnails.data_uri(image) for mode, image in drawn.items()}
+    images = render_modes(scene)
+    pictures = {mode: thumbnails.data_uri(image) for mode, image in images.items()}
     return template("pair.html.j2").render(
         title=f"{_short(result.source)} registered to {_short(result.target)}",
         version=__version__,
@@ -62,7 +62,7 @@ def render_pair(result: PairResult) -> str:
         none_color=_css(thumbnails.GONE),
         bar=color_bar(),
         ticks=[_mm(scene.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
-        beyond=words.length(scene.none_m),
+        beyond=words.length(scene.max_distance_m),
         started="the guess" if result.guess is not None else "the identity",
         thinned=_thinned(scene),
         distance=_distance(scene),
@@ -77,25 +77,25 @@ def render_pair(result: PairResult) -> str:
 
 
 def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
-    found = result.found
+    registration = result.found
     name = "Displacement of the centre" if result.source.center.any() else "Translation"
     facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
     facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))
-    if found.overlap is not None:
-        facts.append(("Overlap", pair_words.percent(found.overlap)))
-    facts.append(("Rms distance", words.length(found.rms_m)))
+    if registration.overlap is not None:
+        facts.append(("Overlap", pair_words.percent(registration.overlap)))
+    facts.append(("Rms distance", words.length(registration.rms_m)))
     if result.sigma != (None, None):
         facts.append(("Sigma", pair_words.sigma(result)))
-    if found.margin is not None:
-        facts.append(("Margin", pair_words.percent(found.margin)))
+    if registration.margin is not None:
+        facts.append(("Margin", pair_words.percent(registration.margin)))
     return facts
 
 
 def _notes(result: PairResult) -> list[tuple[str, str]]:
     """The details: a heading and a sentence each."""
     translation = pair_words.translation(result)
-    if moved := pair_words.moved_center(result):
-        translation += f"; {moved}"
+    if displacement := pair_words.moved_center(result):
+        translation += f"; {displacement}"
     notes = [
         ("Translation", translation),
         ("Rotation", pair_words.rotation(result)),
@@ -105,8 +105,8 @@ def _notes(result: PairResult) -> list[tuple[str, str]]:
         notes.append(("Sigma", f"{pair_words.sigma(result)} ({pair_words.sigma_note(result)})"))
     if free := pair_words.unobservable(result):
         notes.append(("Unobservable", f"{free}, in the axes of the source"))
-    if other := pair_words.runner_up(result):
-        notes.append(("Runner-up", other))
+    if runner_up := pair_words.runner_up(result):
+        notes.append(("Runner-up", runner_up))
     return notes
 
 
@@ -130,10 +130,10 @@ def _thinned(scene: PairScene) -> str:
 def _distance(scene: PairScene) -> str:
     """The median distance between the views where both have a surface, as text."""
     if scene.fraction == 0:
-        return f"No point is within {words.length(scene.none_m)} of the other view."
+        return f"No point is within {words.length(scene.max_distance_m)} of the other view."
     return (
         f"Median distance {_mm(scene.median_m)}, over the {pair_words.percent(scene.fraction)} of "
-        f"the points that are within {words.length(scene.none_m)} of the other view."
+        f"the points that are within {words.length(scene.max_distance_m)} of the other view."
     )
 
 

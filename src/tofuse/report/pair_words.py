@@ -9,21 +9,27 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.results.pair import PairResult
 
-_ALONG = 0.985  # minimum cosine to an axis for a direction to be named after it
+_MIN_AXIS_COSINE = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
 
 
 def decision(result: PairResult) -> tuple[str, str]:
-    """Return whether the pose is accepted, and the rest of the sentence."""
-    found = result.found
-    chance = "" if found.probability is None else f"probability {_chance(found.probability)}"
-    if found.believed:
-        return "Accepted", chance
-    if found.believed is None:
+    """Return whether the pose is accepted, and the remainder of the sentence."""
+    registration = result.found
+    probability = (
+        ""
+        if registration.probability is None
+        else f"probability {_probability(registration.probability)}"
+    )
+    if registration.believed:
+        return "Accepted", probability
+    if registration.believed is None:
         return "Not verified", "; ".join(
-            text for text in (chance, found.reason or "the method can't verify its result") if text
+            text
+            for text in (probability, registration.reason or "the method can't verify its result")
+            if text
         )
-    return "Rejected", "; ".join(text for text in (chance, found.reason) if text)
+    return "Rejected", "; ".join(text for text in (probability, registration.reason) if text)
 
 
 def translation(result: PairResult) -> str:
@@ -52,22 +58,22 @@ def rotation(result: PairResult) -> str:
 def matrix(result: PairResult) -> list[str]:
     """Return the rows of T_target_source as text."""
     T = result.T_target_source
-    wide = max(len(f"{value:.6f}") for value in T[:3, 3])
-    return [" ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{wide}.6f}" for row in T]
+    width = max(len(f"{value:.6f}") for value in T[:3, 3])
+    return [" ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{width}.6f}" for row in T]
 
 
 def overlap(result: PairResult) -> str:
     """Return overlap, support and contradiction as text, as far as the method provides them."""
-    found = result.found
+    registration = result.found
     parts = []
-    if found.overlap is not None:
-        parts.append(f"{percent(found.overlap)} of the points overlap")
-    if found.support is not None:
-        parts.append(f"{percent(found.support)} support the pose")
-    if found.contradiction is not None:
-        parts.append(f"{percent(found.contradiction)} contradict it")
+    if registration.overlap is not None:
+        parts.append(f"{percent(registration.overlap)} of the points overlap")
+    if registration.support is not None:
+        parts.append(f"{percent(registration.support)} support the pose")
+    if registration.contradiction is not None:
+        parts.append(f"{percent(registration.contradiction)} contradict it")
     if not parts:
-        return f"{percent(found.inlier_ratio)} of the source's points have a correspondence"
+        return f"{percent(registration.inlier_ratio)} of the source's points have a correspondence"
     return ", ".join(parts)
 
 
@@ -98,23 +104,23 @@ def sigma_note(result: PairResult) -> str:
 
 def unobservable(result: PairResult) -> str:
     """Return the unobservable motions as text, in the axes of the source; empty if none."""
-    slides, turns = result.free_motions
+    translations, rotations = result.free_motions
     parts = []
-    if len(slides):
-        parts.append(f"sliding {_directions(slides, 'along', 'in any direction')}")
-    if len(turns):
-        parts.append(f"turning {_directions(turns, 'about', 'about any axis')}")
+    if len(translations):
+        parts.append(f"sliding {_directions(translations, 'along', 'in any direction')}")
+    if len(rotations):
+        parts.append(f"turning {_directions(rotations, 'about', 'about any axis')}")
     return " and ".join(parts)
 
 
 def runner_up(result: PairResult) -> str:
     """Return the distance and the margin of the best rival pose as text; empty without one."""
     parts = []
-    away = result.runner_up_distance
-    if away is None and result.found.margin is not None:
+    distance = result.runner_up_distance
+    if distance is None and result.found.margin is not None:
         return "no other pose fits"
-    if away is not None:
-        metres, angle = away
+    if distance is not None:
+        metres, angle = distance
         parts.append(f"{metres:.3f} m and {np.degrees(angle):.1f}\N{DEGREE SIGN} away")
     if result.found.margin is not None:
         margin = result.found.margin
@@ -126,11 +132,11 @@ def runner_up(result: PairResult) -> str:
 
 def percent(value: float) -> str:
     """Return a fraction in percent as text, with a decimal if it is small."""
-    shown = 100 * value
-    return f"{shown:.1f} %" if 0.05 <= abs(shown) < 9.95 else f"{shown:.0f} %"
+    percentage = 100 * value
+    return f"{percentage:.1f} %" if 0.05 <= abs(percentage) < 9.95 else f"{percentage:.0f} %"
 
 
-def _chance(value: float) -> str:
+def _probability(value: float) -> str:
     """A probability as text, never 0 or 1."""
     if value > 0.99:
         return "above 99 %"
@@ -143,19 +149,19 @@ def vector(values: ArrayLike, digits: int) -> str:
     return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
-def _directions(axes: Float64, one: str, all_of_them: str) -> str:
+def _directions(axes: Float64, preposition: str, unrestricted: str) -> str:
     """The span of axes (k, 3) as text."""
     if len(axes) >= 3:
-        return all_of_them
+        return unrestricted
     if len(axes) == 2:
-        return f"{all_of_them} perpendicular to {_named(np.cross(*axes))}"
-    return f"{one} {_named(axes[0])}"
+        return f"{unrestricted} perpendicular to {_axis_name(np.cross(*axes))}"
+    return f"{preposition} {_axis_name(axes[0])}"
 
 
-def _named(axis: Float64) -> str:
+def _axis_name(axis: Float64) -> str:
     """The name of the source's axis that a direction is close to, else its components."""
     axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
     k = int(np.abs(axis).argmax())
-    if abs(axis[k]) > _ALONG:
+    if abs(axis[k]) > _MIN_AXIS_COSINE:
         return f"{'xyz'[k]}"
     return vector(axis * np.sign(axis[k]), 2)

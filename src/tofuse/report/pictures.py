@@ -35,8 +35,10 @@ class Pictures:
 
 def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
     """Return the depths in m at the ends of the colour map, the same for all frames."""
-    seen = [f.depth[::3, ::3] for f in frames]
-    values = np.concatenate([d[d > 0] for d in seen]) if seen else np.zeros(0, np.float16)
+    subsampled = [f.depth[::3, ::3] for f in frames]
+    values = (
+        np.concatenate([d[d > 0] for d in subsampled]) if subsampled else np.zeros(0, np.float16)
+    )
     if len(values) == 0:
         return 0.0, 1.0
     low, high = np.percentile(values.astype(float), [2, 98])
@@ -46,11 +48,11 @@ def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
 def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
     """Render the samples of frames."""
     low, high = depth_range(frames)
-    table = np.zeros((4, 3), np.uint8)
+    fate_colors = np.zeros((4, 3), np.uint8)
     for fate, (color, _) in FATES.items():
-        table[fate] = color
+        fate_colors[fate] = color
 
-    def drawn(frame: FrameSample) -> Pictures:
+    def render(frame: FrameSample) -> Pictures:
         depth = frame.depth.astype(float)
         picture = viridis((depth - low) / (high - low))
         picture[depth == 0] = GONE
@@ -58,7 +60,7 @@ def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
         images["range"] = encode(picture, jpeg=True)
         if frame.amplitude is not None:
             images["amplitude"] = encode(grey(frame.amplitude), jpeg=True)
-        images["fate"] = encode(table[frame.fate])
+        images["fate"] = encode(fate_colors[frame.fate])
         return Pictures(frame.index, images)
 
-    return tuple(run_all([partial(drawn, frame) for frame in frames]))
+    return tuple(run_all([partial(render, frame) for frame in frames]))

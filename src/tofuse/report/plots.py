@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Stand-ins that `svg` replaces by the page's variables of the same names.
+# Placeholders that `svg` replaces by the page's variables of the same names.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"
 PAGE = "#090909"
 BEFORE, AFTER, REFERENCE, LOOP, BAD = "#040404", "#050505", "#060606", "#070707", "#080808"
@@ -33,9 +33,9 @@ _VARIABLES = {
     BAD: "bad",
     PAGE: "page",
 }
-_MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
-_MAX_QUANTILE = 50_000  # points of which quantiles are computed
-_SMALL_M = 0.6
+_MODEL_COLOR = (112, 138, 176)  # of the model's points: visible on white and on near-black
+_MAX_QUANTILE = 50_000  # maximum number of points of which quantiles are computed
+_MAX_MM_EXTENT_M = 0.6  # plans of smaller extent have ticks in mm
 _WIDTH = 440  # of a plan, in pixels
 _STYLE: Any = {
     "svg.fonttype": "none",
@@ -96,20 +96,22 @@ def svg(figure: Figure, label: str) -> str:
     """Return the figure as an `<svg>` element; `label` is plain text without markup."""
     import matplotlib
 
-    out = io.StringIO()
-    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
-    # Salted with the label, identifiers differ between the plots of a page.
+    buffer = io.StringIO()
+    no_metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    # The label as salt makes identifiers differ between the plots of a page.
     with matplotlib.rc_context({**_STYLE, "svg.hashsalt": label}):
-        figure.savefig(out, format="svg", metadata=nothing)
-    text = out.getvalue()
+        figure.savefig(buffer, format="svg", metadata=no_metadata)
+    text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", text, count=1, flags=re.DOTALL)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     view = re.search(r'viewBox="[^"]*"', text)
     # HTML implies the namespaces, whose addresses would be in the page.
-    head = f'<svg class="plot" role="img" aria-label="{label}" {view.group() if view else ""}>'
-    text = head + text[text.index(">") + 1 :]
+    opening_tag = (
+        f'<svg class="plot" role="img" aria-label="{label}" {view.group() if view else ""}>'
+    )
+    text = opening_tag + text[text.index(">") + 1 :]
     text = text.replace("xlink:href", "href")
     text = re.sub(r"'?DejaVu Sans'?(, '[^']*'|, [A-Za-z -]+)*", "inherit", text)
     for color, name in _VARIABLES.items():
@@ -146,25 +148,25 @@ def lines(
         x of frames without a value, marked by crosses on the axis.
     """
     figure, axes = make_figure(*size, (52, 36, 10, 20))
-    one = len(x) == 1
+    single = len(x) == 1
     for y, color, style in series:
-        few = int(np.isfinite(y).sum()) <= 30
+        sparse = int(np.isfinite(y).sum()) <= 30
         axes.plot(
             x,
             y,
             color=color,
             linestyle=style,
             linewidth=1.6,
-            marker="o" if one or (few and style == "-") else None,
+            marker="o" if single or (sparse and style == "-") else None,
             markersize=3,
         )
     if log:
         values = np.concatenate([y for y, _, _ in series])
-        above = values[np.isfinite(values) & (values > 0)]
-        if len(above) and (values[np.isfinite(values)] > 0).all():
+        positive = values[np.isfinite(values) & (values > 0)]
+        if len(positive) and (values[np.isfinite(values)] > 0).all():
             axes.set_yscale("log")
-        elif len(above):
-            axes.set_yscale("symlog", linthresh=float(above.min()))
+        elif len(positive):
+            axes.set_yscale("symlog", linthresh=float(positive.min()))
     if zero:
         axes.axhline(0, color=MUTED, linewidth=0.8)
     if floor:
@@ -179,9 +181,9 @@ def lines(
             transform=axes.get_xaxis_transform(),
             clip_on=False,
         )
-    if not one and len(x):
-        pad = 0.01 * (x[-1] - x[0])
-        axes.set_xlim(x[0] - pad, x[-1] + pad)
+    if not single and len(x):
+        padding = 0.01 * (x[-1] - x[0])
+        axes.set_xlim(x[0] - padding, x[-1] + padding)
     axes.set_xlabel(xlabel, color=MUTED, fontsize=10.5, labelpad=2)
     axes.set_title(ylabel, color=INK, fontsize=11, loc="left", pad=6, x=-0.1)
     axes.locator_params(axis="x", nbins=6, integer=True)
@@ -205,20 +207,20 @@ def project(points: Float64, view: str) -> Float64:
 
 
 def limits(
-    *groups: Float64, outer: float = 0.0, room: float = 0.06, least: float = 0.02
+    *groups: Float64, outer: float = 0.0, margin: float = 0.06, min_margin_m: float = 0.02
 ) -> Float64:
     """Return (2, 2) low and high corners around groups of (N, 2) points.
 
-    `outer` percent of the points are left out at each end. The border is `room` of the size,
-    and at least `least` m.
+    `outer` percent of the points are left out at each end. The border is `margin` of the size,
+    and at least `min_margin_m` m.
     """
-    some = [g[:: -(-len(g) // _MAX_QUANTILE)] if outer else g for g in groups if len(g)]
-    boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in some]
+    sampled = [g[:: -(-len(g) // _MAX_QUANTILE)] if outer else g for g in groups if len(g)]
+    boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in sampled]
     if not boxes:
         return np.array([[-0.5, -0.5], [0.5, 0.5]])
     low = np.min([b[0] for b in boxes], axis=0)
     high = np.max([b[1] for b in boxes], axis=0)
-    border = np.maximum(room * (high - low).max(), least)
+    border = np.maximum(margin * (high - low).max(), min_margin_m)
     return np.stack([low - border, high + border])
 
 
@@ -231,12 +233,12 @@ def _plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
     figure, axes = make_figure(width, height + bottom + top, (left, bottom, right, top))
     # Enlarge the box to the shape of the axes, about its centre.
     scale = max(extent[0] / inner, extent[1] / height)
-    middle = box.mean(0)
-    axes.set_xlim(middle[0] - scale * inner / 2, middle[0] + scale * inner / 2)
-    axes.set_ylim(middle[1] - scale * height / 2, middle[1] + scale * height / 2)
+    centre = box.mean(0)
+    axes.set_xlim(centre[0] - scale * inner / 2, centre[0] + scale * inner / 2)
+    axes.set_ylim(centre[1] - scale * height / 2, centre[1] + scale * height / 2)
     (a, sa), (b, sb) = VIEWS[view]
     # In metres, the ticks of a camera that hardly moves would need three digits.
-    unit, per_m = ("mm", 1000) if max(extent) < _SMALL_M else ("m", 1)
+    unit, per_m = ("mm", 1000) if max(extent) < _MAX_MM_EXTENT_M else ("m", 1)
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
         axis.set_major_locator(locator(inner / 60 if axis is axes.xaxis else height / 40))
         axis.set_major_formatter(partial(_tick, by=sign * per_m))
@@ -249,11 +251,11 @@ def _tick(value: float, _: int, *, by: float) -> str:
     return f"{by * value + 0.0:.6g}".replace("-", "−")
 
 
-def locator(most: float) -> Any:
-    """Return a locator of at most about `most` ticks, 2 to 6, at round numbers."""
+def locator(max_ticks: float) -> Any:
+    """Return a locator of at most about `max_ticks` ticks, 2 to 6, at round numbers."""
     from matplotlib.ticker import MaxNLocator
 
-    return MaxNLocator(nbins=int(np.clip(most, 2, 6)), steps=[1, 2, 5, 10])
+    return MaxNLocator(nbins=int(np.clip(max_ticks, 2, 6)), steps=[1, 2, 5, 10])
 
 
 def model(
@@ -286,10 +288,10 @@ def model(
     inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
     cell = (columns * i[inside] + j[inside]).astype(np.intp)
     density = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
-    top = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
+    max_density = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
     image = np.zeros((rows, columns, 4), np.uint8)
-    image[..., :3] = _MODEL
-    alpha = (np.log1p(density) / np.log1p(top)).clip(0, 1)
+    image[..., :3] = _MODEL_COLOR
+    alpha = (np.log1p(density) / np.log1p(max_density)).clip(0, 1)
     image[..., 3] = np.round(255 * np.where(density > 0, 0.3 + 0.7 * alpha, 0))
     axes.imshow(
         image,
@@ -354,7 +356,7 @@ def cameras(
     poses
         (n, 4, 4) T_world_camera.
     box
-        (2, 2) corners of the picture, m, so that pictures compare.
+        (2, 2) corners of the picture, m, so that pictures are comparable.
     loops
         (L, 2, 3) ends of loops.
     reference
@@ -377,8 +379,8 @@ def cameras(
     if view == "side":
         shape = shape[:, [1, 0, 2]]
     for k in range(0, len(poses), step):
-        grow = 1.7 if k == 0 else 1.0
-        world = poses[k, :3, :3] @ (grow * size * shape.T) + poses[k, :3, 3:]
+        scale = 1.7 if k == 0 else 1.0
+        world = poses[k, :3, :3] @ (scale * size * shape.T) + poses[k, :3, 3:]
         flat = project(world.T, view)
         axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=1.8 if k == 0 else 0.9)
     axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
@@ -408,17 +410,17 @@ def rig(
     pairs
         Cameras a and b that are joined by a line, and its label.
     """
-    middles = poses[:, :3, 3]
-    apart = float(np.linalg.norm(middles - middles.mean(0), axis=1).max())
-    size = 0.35 * apart if apart > 0.01 else 0.1
+    centres = poses[:, :3, 3]
+    radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    size = 0.35 * radius if radius > 0.01 else 0.1
     corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
-    seen = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + middles[:, None]
-    box = limits(project(middles, view), project(seen.reshape(-1, 3), view), room=0.16)
+    frusta = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + centres[:, None]
+    box = limits(project(centres, view), project(frusta.reshape(-1, 3), view), margin=0.16)
     figure, axes = _plan(box, view)
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
     for a, b, text in pairs:
-        ends = project(middles[[a, b]], view)
+        ends = project(centres[[a, b]], view)
         axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
         axes.annotate(
             text,
@@ -430,19 +432,19 @@ def rig(
             bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 1.5},
         )
     for k, name in enumerate(names):
-        eye, flat = project(middles[k : k + 1], view)[0], project(seen[k], view)
-        color, thick = (AFTER, 1.8) if k == 0 else (INK, 1.1)
+        eye, flat = project(centres[k : k + 1], view)[0], project(frusta[k], view)
+        color, linewidth = (AFTER, 1.8) if k == 0 else (INK, 1.1)
         axes.fill(*flat.T, color=color, alpha=0.12, linewidth=0)
-        axes.plot(*np.concatenate([flat, flat[:1]]).T, color=color, linewidth=thick)
+        axes.plot(*np.concatenate([flat, flat[:1]]).T, color=color, linewidth=linewidth)
         for corner in flat:
-            axes.plot(*np.stack([eye, corner]).T, color=color, linewidth=thick)
+            axes.plot(*np.stack([eye, corner]).T, color=color, linewidth=linewidth)
         axes.plot(*eye, "o", color=color, markersize=4)
-        # Behind the camera, where nothing of it is drawn.
+        # The name is behind the camera, where nothing is drawn.
         behind = eye - flat.mean(0)
         length = float(np.linalg.norm(behind))
         behind = behind / length if length > 0.2 * size else np.array([0.0, -1.0])
-        at = eye + 10 * per_pixel * behind
-        side = "left" if behind[0] > 0.4 else "right" if behind[0] < -0.4 else "center"
-        rise = "bottom" if behind[1] > 0.4 else "top" if behind[1] < -0.4 else "center"
-        axes.text(*at, name, color=color, fontsize=11, ha=side, va=rise)
+        position = eye + 10 * per_pixel * behind
+        ha = "left" if behind[0] > 0.4 else "right" if behind[0] < -0.4 else "center"
+        va = "bottom" if behind[1] > 0.4 else "top" if behind[1] < -0.4 else "center"
+        axes.text(*position, name, color=color, fontsize=11, ha=ha, va=va)
     return svg(figure, label)

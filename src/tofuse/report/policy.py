@@ -1,7 +1,7 @@
-"""Content security policy of the pages: they run their own scripts and load nothing else.
+"""Content security policy of the pages: they run only their inline scripts and load nothing else.
 
-Names in recordings are text. Should a template ever let them through as markup, the browser runs
-no script whose hash is not in the policy, and requests nothing from outside.
+Names in recordings are text. Should a template ever output them as markup, the browser runs no
+script whose hash is not in the policy, and sends no requests.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _HEAD = re.compile(r"<meta\s+charset=[^>]*>", re.I)
 def script_hashes(html: str) -> list[str]:
     """Return the hashes of a page's inline scripts as in a policy, in order, each once."""
     bodies = [
-        found["body"]
-        for found in _SCRIPT.finditer(html)
-        if not _DATA.search(found["attributes"]) and "src=" not in found["attributes"].lower()
+        match["body"]
+        for match in _SCRIPT.finditer(html)
+        if not _DATA.search(match["attributes"]) and "src=" not in match["attributes"].lower()
     ]
     # Browsers hash scripts with normalised line ends.
     texts = [body.replace("\r\n", "\n").replace("\r", "\n").encode() for body in bodies]
-    sums = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in texts]
-    return list(dict.fromkeys(f"'sha256-{each}'" for each in sums))
+    digests = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in texts]
+    return list(dict.fromkeys(f"'sha256-{digest}'" for digest in digests))
 
 
 def secured(html: str) -> str:

@@ -1,4 +1,4 @@
-"""What the 3D view shows: the model, cameras and loops as compact arrays, and a still of them."""
+"""The content of the 3D view: model, cameras and loops as compact arrays, and a still image."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import thumbnails
-from tofuse.report.packing import normal_bytes, pack, steps_of
+from tofuse.report.packing import normal_bytes, pack, quantized
 from tofuse.results.types import Reconstruction
 
 MAX_POINTS = 150_000
 MAX_FACES = 300_000
 MAX_CAMERAS = 72
-_MAX_PATH = 1000  # segments of a trajectory
-_FAR = 1.8  # times the size of the model: then it is framed without the cameras
-_SAMPLED, _CLEARLY = 5000, 1.05  # sampled normals, and the ratio that decides
+_MAX_SEGMENTS = 1000  # segments of a trajectory
+_MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
+_MAX_NORMALS, _MIN_AREA_RATIO = 5000, 1.05  # sampled normals; area to the default view's
 _DIRECTIONS = 100  # in which the outermost points are framed
 _MAX_FRAMED = 50_000  # of these points
-# Of the cameras of a rig, in their order; the first is that of any camera.
+# Of the cameras of a rig, in their order; the first is also that of a single camera.
 CAMERA_COLORS = (
     (90, 176, 245), (243, 122, 160), (95, 208, 138), (226, 200, 84),
     (178, 144, 245), (240, 140, 84), (84, 214, 214), (205, 208, 214),
@@ -42,7 +42,7 @@ class Scene:
     points, colors, normals
         (K, 3) float64 m, (K, 3) uint8, (K, 3) float or None where the cloud has none.
     total
-        Points in the whole model.
+        Number of points of the full model.
     spacing
         Typical distance between neighbouring points shown, m.
     before, after, reference
@@ -51,10 +51,10 @@ class Scene:
     loops
         (L, 2, 3) camera centres of the accepted loop closures.
     surface
-        The whole surface; None without one.
+        The full surface; None without one.
     sigma, views
-        (K,) standard deviation of the points, m, and (K,) number of views that saw them; None where
-        not known.
+        (K,) standard deviation of the points, m, and (K,) number of views that observed them; None
+        if unknown.
     """
 
     points: Float64
@@ -81,28 +81,34 @@ class Scene:
     def box(self) -> Float64:
         """(2, 3) corners of the box to be shown, without the outermost points.
 
-        It includes the cameras unless they would enlarge it much, as those around an object do.
+        It includes the cameras unless they would enlarge it much, like those around an object.
         """
         points, cameras = self.points, self.after[:, :3, 3]
         boxes = [np.percentile(p, [3, 97], axis=0) for p in (points, cameras) if len(p)]
         if not boxes:
             return np.zeros((2, 3))
-        both = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
-        reach, own = (float(np.linalg.norm(np.ptp(box, axis=0))) for box in (both, boxes[0]))
-        return boxes[0] if own > 0 and reach > _FAR * own else both
+        combined = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
+        combined_size, points_size = (
+            float(np.linalg.norm(np.ptp(box, axis=0))) for box in (combined, boxes[0])
+        )
+        return (
+            boxes[0]
+            if points_size > 0 and combined_size > _MAX_EXTENT_RATIO * points_size
+            else combined
+        )
 
     @property
     def framed(self) -> Float64:
-        """(K, 3) extreme points of the content of the box, which the view must contain."""
+        """(K, 3) extreme points of the content of the box, which must be in view."""
         low, high = self.box
         cameras = self.after[:, :3, 3]
-        near = cameras[((cameras >= low) & (cameras <= high)).all(1)]
-        shown = [
+        cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
+        extremes = [
             extreme_points(part, outer)
-            for part, outer in ((self.points, 0.5), (near, 0.0))
+            for part, outer in ((self.points, 0.5), (cameras_in_box, 0.0))
             if len(part)
         ]
-        return np.concatenate(shown) if shown else np.stack([low, high])
+        return np.concatenate(extremes) if extremes else np.stack([low, high])
 
     @property
     def center(self) -> Float64:
@@ -172,7 +178,7 @@ class RigCameras:
 
 
 def finite_poses(poses: Float64 | None) -> Float64:
-    """Return the finite ones of poses, (n, 4, 4)."""
+    """Return the finite poses, (n, 4, 4)."""
     if poses is None or len(poses) == 0:
         return np.zeros((0, 4, 4))
     return poses[np.isfinite(poses).all((1, 2))]
@@ -193,10 +199,10 @@ def make_scene(
         (N, 4, 4) reference poses, NaN where there is none; or None.
     """
     cloud = result.cloud
-    chosen = random_subset(len(cloud), MAX_POINTS)
-    points = cloud.points[chosen].astype(float) + cloud.offset
-    good = np.isfinite(points).all(1)
-    points, chosen = points[good], chosen[good]
+    sampled = random_subset(len(cloud), MAX_POINTS)
+    points = cloud.points[sampled].astype(float) + cloud.offset
+    finite = np.isfinite(points).all(1)
+    points, sampled = points[finite], sampled[finite]
     ends = [
         (result.trajectory[rows[p.i], :3, 3], result.trajectory[rows[p.j], :3, 3])
         for p in result.diagnostics.loops
@@ -205,8 +211,8 @@ def make_scene(
     loops = np.array(ends, float).reshape(-1, 2, 3)
     return Scene(
         points,
-        _colors(cloud, chosen, points),
-        None if cloud.normals is None else cloud.normals[chosen],
+        _colors(cloud, sampled, points),
+        None if cloud.normals is None else cloud.normals[sampled],
         len(cloud),
         spacing_of(points),
         finite_poses(result.diagnostics.sequential),
@@ -214,8 +220,8 @@ def make_scene(
         finite_poses(reference),
         loops[np.isfinite(loops).all((1, 2))],
         _display_colors(result.mesh),
-        None if cloud.sigma is None else cloud.sigma[chosen],
-        None if cloud.views is None else cloud.views[chosen],
+        None if cloud.sigma is None else cloud.sigma[sampled],
+        None if cloud.views is None else cloud.views[sampled],
     )
 
 
@@ -238,7 +244,7 @@ def packed(scene: Scene) -> dict[str, Any]:
         "spacing": scene.spacing if mesh is None else spacing_of(points),
         "yaw": opening_yaw(scene),
         "pitch": PITCH,
-        "model": _packed_model(scene, steps_of(points, low, extent)) if len(points) else None,
+        "model": _packed_model(scene, quantized(points, low, extent)) if len(points) else None,
         "lines": {
             "reference": pack(path_lines(scene.reference).astype("<f4")),
             "loops": pack(scene.loops.reshape(-1, 3).astype("<f4")),
@@ -252,8 +258,8 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
         normals, colors, faces = scene.normals, scene.colors, None
     else:
         normals, faces = mesh.normals, pack(mesh.faces.astype("<u4"))
-        own = mesh.color
-        colors = height_colors(mesh.vertices.astype(float)) if own is None else own
+        color = mesh.color
+        colors = height_colors(mesh.vertices.astype(float)) if color is None else color
     return {
         "points": pack(steps),
         "colors": pack(colors),
@@ -271,21 +277,21 @@ def _display_colors(mesh: Mesh | None) -> Mesh | None:
 def opening_yaw(scene: Scene) -> float:
     """Return the yaw in rad that shows the largest front-facing area of the model.
 
-    The best of eight directions, but `YAW` unless another one shows clearly more.
+    The best of eight directions, but `YAW` unless another one shows considerably more.
     """
     normals = scene.normals if scene.mesh is None else scene.mesh.normals
     if normals is None or not len(normals):
         return YAW
-    sample = np.nan_to_num(normals[:: -(-len(normals) // _SAMPLED)].astype(float))
+    sampled = np.nan_to_num(normals[:: -(-len(normals) // _MAX_NORMALS)].astype(float))
     yaws = YAW + np.arange(8) * np.pi / 4
-    towards = np.array([-thumbnails.view_rotation(yaw, PITCH)[2] for yaw in yaws])
-    seen = np.maximum(sample @ towards.T, 0).sum(0)
-    best = int(seen.argmax())
-    return float(yaws[best]) if seen[best] > _CLEARLY * seen[0] else YAW
+    view_directions = np.array([-thumbnails.view_rotation(yaw, PITCH)[2] for yaw in yaws])
+    visible_area = np.maximum(sampled @ view_directions.T, 0).sum(0)
+    best = int(visible_area.argmax())
+    return float(yaws[best]) if visible_area[best] > _MIN_AREA_RATIO * visible_area[0] else YAW
 
 
 def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
-    """Return ends of lines (2 n, 3): cameras as pyramids, and the trajectory.
+    """Return end points of lines (2 n, 3): cameras as pyramids, and the trajectory.
 
     Parameters
     ----------
@@ -299,9 +305,9 @@ def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
     if len(poses) == 0:
         return np.zeros((0, 3))
     w, h, d = 0.5, 0.4, 0.8
-    tip = np.zeros(3)
+    apex = np.zeros(3)
     a, b, c, e = ([x * w, y * h, d] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
-    shape = np.array([tip, a, tip, b, tip, c, tip, e, a, b, b, c, c, e, e, a], float) * edge
+    shape = np.array([apex, a, apex, b, apex, c, apex, e, a, b, b, c, c, e, e, a], float) * edge
     drawn = poses[::step]
     out = [se3.transform(drawn, shape[None]).reshape(-1, 3), path_lines(poses)]
     out.append(se3.transform(poses[0], 1.8 * shape))
@@ -309,12 +315,12 @@ def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
 
 
 def path_lines(poses: Float64) -> Float64:
-    """Return ends of the lines (2 n, 3) that join the camera centres in order.
+    """Return end points of the lines (2 n, 3) that join the camera centres in order.
 
     Of long trajectories every k-th centre is joined: wide lines cost a browser more than triangles.
     """
     centers = poses[:, :3, 3]
-    step = max(1, -(-len(centers) // _MAX_PATH))
+    step = max(1, -(-len(centers) // _MAX_SEGMENTS))
     centers = np.concatenate([centers[:-1:step], centers[-1:]])
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
@@ -327,7 +333,7 @@ def render(
     pitch: float = PITCH,
     eye_at: tuple[Float64, float] | None = None,
     peel: bool = True,
-    least: int = 1,
+    min_radius: int = 1,
 ) -> UInt8:
     """Render the initial 3D view as an image (H, W, 3), for browsers without WebGL.
 
@@ -340,10 +346,10 @@ def render(
     yaw, pitch
         Viewing direction, rad.
     eye_at
-        Point (3,) to look at, and the distance from it, m; by default the whole scene.
+        Point (3,) to look at, and the distance from it, m; by default the full scene.
     peel
         Whether to leave out back faces.
-    least
+    min_radius
         Minimum size of a point, pixels.
     """
     center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
@@ -354,33 +360,33 @@ def render(
     scale = size[1] / (2 * np.tan(0.35) * distance)
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
     if scene.normals is not None and len(points):
-        # Surfaces that face away are walls between us and the inside.
+        # Surfaces that face away are walls in front of the interior.
         eye = center - R.T @ np.array([0, 0, distance])
-        towards = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
-        facing = (towards * np.nan_to_num(scene.normals)).sum(1)
+        to_eye = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+        facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
         colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
         if peel:
             points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(scene.spacing * scale), least, 6))
-    drawn = thumbnails.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
-    out = np.empty((*drawn.shape[:2], 3), np.uint8)
-    out[:] = thumbnails.BACKGROUND
-    seen = drawn[..., 3] > 0
-    out[seen] = drawn[seen, :3]
+    radius = int(np.clip(np.ceil(scene.spacing * scale), min_radius, 6))
+    rgba = thumbnails.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
+    image = np.empty((*rgba.shape[:2], 3), np.uint8)
+    image[:] = thumbnails.BACKGROUND
+    covered = rgba[..., 3] > 0
+    image[covered] = rgba[covered, :3]
     edge, step = 0.018 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
-        dots = _sampled(camera_lines(poses, edge, step))
-        ink = thumbnails.splat(
-            dots,
-            np.broadcast_to(np.array(color, np.uint8), dots.shape),
+        line_points = _sample_lines(camera_lines(poses, edge, step))
+        lines_rgba = thumbnails.splat(
+            line_points,
+            np.broadcast_to(np.array(color, np.uint8), line_points.shape),
             T,
             size,
             scale=scale,
             distance=distance,
         )
-        seen = ink[..., 3] > 0
-        out[seen] = ink[seen, :3]
-    return out
+        covered = lines_rgba[..., 3] > 0
+        image[covered] = lines_rgba[covered, :3]
+    return image
 
 
 def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
@@ -389,13 +395,13 @@ def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
         return render(scene, size)
     framing = thumbnails.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
     R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
-    # Far enough for the nearest points, which appear largest.
+    # So distant that the nearest points, which appear largest, fit.
     depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
     distance = size[1] / (2 * np.tan(0.35) * framing.scale) + 0.5 * float(depth)
-    return render(scene, size, eye_at=(-R.T @ t, distance), least=2)
+    return render(scene, size, eye_at=(-R.T @ t, distance), min_radius=2)
 
 
-def _sampled(lines: Float64, number: int = 24) -> Float64:
+def _sample_lines(lines: Float64, number: int = 24) -> Float64:
     ends = lines.reshape(-1, 2, 3)
     t = np.linspace(0, 1, number)[None, :, None]
     return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
@@ -416,22 +422,22 @@ def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
     inside = points[((points >= low) & (points <= high)).all(1)]
     points = inside if len(inside) else points
     k = np.arange(_DIRECTIONS) + 0.5
-    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    across = np.sqrt(1 - height**2)
-    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height])
+    height, azimuth = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - height**2)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
     return points[np.unique((points @ directions).argmax(0))]
 
 
-def random_subset(number: int, most: int) -> Intp:
-    """Return the indices of at most `most` points, chosen at random to avoid regular patterns."""
-    if number <= most:
-        return np.arange(number)
-    return np.sort(np.random.default_rng([0, number]).permutation(number)[:most])
+def random_subset(count: int, max_count: int) -> Intp:
+    """Return the indices of at most `max_count` points, random to avoid regular patterns."""
+    if count <= max_count:
+        return np.arange(count)
+    return np.sort(np.random.default_rng([0, count]).permutation(count)[:max_count])
 
 
-def _colors(cloud: Cloud, chosen: Intp, points: Float64) -> UInt8:
+def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
     if cloud.color is not None:
-        return seen_colors(cloud.color[chosen])
+        return seen_colors(cloud.color[sampled])
     return height_colors(points)
 
 
@@ -455,6 +461,6 @@ def spacing_of(points: Float64) -> float:
         return 0.01
     from scipy.spatial import cKDTree
 
-    sample = points[:: max(1, len(points) // 2000)]
-    near, _ = cKDTree(points).query(sample, k=2)
-    return float(max(np.median(near[:, 1]), 1e-5))
+    sampled = points[:: max(1, len(points) // 2000)]
+    distances, _ = cKDTree(points).query(sampled, k=2)
+    return float(max(np.median(distances[:, 1]), 1e-5))

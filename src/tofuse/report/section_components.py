@@ -24,26 +24,26 @@ def color(component: int) -> int:
 
 def components(s: Subject) -> Values:
     """Return the table of components; empty if there is only one."""
-    found = s.result.components
-    apart = sum(not c.connected for c in found)
-    if len(found) < 2:
-        return {"components": [], "components_text": "", "apart": apart}
-    sizes = [0] * len(found)
+    parts = s.result.components
+    disconnected = sum(not c.connected for c in parts)
+    if len(parts) < 2:
+        return {"components": [], "components_text": "", "apart": disconnected}
+    sizes = [0] * len(parts)
     for record in s.result.diagnostics.frames:
         if record.component is not None:
             sizes[record.component] += 1
-    rows = [_row(number, c, sizes[number]) for number, c in enumerate(found)]
-    text = f"The recording was tracked in {words.count(len(found), 'component')}. "
-    if apart:
+    rows = [_row(number, c, sizes[number]) for number, c in enumerate(parts)]
+    text = f"The recording was tracked in {words.count(len(parts), 'component')}. "
+    if disconnected:
         text += (
-            f"{apart:,} of them could not be connected to the main one, so "
-            f"{'its' if apart == 1 else 'their'} frames are not in this model."
+            f"{disconnected:,} of them could not be connected to the main one, so "
+            f"{'its' if disconnected == 1 else 'their'} frames are not in this model."
         )
     else:
         text += "All of them are connected and are in this model."
     if len(rows) > ROWS:
         text += f" The first {ROWS} are listed."
-    return {"components": rows[:ROWS], "components_text": text, "apart": apart}
+    return {"components": rows[:ROWS], "components_text": text, "apart": disconnected}
 
 
 def _row(number: int, component: Component, count: int) -> Values:

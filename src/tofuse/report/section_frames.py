@@ -17,7 +17,7 @@ _STRIP = 600  # cells in the strip of frames
 def frames(s: Subject) -> Values:
     """Return the strip of frames, the plots of registration quality and the table of problems."""
     records = s.result.diagnostics.frames
-    out: Values = {
+    section: Values = {
         "lanes": list(words.STATUSES),
         "strip": [],
         "health": [],
@@ -26,17 +26,17 @@ def frames(s: Subject) -> Values:
         "health_legend": [],
     }
     if not records:
-        return out | {"strip_label": "", "strip_hint": "", "strip_hint_short": ""}
+        return section | {"strip_label": "", "strip_hint": "", "strip_hint_short": ""}
     components = s.result.components
     if len(components) > 1:
-        out["lanes"].append("component")
-    # With more frames than cells, a cell represents several and shows the worst of them.
-    size = -(-len(records) // _STRIP)
-    for start in range(0, len(records), size):
-        group = records[start : start + size]
+        section["lanes"].append("component")
+    # With more frames than cells, a cell shows the worst of several frames.
+    cell_frames = -(-len(records) // _STRIP)
+    for start in range(0, len(records), cell_frames):
+        group = records[start : start + cell_frames]
         worst = max(group, key=lambda r: (1, 2, 3, 0)[words.STATUSES.index(r.status)])
         lane = words.STATUSES.index(worst.status)
-        out["strip"].append(
+        section["strip"].append(
             {
                 "status": worst.status,
                 "lane": lane,
@@ -48,21 +48,21 @@ def frames(s: Subject) -> Values:
             }
         )
     counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
-    out["strip_label"] = "Status of each frame: " + ", ".join(counts)
+    section["strip_label"] = "Status of each frame: " + ", ".join(counts)
     first, last = records[0].index, records[-1].index
-    out["strip_hint_short"] = (
+    section["strip_hint_short"] = (
         f"{words.frame_range(first, last).capitalize()}: status above, accuracy below (dark = "
         "accurate)."
         if any(r.covariance is not None for r in records)
         else f"{words.frame_range(first, last).capitalize()}: status."
     )
-    out["strip_hint"] = (
+    section["strip_hint"] = (
         f"From left to right: {words.frame_range(first, last)}. Point at a frame to see its status."
     )
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
     if len(bad):
-        out["health_legend"] = [("bad", "x", "lost or skipped")]
+        section["health_legend"] = [("bad", "x", "lost or skipped")]
     inliers = np.array(
         [np.nan if r.inlier_share is None else r.inlier_share for r in records], float
     )
@@ -73,17 +73,17 @@ def frames(s: Subject) -> Values:
     ):
         if np.isfinite(values).any():
             series = [(values * scale, plots.AFTER, "-")]
-            drawn = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
-            out["health"].append(Figure(drawn))
+            svg = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+            section["health"].append(Figure(svg))
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
-    out["problems"] = [
-        (words.frame_range(a, b), f"{n:,}", status, why or "–", [[a, b]])
-        for a, b, n, status, why in runs[:ROWS]
+    section["problems"] = [
+        (words.frame_range(a, b), f"{n:,}", status, reason or "–", [[a, b]])
+        for a, b, n, status, reason in runs[:ROWS]
     ]
     if len(runs) > ROWS:
-        out["problems_more"] = f"{len(runs) - ROWS:,} more are not shown."
-    return out
+        section["problems_more"] = f"{len(runs) - ROWS:,} more are not shown."
+    return section
 
 
 def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str:
@@ -98,8 +98,8 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
     if len(record.unobservable):
         parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
     if record.component is not None and len(components) > 1:
-        apart = "" if in_main_model(record, components) else " (not connected to the main one)"
-        parts.append(f"component {record.component}{apart}")
+        note = "" if in_main_model(record, components) else " (not connected to the main one)"
+        parts.append(f"component {record.component}{note}")
     return ", ".join(parts)
 
 

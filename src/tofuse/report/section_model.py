@@ -24,24 +24,24 @@ def model(s: Subject) -> Values:
             "rig": [],
             "thinned": "",
         }
-    laid = scene.view_rotation(s.straight)
-    by = (
-        {field.name: field for field in fields(laid, camera_frusta.position_errors(s))}
+    displayed = scene.view_rotation(s.R_display_world)
+    fields_by_name = (
+        {field.name: field for field in fields(displayed, camera_frusta.position_errors(s))}
         if len(scene.points)
         else {}
     )
-    own = _own_colors(s)
-    data = packed(laid) | {
-        "fields": {name: field.packed() for name, field in by.items()},
+    color_source = _color_source(s)
+    data = packed(displayed) | {
+        "fields": {name: field.packed() for name, field in fields_by_name.items()},
         "frames": camera_frusta.packed(s),
     }
     return {
         "scene": data,
-        "still": thumbnails.data_uri(render(laid, yaw=opening_yaw(laid))),
+        "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
         "toggles": _toggles(scene),
         "rig": _rig(s),
-        "colorings": ([("", own)] if own else [])
-        + [(name, field.label) for name, field in by.items()],
+        "colorings": ([("", color_source)] if color_source else [])
+        + [(name, field.label) for name, field in fields_by_name.items()],
         "thinned": _thinned(scene),
     }
 
@@ -76,8 +76,8 @@ def _rig(s: Subject) -> list[tuple[str, str]]:
     ]
 
 
-def _own_colors(s: Subject) -> str:
-    """The origin of the model's own colours: colour images or amplitude; empty without any."""
+def _color_source(s: Subject) -> str:
+    """The source of the model's colours: colour images or amplitude; empty without any."""
     mesh = s.scene.mesh
     color = s.result.cloud.color if mesh is None else mesh.color
     if color is None or not len(color):
@@ -88,10 +88,10 @@ def _own_colors(s: Subject) -> str:
 
 def _thinned(scene: Scene) -> str:
     if scene.mesh is not None and scene.surface is not None:
-        shown, total, what = len(scene.mesh.faces), len(scene.surface.faces), "triangles"
+        shown, total, unit = len(scene.mesh.faces), len(scene.surface.faces), "triangles"
     else:
-        shown, total, what = len(scene.points), scene.total, "points"
-    return "" if shown == total else f"{shown:,} of {total:,} {what} are shown."
+        shown, total, unit = len(scene.points), scene.total, "points"
+    return "" if shown == total else f"{shown:,} of {total:,} {unit} are shown."
 
 
 def views(s: Subject) -> Values:
@@ -100,55 +100,57 @@ def views(s: Subject) -> Values:
         return dict.fromkeys(("views", "sizes", "views_legend", "views_note"), "") | {
             "true_sizes": False
         }
-    R = s.straight
+    R = s.R_display_world
     points = s.scene.points @ R.T
-    true = None if s.truth is None else s.truth @ R.T
+    truth = None if s.truth is None else s.truth @ R.T
     path = s.scene.after[:, :3, 3] @ R.T
     measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
     figures = [
         Figure(
-            plots.model(points, path, true, view, measured=measured, label=f"Model, {name}"), name
+            plots.model(points, path, truth, view, measured=measured, label=f"Model, {name}"), name
         )
         for view, name in (("above", "From above"), ("side", "From the side"))
     ]
     before = s.result.diagnostics.cloud_before
     if before is not None and len(before):
-        earlier = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
+        points_before = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
         name = "From above, before optimisation"
-        extents = np.percentile(earlier, [OUTER, 100 - OUTER], axis=0)
-        start = s.scene.before[:, :3, 3] @ R.T
-        drawn = plots.model(earlier, start, true, "above", measured=extents, label=f"Model, {name}")
-        figures.insert(0, Figure(drawn, name))
+        extents = np.percentile(points_before, [OUTER, 100 - OUTER], axis=0)
+        path_before = s.scene.before[:, :3, 3] @ R.T
+        svg = plots.model(
+            points_before, path_before, truth, "above", measured=extents, label=f"Model, {name}"
+        )
+        figures.insert(0, Figure(svg, name))
     legend = [("after", "", "measured extents")]
     if len(path):
         legend.append(("ink", "", "camera trajectory (dot: start)"))
-    if true is not None:
+    if truth is not None:
         legend.insert(0, ("bad", "6 3", "true outline"))
     return {
         "views": figures,
-        "sizes": _sizes(s.result.cloud.points @ R.T.astype(np.float32), measured, true),
-        "true_sizes": true is not None,
+        "sizes": _sizes(s.result.cloud.points @ R.T.astype(np.float32), measured, truth),
+        "true_sizes": truth is not None,
         "views_legend": legend,
-        "views_note": _turn_note(R),
+        "views_note": _axes_note(R),
     }
 
 
-def _sizes(points: Float32, measured: Float64, true: Float64 | None) -> list[list[str]]:
+def _sizes(points: Float32, measured: Float64, truth: Float64 | None) -> list[list[str]]:
     """Extents of the model without outliers, by its corners `measured`, and of all its points."""
     rows = []
     points = points[np.isfinite(points).all(1)]
     for axis, name in enumerate(("width", "height", "depth")):
-        got = float(np.ptp(measured[:, axis]))
-        row = [name, words.length(got), words.length(float(np.ptp(points[:, axis])))]
-        if true is not None:
-            exact = float(np.ptp(true[:, axis]))
-            row[1:1] = [words.length(exact)]
-            row[3:3] = [words.signed_length(got - exact)]
+        extent = float(np.ptp(measured[:, axis]))
+        row = [name, words.length(extent), words.length(float(np.ptp(points[:, axis])))]
+        if truth is not None:
+            true_extent = float(np.ptp(truth[:, axis]))
+            row[1:1] = [words.length(true_extent)]
+            row[3:3] = [words.signed_length(extent - true_extent)]
         rows.append(row)
     return rows
 
 
-def _turn_note(R: Float64) -> str:
+def _axes_note(R: Float64) -> str:
     angle = float(np.degrees(se3.angle(R)))
     text = "Axes: right, down and forward of the first camera"
     if angle < 0.5:

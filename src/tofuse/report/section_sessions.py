@@ -22,23 +22,23 @@ def sessions(s: Subject) -> Values:
         }
     rows = []
     for session in records:
-        mine = [f for f in s.result.diagnostics.frames if session.has(f.index)]
-        last = mine[-1].index if mine else session.first
+        frames = [f for f in s.result.diagnostics.frames if session.has(f.index)]
+        last = frames[-1].index if frames else session.first
         rows.append(
             {
                 "name": session.name,
-                "frames": f"{mine[0].index if mine else session.first}–{last}",
-                "count": f"{len(mine):,}",
+                "frames": f"{frames[0].index if frames else session.first}–{last}",
+                "count": f"{len(frames):,}",
                 "where": "in this map" if session.T_main_session is not None else "apart",
                 "recording": ", ".join(session.opening["paths"]),
             }
         )
-    apart = sum(session.T_main_session is None for session in records)
+    unjoined = sum(session.T_main_session is None for session in records)
     text = f"{words.count(len(records), 'session')} were merged. "
-    if apart:
+    if unjoined:
         text += (
-            f"For {apart:,} of them no overlap with the first one could be confirmed: "
-            f"{'it is' if apart == 1 else 'they are'} not joined."
+            f"For {unjoined:,} of them no overlap with the first one could be confirmed: "
+            f"{'it is' if unjoined == 1 else 'they are'} not joined."
         )
     else:
         text += "All of them are in this map, in the world frame of the first."
@@ -54,12 +54,12 @@ def sessions(s: Subject) -> Values:
     }
 
 
-def _change(found: SessionChange, names: list[str]) -> Values:
-    change = found.change
+def _change(record: SessionChange, names: list[str]) -> Values:
+    change = record.change
     return {
         "kind": change.kind,
         "color": "#{:02x}{:02x}{:02x}".format(*CHANGE_COLORS[change.kind]),
-        "sessions": f"{names[found.a]}, then {names[found.b]}",
+        "sessions": f"{names[record.a]}, then {names[record.b]}",
         "centre": ", ".join(f"{x:.2f}" for x in change.centre).replace("-", "−"),
         "size": " × ".join(words.length(float(x)) for x in change.size),
         "volume": f"{1e3 * change.volume_m3:.1f} l",

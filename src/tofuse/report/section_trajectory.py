@@ -21,9 +21,12 @@ def cameras(s: Subject) -> Values:
     groups = [before, after] + ([s.scene.reference] if s.reference is not None else [])
     for view, name in (("above", "from above"), ("side", "from the side")):
         flat = [plots.project(g[:, :3, 3], view) for g in groups]
-        box = plots.limits(*flat, room=0.11, least=0.01)
-        for poses, color, when in ((before, plots.BEFORE, "before"), (after, plots.AFTER, "after")):
-            title = f"{when}, {name}"
+        box = plots.limits(*flat, margin=0.11, min_margin_m=0.01)
+        for poses, color, stage in (
+            (before, plots.BEFORE, "before"),
+            (after, plots.AFTER, "after"),
+        ):
+            title = f"{stage}, {name}"
             if len(poses):
                 drawing = plots.cameras(
                     poses,
@@ -31,7 +34,7 @@ def cameras(s: Subject) -> Values:
                     view,
                     color=color,
                     label=f"Cameras {title}",
-                    loops=s.scene.loops if when == "after" else None,
+                    loops=s.scene.loops if stage == "after" else None,
                     reference=s.scene.reference if s.reference is not None else None,
                 )
                 figures.append(Figure(drawing, title[0].upper() + title[1:]))
@@ -47,16 +50,16 @@ def _moved(s: Subject) -> str:
     sequential = s.result.diagnostics.sequential
     if sequential.shape != s.result.trajectory.shape:
         return ""
-    both = np.isfinite(sequential[:, 0, 0]) & s.result.has_pose
-    if not both.any():
+    in_both = np.isfinite(sequential[:, 0, 0]) & s.result.has_pose
+    if not in_both.any():
         return ""
-    shift = np.linalg.norm(s.result.trajectory[:, :3, 3] - sequential[:, :3, 3], axis=1)
-    shift[~both] = 0
-    k = int(shift.argmax())
-    if shift[k] < 1e-6:
+    displacement = np.linalg.norm(s.result.trajectory[:, :3, 3] - sequential[:, :3, 3], axis=1)
+    displacement[~in_both] = 0
+    k = int(displacement.argmax())
+    if displacement[k] < 1e-6:
         return "Optimisation changed no pose: the trajectory is that of odometry."
     return (
-        f"Optimisation moved poses by up to {words.length(float(shift[k]))}, "
+        f"Optimisation moved poses by up to {words.length(float(displacement[k]))}, "
         f"most at frame {int(s.index[k])}."
     )
 
@@ -80,7 +83,7 @@ def error(s: Subject) -> Values:
     names = (("Before", before, plots.BEFORE, "--"), ("After", after, plots.AFTER, "-"))
     offsets = [_offsets(poses, reference) for _, poses, _, _ in names]
     bad = s.index[~result.has_pose]
-    what = "error" if compared else "displacement"
+    quantity = "error" if compared else "displacement"
     figures = []
     for k, axis in enumerate(("x (right)", "y (down)", "z (forward)", "rotation")):
         scale, unit = (180 / np.pi, "degrees") if k == 3 else (1.0, "m")
@@ -88,11 +91,11 @@ def error(s: Subject) -> Values:
         if k < 3 and max(np.nanmax(np.abs(r)) for r in rows if np.isfinite(r).any()) < 0.1:
             rows, unit = [1000 * r for r in rows], "mm"
         series = [(r, color, style) for r, (_, _, color, style) in zip(rows, names, strict=True)]
-        label = f"{what.capitalize()} in {axis} over frames, before and after optimisation"
-        drawn = plots.lines(
+        label = f"{quantity.capitalize()} in {axis} over frames, before and after optimisation"
+        svg = plots.lines(
             s.index, series, label=label, ylabel=f"{axis}, {unit}", zero=True, bad=bad
         )
-        figures.append(Figure(drawn))
+        figures.append(Figure(svg))
     text = (
         "Estimated minus reference position along each axis of the first camera, "
         "both starting at the identity, without further alignment."
@@ -117,33 +120,33 @@ def _offsets(poses: Float64, reference: Float64 | None) -> Float64:
 
     Without a reference, against the first pose. NaN where there is none.
     """
-    out = np.full((len(poses), 4), np.nan)
-    there = np.isfinite(poses).all((1, 2))
+    offsets = np.full((len(poses), 4), np.nan)
+    valid = np.isfinite(poses).all((1, 2))
     if reference is None:
-        base = poses[there][:1]
+        base = poses[valid][:1]
         if len(base) == 0:
-            return out
-        against = np.broadcast_to(base, poses.shape)
+            return offsets
+        target = np.broadcast_to(base, poses.shape)
     else:
-        there &= np.isfinite(reference).all((1, 2))
-        against = reference
-    out[there, :3] = poses[there, :3, 3] - against[there, :3, 3]
-    relative = np.swapaxes(against[there, :3, :3], 1, 2) @ poses[there, :3, :3]
-    out[there, 3] = se3.angle(relative)
-    return out
+        valid &= np.isfinite(reference).all((1, 2))
+        target = reference
+    offsets[valid, :3] = poses[valid, :3, 3] - target[valid, :3, 3]
+    relative = np.swapaxes(target[valid, :3, :3], 1, 2) @ poses[valid, :3, :3]
+    offsets[valid, 3] = se3.angle(relative)
+    return offsets
 
 
 def _error_rows(names: list[str], offsets: list[Float64], compared: bool) -> list[list[str]]:
     rows = []
-    for name, o in zip(names, offsets, strict=True):
-        seen = o[np.isfinite(o).all(1)]
-        if len(seen) == 0:
+    for name, offset in zip(names, offsets, strict=True):
+        valid = offset[np.isfinite(offset).all(1)]
+        if len(valid) == 0:
             continue
-        kinds = [("last frame", np.abs(seen[-1]))]
+        kinds = [("last frame", np.abs(valid[-1]))]
         if compared:
-            kinds.append(("rms", np.sqrt((seen**2).mean(0))))
-        kinds.append(("largest", np.abs(seen).max(0)))
-        lengths = np.linalg.norm(seen[:, :3], axis=1)
+            kinds.append(("rms", np.sqrt((valid**2).mean(0))))
+        kinds.append(("largest", np.abs(valid).max(0)))
+        lengths = np.linalg.norm(valid[:, :3], axis=1)
         totals = {"last frame": lengths[-1], "largest": lengths.max()}
         totals["rms"] = np.sqrt((lengths**2).mean())
         for kind, values in kinds:
@@ -159,87 +162,93 @@ def uncertainty(s: Subject) -> Values:
     for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
         if record.covariance is not None:
             C[k] = record.covariance
-    known = np.isfinite(C).all((1, 2))
-    if known.sum() < 2:
+    bounded = np.isfinite(C).all((1, 2))
+    if bounded.sum() < 2:
         return {"uncertainty": []}
     figures = []
-    for what, part, scale, unit, most in (
+    for quantity, part, scale, unit, max_sigma in (
         ("position", slice(0, 3), 1000.0, "mm", np.inf),
         ("rotation", slice(3, 6), 180 / np.pi, "degrees", 180.0),
     ):
-        variance = np.linalg.eigvalsh(C[known][:, part, part])[:, -1]
+        variance = np.linalg.eigvalsh(C[bounded][:, part, part])[:, -1]
         sigma = np.full(len(C), np.nan)
-        sigma[known] = np.minimum(scale * np.sqrt(variance.clip(0)), most)
-        drawn = plots.lines(
+        sigma[bounded] = np.minimum(scale * np.sqrt(variance.clip(0)), max_sigma)
+        svg = plots.lines(
             s.index,
             [(sigma, plots.AFTER, "-")],
-            label=f"Standard deviation of the {what} over frames",
-            ylabel=f"{what}, {unit}",
+            label=f"Standard deviation of the {quantity} over frames",
+            ylabel=f"{quantity}, {unit}",
             floor=True,
         )
-        figures.append(Figure(drawn))
+        figures.append(Figure(svg))
     return {"uncertainty": figures}
 
 
 def optimised(s: Subject) -> Values:
     """Return the outcome of the optimiser and of the refinement as text."""
     d = s.result.diagnostics
-    out = []
+    sentences = []
     if len(d.parts) > 1:
-        out.append(f"The pose graph has {len(d.parts)} disconnected parts.")
+        sentences.append(f"The pose graph has {len(d.parts)} disconnected parts.")
     if any(p.before > 0 and not p.improved for p in d.parts):
-        out.append("The optimiser did not improve on the initial poses.")
-    r = d.refinement
+        sentences.append("The optimiser did not improve on the initial poses.")
+    refinement = d.refinement
     refined = ""
-    if r is not None and r.views:
+    if refinement is not None and refinement.views:
         refined = (
-            f"Global refinement over {words.count(r.views, 'view')} in "
-            f"{words.count(r.pairs, 'overlapping pair')}. "
+            f"Global refinement over {words.count(refinement.views, 'view')} in "
+            f"{words.count(refinement.pairs, 'overlapping pair')}. "
         )
-        support = f"{words.percent(r.support[0])} to {words.percent(r.support[1])}"
-        if r.kept:
+        support = (
+            f"{words.percent(refinement.support[0])} to {words.percent(refinement.support[1])}"
+        )
+        if refinement.kept:
             refined += (
-                f"Poses moved by up to {words.length(r.moved_m)} and "
-                f"{np.degrees(r.moved_rad):.2f}°, and consistency rose from {support}."
+                f"Poses moved by up to {words.length(refinement.moved_m)} and "
+                f"{np.degrees(refinement.moved_rad):.2f}°, and consistency rose from {support}."
             )
-        elif r.pairs:
+        elif refinement.pairs:
             refined += f"Consistency fell from {support}: it was discarded."
         else:
             refined = "No two views overlap enough for a global refinement."
-    out += [f"{sensor.text[0].upper()}{sensor.text[1:]}." for sensor in d.priors]
-    return {"optimised": " ".join(out), "refined": refined, "camera_check": _camera_check(r)}
+    sentences += [f"{prior.text[0].upper()}{prior.text[1:]}." for prior in d.priors]
+    return {
+        "optimised": " ".join(sentences),
+        "refined": refined,
+        "camera_check": _camera_check(refinement),
+    }
 
 
-def _camera_check(r: Refinement | None) -> str:
+def _camera_check(refinement: Refinement | None) -> str:
     """The check of the camera's calibration as text."""
-    if r is None or not r.views:
+    if refinement is None or not refinement.views:
         return ""
-    out = ""
-    if r.errors:
+    text = ""
+    if refinement.errors:
         errors_text = [
             f"{name} {words.signed_length(value)}"
             if name == "offset"
             else f"{name} {100 * value:+.1f} %".replace("-", "−")
-            for name, value in r.errors.items()
+            for name, value in refinement.errors.items()
         ]
-        out = f"Calibration errors were estimated jointly: {', '.join(errors_text)}. "
-    s = r.calibration_check
-    if s is None:
-        return out.strip()
-    if s.errors:
-        verdict = "Check the calibration" if s.alarm else "This is not significant"
-        errors = " or ".join(in_words(s.errors))
-        out += f"Overlapping views would be more consistent with {errors}. {verdict}. "
-    elif not r.errors:
-        out += "No evidence of a focal-length or range-offset error. "
-    if s.gap is not None:
-        gap, (m, rad), (m_after, rad_after) = s.gap, s.gap.before, s.gap.after
-        out += (
+        text = f"Calibration errors were estimated jointly: {', '.join(errors_text)}. "
+    check = refinement.calibration_check
+    if check is None:
+        return text.strip()
+    if check.errors:
+        verdict = "Check the calibration" if check.alarm else "This is not significant"
+        errors = " or ".join(in_words(check.errors))
+        text += f"Overlapping views would be more consistent with {errors}. {verdict}. "
+    elif not refinement.errors:
+        text += "No evidence of a focal-length or range-offset error. "
+    if check.gap is not None:
+        gap, (m, rad), (m_after, rad_after) = check.gap, check.gap.before, check.gap.after
+        text += (
             f"Odometry drift over loop {gap.i}–{gap.j} is {words.length(m)}, "
             f"{np.degrees(rad):.1f}°; with this correction {words.length(m_after)}, "
             f"{np.degrees(rad_after):.1f}°."
         )
-    return out.strip()
+    return text.strip()
 
 
 def objective(s: Subject) -> Values:
@@ -248,8 +257,8 @@ def objective(s: Subject) -> Values:
     if not np.isfinite(values).any():
         return {"objective": None, "objective_text": ""}
     x = np.arange(len(values), dtype=float)
-    seen = values[np.isfinite(values)]
-    drawn = plots.lines(
+    finite = values[np.isfinite(values)]
+    svg = plots.lines(
         x,
         [(values, plots.AFTER, "-")],
         label="Objective over iterations",
@@ -258,5 +267,7 @@ def objective(s: Subject) -> Values:
         log=True,
         size=(480, 240),
     )
-    text = f"From {seen[0]:.4g} to {seen[-1]:.4g} in {words.count(len(values) - 1, 'iteration')}."
-    return {"objective": Figure(drawn), "objective_text": text}
+    text = (
+        f"From {finite[0]:.4g} to {finite[-1]:.4g} in {words.count(len(values) - 1, 'iteration')}."
+    )
+    return {"objective": Figure(svg), "objective_text": text}

@@ -16,34 +16,34 @@ _THUMBNAIL, _FILTER = 220, 320  # px
 def filters(s: Subject) -> Values:
     """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    here: dict[str, tuple[int, int]] = {}  # points removed and seen; a filter may be used twice
+    counts: dict[str, tuple[int, int]] = {}  # points removed, of all; a filter may be used twice
     shown = []
     if steps:
         raw = steps[0][1]
         limits = thumbnails.depth_limits(raw)
         framing = thumbnails.Framing.around(raw.points.astype(float), (_FILTER, 240))
-        last = raw
+        previous = raw
         for k, (name, frame) in enumerate(steps):
             if k:
-                gone = len(last) - len(frame)
-                part = words.percent(gone / len(last) if len(last) else None)
-                text = f"removed {part} ({gone:,} points), {len(frame):,} are left"
-                if not gone and name not in removed:
+                num_removed = len(previous) - len(frame)
+                fraction = words.percent(num_removed / len(previous) if len(previous) else None)
+                text = f"removed {fraction} ({num_removed:,} points), {len(frame):,} are left"
+                if not num_removed and name not in removed:
                     text = f"corrects; {words.count(len(frame), 'point')}"
-                before = here.get(name, (0, 0))
-                here[name] = (before[0] + gone, before[1] + len(last))
+                before = counts.get(name, (0, 0))
+                counts[name] = (before[0] + num_removed, before[1] + len(previous))
             else:
                 text = words.count(len(frame), "point")
             pictures = []
             if isinstance(frame, RangeFrame):
-                lost = None
-                if k and isinstance(last, RangeFrame):
-                    lost = last.valid & ~frame.valid
-                depth = thumbnails.depth_image(frame, limits, lost, _FILTER)
+                removed_mask = None
+                if k and isinstance(previous, RangeFrame):
+                    removed_mask = previous.valid & ~frame.valid
+                depth = thumbnails.depth_image(frame, limits, removed_mask, _FILTER)
                 pictures.append(thumbnails.data_uri(depth))
             pictures.append(thumbnails.data_uri(thumbnails.cloud_image(frame, limits, framing)))
             shown.append({"name": name, "text": text, "images": pictures})
-            last = frame
+            previous = frame
     note = ""
     if steps:
         low, high = thumbnails.depth_limits(steps[0][1])
@@ -57,33 +57,33 @@ def filters(s: Subject) -> Values:
                 "the points from above and to the side."
             )
     # Corrections remove nothing.
-    names = [*removed, *(n for n in here if n not in removed and here[n][0])]
+    names = [*removed, *(n for n in counts if n not in removed and counts[n][0])]
     rows = []
     for name in names:
-        gone, seen = here.get(name, (0, 0))
-        part = words.percent(gone / seen) if seen else "–"
-        rows.append((name, words.percent(removed.get(name)), part))
+        num_removed, num_points = counts.get(name, (0, 0))
+        fraction = words.percent(num_removed / num_points) if num_points else "–"
+        rows.append((name, words.percent(removed.get(name)), fraction))
     return {"filter_rows": rows, "filter_steps": shown, "filter_note": note}
 
 
 def clouds(s: Subject) -> Values:
     """Return samples of the recording, if its views are clouds."""
     frames = s.extras.clouds
-    every = [thumbnails.depth_limits(f) for f in frames if len(f)]
+    depth_ranges = [thumbnails.depth_limits(f) for f in frames if len(f)]
     limits = (0.0, 1.0)
-    if every:
-        limits = (min(low for low, _ in every), max(high for _, high in every))
-    out = []
+    if depth_ranges:
+        limits = (min(low for low, _ in depth_ranges), max(high for _, high in depth_ranges))
+    samples = []
     for frame in frames:
         framing = thumbnails.Framing.around(frame.points.astype(float), (_THUMBNAIL, 165))
-        drawn = thumbnails.cloud_image(frame, limits, framing)
-        out.append({"index": frame.index, "image": thumbnails.data_uri(drawn)})
+        image = thumbnails.cloud_image(frame, limits, framing)
+        samples.append({"index": frame.index, "image": thumbnails.data_uri(image)})
     note = "Sample views before filtering, from above and to the side."
-    if every:
+    if depth_ranges:
         note += (
             f" Depth from dark ({words.length(limits[0])}) to bright ({words.length(limits[1])})."
         )
-    return {"clouds": out, "clouds_note": note}
+    return {"clouds": samples, "clouds_note": note}
 
 
 _TITLES = {

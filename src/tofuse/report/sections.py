@@ -29,7 +29,7 @@ from tofuse.results.types import Reconstruction
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     """Return all values that the template shows."""
     subject = Subject.of(result, extras)
-    out: Values = {}
+    values: Values = {}
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
         section_sessions.sessions,
@@ -53,10 +53,10 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     with job_pool(1, "tofuse-report") as background:
         model = background.submit(section_model.model, subject)
         for part in parts:
-            out.update(part(subject))
-        out.update(model.result())
-    true = out["true_sizes"]
-    out["dimensions"] = [(row[0], row[2 if true else 1]) for row in out["sizes"]]
+            values.update(part(subject))
+        values.update(model.result())
+    has_true_sizes = values["true_sizes"]
+    values["dimensions"] = [(row[0], row[2 if has_true_sizes else 1]) for row in values["sizes"]]
     names = {
         "model": "Model",
         "verdict": "Accuracy",
@@ -75,22 +75,22 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         "settings": "Settings",
         "reading": "How to read this",
     }
-    if not out["clouds"]:
+    if not values["clouds"]:
         del names["recording"]
-    if not out["sessions"]:
+    if not values["sessions"]:
         del names["sessions"]
-    if not out["rig_views"]:
+    if not values["rig_views"]:
         del names["rig"]
-    if not out["components"]:
+    if not values["components"]:
         del names["components"]
-    out["contents"] = list(names.items())
-    return out
+    values["contents"] = list(names.items())
+    return values
 
 
 def _verdict(s: Subject) -> Values:
     result = s.result
-    found = words.findings(result.diagnostics.reasons, len(result.diagnostics.frames))
-    text = words.verdict_sentence(result, found)
+    findings = words.findings(result.diagnostics.reasons, len(result.diagnostics.frames))
+    text = words.verdict_sentence(result, findings)
     head, _, tail = text.partition(":")
     statuses: list[str] = [f.status for f in result.diagnostics.frames]
     facts = [(f"frames {name}", f"{statuses.count(name):,}") for name in words.STATUSES]
@@ -101,8 +101,8 @@ def _verdict(s: Subject) -> Values:
     if len(path) > 1:
         travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         facts.append(("trajectory length", words.length(travelled)))
-    closed = sum(p.accepted for p in result.diagnostics.loops)
-    facts.append(("loop closures", f"{closed:,}"))
+    closures = sum(p.accepted for p in result.diagnostics.loops)
+    facts.append(("loop closures", f"{closures:,}"))
     return {
         "title": s.extras.title,
         "headline": s.extras.headline,
@@ -113,7 +113,7 @@ def _verdict(s: Subject) -> Values:
         "verdict_head": head + ":",
         "verdict_tail": tail,
         "facts": facts,
-        "findings": found,
+        "findings": findings,
     }
 
 
@@ -121,11 +121,11 @@ def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
     """Name, value and frame ranges of each line of the accuracy card."""
     d = result.diagnostics
     readable = sum(f.status != "skipped" for f in d.frames)
-    closed = sum(p.accepted for p in d.loops)
+    closures = sum(p.accepted for p in d.loops)
     covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
     lines = [
         ("Accuracy", bound(d.accuracy, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
-        ("Coverage", f"{covered}, {words.count(closed, 'loop closure')}", ""),
+        ("Coverage", f"{covered}, {words.count(closures, 'loop closure')}", ""),
     ]
     weakest = weakest_frame(d.accuracy)
     if weakest:
@@ -149,15 +149,15 @@ def _subtitle(result: Reconstruction) -> str:
 
 
 def _timings(s: Subject) -> Values:
-    taken = s.result.diagnostics.seconds
-    total = sum(taken.values())
+    durations = s.result.diagnostics.seconds
+    total = sum(durations.values())
     frames = len(s.result.diagnostics.frames)
     rows = [
         (name, words.seconds(value), f"{100 * value / total if total else 0:.1f}")
-        for name, value in taken.items()
+        for name, value in durations.items()
     ]
-    each = f"{words.seconds(total / frames)} per frame" if frames else ""
-    return {"timings": rows, "total_time": words.seconds(total), "per_frame": each}
+    per_frame = f"{words.seconds(total / frames)} per frame" if frames else ""
+    return {"timings": rows, "total_time": words.seconds(total), "per_frame": per_frame}
 
 
 def _settings(s: Subject) -> Values:

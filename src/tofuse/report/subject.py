@@ -38,10 +38,10 @@ class Subject:
     rows
         The row of each frame index.
     scene
-        What the 3D view shows; plans and sizes are of its points, too.
+        Content of the 3D view; plans and sizes are of its points, too.
     truth
         (K, 3) finite points of the true surfaces, world frame.
-    straight
+    R_display_world
         (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright by
         `Reconstruction.T_up_world`, and rotated so that the model is aligned with them.
     """
@@ -53,7 +53,7 @@ class Subject:
     reference: Float64 | None
     scene: Scene
     truth: Float64 | None
-    straight: Float64
+    R_display_world: Float64
 
     @classmethod
     def of(cls, result: Reconstruction, extras: ReportExtras) -> Subject:
@@ -70,22 +70,26 @@ class Subject:
         truth = extras.truth_points
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]
-        true = truth.astype(float) if truth is not None and len(truth) else None
-        up = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
-        shown = scene.points @ up.T if true is None else true @ up.T
-        turn = (
-            display_axes.upright_axes(shown, OUTER)
-            if true is None
-            else display_axes.box_axes(shown)
+        truth_points = truth.astype(float) if truth is not None and len(truth) else None
+        R_up_world = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
+        points = (
+            scene.points @ R_up_world.T if truth_points is None else truth_points @ R_up_world.T
         )
-        return cls(result, extras, index, rows, reference, scene, true, turn @ up)
+        R_display_up = (
+            display_axes.upright_axes(points, OUTER)
+            if truth_points is None
+            else display_axes.box_axes(points)
+        )
+        return cls(
+            result, extras, index, rows, reference, scene, truth_points, R_display_up @ R_up_world
+        )
 
 
 def _row_indices(result: Reconstruction) -> Float64:
     """Return the frame index of each row of the trajectory."""
     records = result.diagnostics.frames
-    number = len(result.trajectory)
-    for chosen in (records, [r for r in records if r.status != "skipped"]):
-        if len(chosen) == number:
-            return np.array([r.index for r in chosen], float)
-    return np.arange(number, dtype=float)
+    rows = len(result.trajectory)
+    for candidates in (records, [r for r in records if r.status != "skipped"]):
+        if len(candidates) == rows:
+            return np.array([r.index for r in candidates], float)
+    return np.arange(rows, dtype=float)

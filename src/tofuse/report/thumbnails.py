@@ -34,17 +34,17 @@ _VIRIDIS = np.array(
 
 def viridis(value: Float64) -> UInt8:
     """Return viridis colours (..., 3) of values from 0 to 1."""
-    place = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
-    return _TABLE[np.round(place).astype(np.intp)]
+    position = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
+    return _TABLE[np.round(position).astype(np.intp)]
 
 
-def _between(place: Float64) -> UInt8:
-    low = np.minimum(place.astype(int), len(_VIRIDIS) - 2)
-    t = (place - low)[..., None]
+def _interpolate(position: Float64) -> UInt8:
+    low = np.minimum(position.astype(int), len(_VIRIDIS) - 2)
+    t = (position - low)[..., None]
     return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
 
 
-_TABLE = _between(np.linspace(0, len(_VIRIDIS) - 1, 1025))
+_TABLE = _interpolate(np.linspace(0, len(_VIRIDIS) - 1, 1025))
 
 
 def encode(image: UInt8, *, jpeg: bool = False) -> bytes:
@@ -119,8 +119,8 @@ def amplitude_image(frame: RangeFrame) -> UInt8 | None:
 
 def grey(amplitude: Float32) -> UInt8:
     """Stretch amplitude (H, W) to grey (H, W, 3), with the gamma of a screen."""
-    lit = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
-    low, high = np.percentile(amplitude[lit], [1, 99]) if lit.any() else (0.0, 1.0)
+    valid = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+    low, high = np.percentile(amplitude[valid], [1, 99]) if valid.any() else (0.0, 1.0)
     level = ((amplitude - low) / max(high - low, 1e-9)).clip(0, 1) ** (1 / 2.2)
     return np.repeat(np.round(255 * level).astype(np.uint8)[..., None], 3, axis=2)
 
@@ -156,8 +156,8 @@ def splat(
     -------
     (H, W, 4) RGBA, transparent where there is no point.
     """
-    found = nearest(points, T_view_world, size, scale=scale, distance=distance, radius=radius)
-    return _colored(found, colors[found[found >= 0]])
+    indices = nearest(points, T_view_world, size, scale=scale, distance=distance, radius=radius)
+    return _to_image(indices, colors[indices[indices >= 0]])
 
 
 def nearest(
@@ -170,19 +170,19 @@ def nearest(
     radius: int = 1,
 ) -> Int32:
     """Return the index of the visible point at each pixel (H, W), as `splat` draws them; or -1."""
-    found = np.full(size[::-1], -1, np.int32)
-    depth = np.full(found.shape, np.inf)
+    indices = np.full(size[::-1], -1, np.int32)
+    depth = np.full(indices.shape, np.inf)
     nearest_points(
-        np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, found
+        np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, indices
     )
-    return found
+    return indices
 
 
-def _colored(found: Int32, colors: UInt8) -> UInt8:
-    """Image (H, W, 4) of the points found, with the colours (K, 3) of those, pixel by pixel."""
-    image = np.zeros((*found.shape, 4), np.uint8)
-    image[found >= 0, :3] = colors
-    image[found >= 0, 3] = 255
+def _to_image(indices: Int32, colors: UInt8) -> UInt8:
+    """RGBA image (H, W, 4) of point indices (H, W), with colours (K, 3) of pixels with a point."""
+    image = np.zeros((*indices.shape, 4), np.uint8)
+    image[indices >= 0, :3] = colors
+    image[indices >= 0, 3] = 255
     return image
 
 
@@ -233,11 +233,13 @@ def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> 
     """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
     points = frame.points.astype(float)
     radius = 1 if len(points) > 60_000 else 2
-    found = nearest(points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius)
-    seen = points[found[found >= 0]]
+    indices = nearest(
+        points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
+    )
+    visible = points[indices[indices >= 0]]
     if isinstance(frame, RangeFrame):
-        depth = seen[:, 2]
+        depth = visible[:, 2]
     else:
-        depth = np.linalg.norm(seen - frame.origin, axis=1)
+        depth = np.linalg.norm(visible - frame.origin, axis=1)
     low, high = limits
-    return _colored(found, viridis((depth - low) / (high - low)))
+    return _to_image(indices, viridis((depth - low) / (high - low)))

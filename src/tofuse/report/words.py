@@ -60,26 +60,26 @@ def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str
     Returns (first index, last index, count, status, reason). Items that follow each other count as
     consecutive even if their indices have gaps, as in a recording read with a stride.
     """
-    out: list[tuple[int, int, int, str, str]] = []
-    for position, status, reason in items:
-        if out and out[-1][3:] == (status, reason):
-            first, _, number, _, _ = out[-1]
-            out[-1] = (first, position, number + 1, status, reason)
+    merged: list[tuple[int, int, int, str, str]] = []
+    for index, status, reason in items:
+        if merged and merged[-1][3:] == (status, reason):
+            first, _, number, _, _ = merged[-1]
+            merged[-1] = (first, index, number + 1, status, reason)
         else:
-            out.append((position, position, 1, status, reason))
-    return out
+            merged.append((index, index, 1, status, reason))
+    return merged
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A reason for the verdict, as the report shows it.
+    """A reason for the verdict in the report.
 
     Attributes
     ----------
     level
         "failed", "degraded" or "note".
     text
-        What was found, with its frames where that adds information.
+        The finding, with its frames where that adds information.
     ranges
         The frames.
     advice
@@ -97,26 +97,26 @@ class Finding:
 
 
 def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
-    """Return the reasons as the report shows them, the most severe first.
+    """Return the reasons as findings, the most severe first.
 
     Parameters
     ----------
     reasons
         The reasons.
     total
-        Number of frames: reasons that concern most of them don't list them.
+        Number of frames: reasons that concern the majority don't list them.
     """
-    out = []
+    listed = []
     for reason in ranked(reasons):
         level, meaning = REASONS[reason.code]
-        text = _placed(reason, total) if reason.text.strip() else meaning
-        some = 0 < size(reason.ranges) < total
-        where = in_words(reason.ranges).replace("-", "–") if some else ""
-        out.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, ""), where))
-    return out
+        text = _with_frames(reason, total) if reason.text.strip() else meaning
+        is_subset = 0 < size(reason.ranges) < total
+        where = in_words(reason.ranges).replace("-", "–") if is_subset else ""
+        listed.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, ""), where))
+    return listed
 
 
-def _placed(reason: Reason, total: int) -> str:
+def _with_frames(reason: Reason, total: int) -> str:
     """Add a reason's frames to its text, unless it names them or they are the majority."""
     text = sentence(reason.text)
     first, last = reason.frames
@@ -135,17 +135,17 @@ def sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?")) or not text else text + "."
 
 
-def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
+def verdict_sentence(result: Reconstruction, findings: Sequence[Finding]) -> str:
     """Return the verdict in a sentence or two."""
     d = result.diagnostics
     readable = sum(f.status != "skipped" for f in d.frames)
-    placed = int(result.has_pose.sum())
-    have = f"{placed} of {readable} readable frames have a pose"
-    if placed == readable:
-        have = f"all {placed} frames have a pose" if placed > 1 else "the only frame has a pose"
-    grave = [f for f in found if f.level == d.verdict]
+    posed = int(result.has_pose.sum())
+    poses_text = f"{posed} of {readable} readable frames have a pose"
+    if posed == readable:
+        poses_text = f"all {posed} frames have a pose" if posed > 1 else "the only frame has a pose"
+    decisive = [f for f in findings if f.level == d.verdict]
     if d.verdict == "good":
-        return f"Good: {have}. No problems found."
+        return f"Good: {poses_text}. No problems found."
     if d.verdict == "degraded":
         return "Degraded: use this model with care."
-    return f"Failed: do not rely on this model.{'' if grave else f' {have}.'}"
+    return f"Failed: do not rely on this model.{'' if decisive else f' {poses_text}.'}"

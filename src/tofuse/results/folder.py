@@ -24,13 +24,13 @@ from tofuse.files.locking import Claim
 from tofuse.files.reading import read_text
 from tofuse.files.staging import (
     Names,
-    check_error,
     check_interrupted,
     clear,
     is_interrupted,
     move_all,
-    places,
+    not_a_result_error,
     recover,
+    result_locations,
 )
 
 STAGING = f"{UNFINISHED}unfinished"
@@ -67,7 +67,9 @@ FILES = (
 )
 # Large surfaces are in tiles, in their own folder (`results.tiles`).
 TILES, TILESET = "tiles", "tileset.json"
-_TILES = Names(frozenset({TILESET}), more=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII))
+_TILES = Names(
+    frozenset({TILESET}), file_pattern=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII)
+)
 _WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
@@ -136,11 +138,11 @@ class OutputFolder:
             _check_content(self.path, self._contract, overwrite)
             self._created = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
-            self._claim = Claim(self.path / LOCK, what=self.path)
+            self._claim = Claim(self.path / LOCK, target=self.path)
             _recover(self.path, self._contract)
             _check_content(self.path, self._contract, overwrite)
             if not clear(self._staging, self._names):
-                raise check_error(self._staging)
+                raise not_a_result_error(self._staging)
             self._staging.mkdir()
         except OSError as error:
             self.discard()
@@ -220,7 +222,7 @@ def check_output(path: str | Path, *, overwrite: bool) -> None:
     path = Path(path)
     lock = path / LOCK
     if os.path.lexists(lock):
-        Claim(lock, what=path).release()
+        Claim(lock, target=path).release()
     if not (path / CHECKPOINT).exists():
         try:
             _check_content(path, RESULT, overwrite)
@@ -235,7 +237,7 @@ def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
         raise OutputError("is a file", where=path, remedy="pass a folder as --out")
     if is_interrupted(staging):
         check_interrupted(staging, contract.names, contract.marker)
-        if any(contract.is_ours(place) for place in places(staging, path)):
+        if any(contract.is_ours(place) for place in result_locations(staging, path)):
             return
     entries = {p.name for p in path.iterdir()} if path.exists() else set()
     entries -= {name for name in entries if name.startswith(UNFINISHED)}
@@ -254,8 +256,8 @@ def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
             remedy="pass --overwrite to replace it, or another --out",
         )
     for name in sorted(entries):
-        if contract.names.folder(name) and not contract.names.is_whole(path / name):
-            raise check_error(path / name)
+        if contract.names.folder(name) and not contract.names.is_result_folder(path / name):
+            raise not_a_result_error(path / name)
 
 
 def lock_folder(folder: Path) -> Path:
@@ -276,7 +278,7 @@ def claimed(folder: Path) -> Iterator[None]:
         If another process writes into it, or it can't be written.
     """
     locked = lock_folder(folder)
-    claim = Claim(locked / LOCK, what=locked)
+    claim = Claim(locked / LOCK, target=locked)
     try:
         yield
     finally:
@@ -289,8 +291,8 @@ def _recover(folder: Path, contract: Contract) -> None:
     if not is_interrupted(staging):
         return
     check_interrupted(staging, contract.names, contract.marker)
-    if not any(contract.is_ours(place) for place in places(staging, folder)):
-        raise check_error(folder)
+    if not any(contract.is_ours(place) for place in result_locations(staging, folder)):
+        raise not_a_result_error(folder)
     recover(staging, folder, contract.names, contract.marker)
 
 
@@ -314,7 +316,7 @@ def finish_interrupted(folder: Path) -> None:
     if not is_interrupted(staging):
         return
     try:
-        claim = Claim(folder / LOCK, what=folder)
+        claim = Claim(folder / LOCK, target=folder)
         try:
             _recover(folder, RESULT)
             clear(staging, RESULT.names)

@@ -183,7 +183,7 @@ def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
     if frame.color_image is None or not isinstance(source, FileSource):
         return None
     try:
-        color = source.whole_color(frame.index)
+        color = source.full_resolution_color(frame.index)
     except InputError:
         return None
     return None if color is None or len(color) <= len(frame.color_image) else color

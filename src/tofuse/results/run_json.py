@@ -321,7 +321,7 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
         If it can't be read, or is not a `run.json` of schema 1.
     """
     path = Path(path)
-    data = parsed(json.loads, read_text(path), where=path, what="JSON")
+    data = parsed(json.loads, read_text(path), where=path, format_name="JSON")
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError("is not a run.json of schema 1", where=path)
     return data

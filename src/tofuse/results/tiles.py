@@ -91,7 +91,7 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
 
 def is_tiles(folder: Path) -> bool:
     """Whether it is a folder `tiles` that contains only files of `write_tiles`."""
-    return RESULT.names.is_whole(folder)
+    return RESULT.names.is_result_folder(folder)
 
 
 def overview(mesh: Mesh) -> Mesh:

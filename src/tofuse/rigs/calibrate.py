@@ -49,12 +49,12 @@ def calibrate(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Estimate the poses of the cameras of a rig, from one recording of each.
+    """Estimate the poses of a rig's cameras from one recording of each.
 
     Parameters
     ----------
     recordings
-        One recording for each camera; the first camera defines the frame of the rig.
+        One recording per camera; the first camera defines the frame of the rig.
     motion
         Whether the rig moves; "auto" detects it.
     format
@@ -62,7 +62,7 @@ def calibrate(
     threads
         Number of threads; None: all cores.
     progress
-        Receives the stages.
+        Receives the names of the stages.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def calibrate_cameras(
     progress = progress or Silent()
     progress.stage("opening")
     if not moves(cameras, motion):
-        return _of_still(cameras, paths, calibrate_still(cameras, progress))
-    return _of_moving(cameras, paths, calibrate_moving(cameras, progress))
+        return _from_static(cameras, paths, calibrate_still(cameras, progress))
+    return _from_moving(cameras, paths, calibrate_moving(cameras, progress))
 
 
 def check(
@@ -106,8 +106,8 @@ def check(
     """
     with using_threads(threads), threadpool_limits(1):
         cameras = cameras_of([c.name for c in rig.cameras], recordings, format)
-        found = calibrate_cameras(cameras, recordings, motion, progress or Silent())
-    return found, compare_in_scene(rig, found.rig)
+        calibration = calibrate_cameras(cameras, recordings, motion, progress or Silent())
+    return calibration, compare_in_scene(rig, calibration.rig)
 
 
 def cameras_of(
@@ -139,7 +139,7 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
     Raises
     ------
     InputError
-        If only some cameras move: then they are not rigidly connected.
+        If only some cameras move, so that they are not rigidly connected.
     """
     if motion != "auto":
         return motion == "moving"
@@ -155,52 +155,52 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
     return not all(still)
 
 
-def _of_still(
-    cameras: Sequence[Camera], paths: Sequence[str | Path], found: StillRig
+def _from_static(
+    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: StillRig
 ) -> Calibration:
     names = [camera.name for camera in cameras]
-    placed = found.placed
+    refined = estimate.refined
     rows = tuple(
         RigCamera(
             names[c],
             str(paths[c]),
-            placed.poses[k],
-            placed.covariance[k][:6, :6],
-            float(found.time_offsets[c]),
-            -float(placed.offsets[k]),
-            placed.random_covariance[k][:6, :6],
+            refined.poses[k],
+            refined.covariance[k][:6, :6],
+            float(estimate.time_offsets[c]),
+            -float(refined.offsets[k]),
+            refined.random_covariance[k][:6, :6],
         )
-        for k, c in enumerate(found.cameras)
+        for k, c in enumerate(estimate.cameras)
     )
     pairs = tuple(
-        Disagreement(names[found.cameras[a]], names[found.cameras[b]], median, pixels)
-        for (a, b), (median, pixels) in placed.disagreement.items()
+        Disagreement(names[estimate.cameras[a]], names[estimate.cameras[b]], median, pixels)
+        for (a, b), (median, pixels) in refined.disagreement.items()
     )
-    unplaced = {names[c]: reason for c, reason in sorted(found.placement.reasons.items())}
-    how = "one instant" if found.instants == 1 else f"{found.instants} instants"
-    return Calibration(Rig(rows, pairs, unplaced), how, found.notes)
+    unplaced = {names[c]: reason for c, reason in sorted(estimate.placement.reasons.items())}
+    how = "one instant" if estimate.instants == 1 else f"{estimate.instants} instants"
+    return Calibration(Rig(rows, pairs, unplaced), how, estimate.notes)
 
 
-def _of_moving(
-    cameras: Sequence[Camera], paths: Sequence[str | Path], found: MovingRig
+def _from_moving(
+    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: MovingRig
 ) -> Calibration:
     names = [camera.name for camera in cameras]
     rows = [RigCamera(names[0], str(paths[0]), np.eye(4), np.zeros((6, 6)))]
     rows += [
         RigCamera(names[k], str(paths[k]), fit.T_a_b, fit.covariance, fit.time_offset_s)
-        for k, fit in sorted(found.fits.items())
+        for k, fit in sorted(estimate.fits.items())
     ]
     pairs = tuple(
         Disagreement(names[a], names[b], median, pixels)
-        for (a, b), (median, pixels) in found.disagreement.items()
+        for (a, b), (median, pixels) in estimate.disagreement.items()
     )
-    unplaced = {names[k]: reason for k, reason in sorted(found.reasons.items())}
-    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", found.notes)
+    unplaced = {names[k]: reason for k, reason in sorted(estimate.reasons.items())}
+    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", estimate.notes)
 
 
 def largest_sigmas(camera: RigCamera) -> tuple[float, float]:
     """Return the largest standard deviations of a camera's position, m, and rotation, rad."""
     C = camera.covariance
-    both = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))
-    position, rotation = both
+    sigmas = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))
+    position, rotation = sigmas
     return position, rotation

@@ -1,9 +1,9 @@
-"""Check whether a camera of a rig was moved: a new calibration against that of its file.
+"""Check whether a camera of a rig was moved: compare a new calibration with that of the file.
 
 Under the null hypothesis the motion xi of a camera from its pose in the file to the new one is
 normally distributed with the sum of both covariances, and xi^T C^-1 xi is chi-square with six
-degrees of freedom. Systematic errors of the ranges, such as multipath, recur in the same scene;
-there the covariances of random errors alone apply. If the first camera was moved, all others appear
+degrees of freedom. Systematic range errors, for instance from multipath, recur in the same scene;
+there only the covariances of random errors apply. If the first camera was moved, all others appear
 moved: if most do, another camera is the reference.
 """
 
@@ -38,7 +38,7 @@ class CameraMotion:
     moved
         Whether the motion is significant.
     chance_elsewhere
-        The same if the scene is not that of the calibration, so that systematic errors differ.
+        The same for a scene other than that of the calibration, where systematic errors differ.
     sigma_m, sigma_rad
         Standard deviation of the motion along the direction where it is largest.
     reason
@@ -56,31 +56,31 @@ class CameraMotion:
 
     @property
     def distance_m(self) -> float:
-        """How far it was moved."""
+        """Distance by which it was moved, m."""
         T = self.T_before_after
         return float("nan") if T is None else float(np.linalg.norm(T[:3, 3]))
 
     @property
     def angle_rad(self) -> float:
-        """How far it was turned."""
+        """Angle by which it was rotated, rad."""
         return (
             float("nan") if self.T_before_after is None else float(se3.angle(self.T_before_after))
         )
 
 
-def compare_in_scene(stated: Rig, found: Rig, level: float = LEVEL) -> list[CameraMotion]:
-    """As `compare`, for two calibrations in one scene, where systematic errors recur."""
-    anywhere = compare(stated, found, level)
+def compare_in_scene(previous: Rig, current: Rig, level: float = LEVEL) -> list[CameraMotion]:
+    """Apply `compare` to two calibrations in one scene, where systematic errors recur."""
+    anywhere = compare(previous, current, level)
     return [
-        replace(moved, chance_elsewhere=other.chance)
-        for moved, other in zip(
-            compare(_random_only(stated), _random_only(found), level), anywhere, strict=True
+        replace(motion, chance_elsewhere=other.chance)
+        for motion, other in zip(
+            compare(_random_only(previous), _random_only(current), level), anywhere, strict=True
         )
     ]
 
 
 def _random_only(rig: Rig) -> Rig:
-    """Return the rig with the covariances of random errors, as far as they are known."""
+    """Return the rig with the covariances of random errors, where they are known."""
     return replace(
         rig,
         cameras=tuple(
@@ -90,58 +90,62 @@ def _random_only(rig: Rig) -> Rig:
     )
 
 
-def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[CameraMotion]:
-    """Compare a rig with a new calibration, camera by camera in the order of `stated`.
+def compare(previous: Rig, current: Rig, level: float = LEVEL) -> list[CameraMotion]:
+    """Compare a rig with a new calibration, camera by camera in the order of `previous`.
 
     Parameters
     ----------
-    stated, found
+    previous, current
         The rig of the file and the new one; cameras are identified by their names.
     level
         Probability of a false alarm for the whole rig.
     """
-    shared = [c for c in stated.cameras if found.camera(c.name) is not None]
+    shared = [c for c in previous.cameras if current.camera(c.name) is not None]
     out: list[CameraMotion] = []
-    knocked: dict[str, CameraMotion] = {}
+    motions: dict[str, CameraMotion] = {}
     if len(shared) > 1:
         # Bonferroni correction for one test per camera.
         limit = level / (len(shared) - 1)
-        reference = _reference(shared, found, limit)
-        knocked = {c.name: _moved(c, reference, found, limit) for c in shared}
-    for camera in stated.cameras:
-        if camera.name in knocked:
-            out.append(knocked[camera.name])
+        reference = _reference(shared, current, limit)
+        motions = {c.name: _test_motion(c, reference, current, limit) for c in shared}
+    for camera in previous.cameras:
+        if camera.name in motions:
+            out.append(motions[camera.name])
             continue
-        why = found.unplaced.get(camera.name, "")
-        out.append(CameraMotion(camera.name, None, 1.0, False, reason=why or "no recording of it"))
+        reason = current.unplaced.get(camera.name, "")
+        out.append(
+            CameraMotion(camera.name, None, 1.0, False, reason=reason or "no recording of it")
+        )
     return out
 
 
-def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCamera:
+def _reference(shared: Sequence[RigCamera], current: Rig, limit: float) -> RigCamera:
     """Return the camera that the others are compared with.
 
-    The first, unless more than half of the others appear moved relative to it: then the one
+    This is the first, unless more than half of the others appear moved relative to it: then the one
     relative to which the fewest do.
     """
 
-    def moved(reference: RigCamera) -> int:
-        return sum(_moved(c, reference, found, limit).moved for c in shared)
+    def count_moved(reference: RigCamera) -> int:
+        return sum(_test_motion(c, reference, current, limit).moved for c in shared)
 
-    if 2 * moved(shared[0]) <= len(shared) - 1 or len(shared) < 3:
+    if 2 * count_moved(shared[0]) <= len(shared) - 1 or len(shared) < 3:
         return shared[0]
-    return min(shared, key=moved)
+    return min(shared, key=count_moved)
 
 
-def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> CameraMotion:
+def _test_motion(
+    camera: RigCamera, reference: RigCamera, current: Rig, limit: float
+) -> CameraMotion:
     """Test the motion of a camera relative to a reference."""
     if camera.name == reference.name:
         return CameraMotion(camera.name, np.eye(4), 1.0, False, sigma_m=0.0, sigma_rad=0.0)
-    before, C_before = _relative(reference, camera)
-    now, now_reference = found.camera(camera.name), found.camera(reference.name)
-    assert now is not None
-    assert now_reference is not None
-    after, C_after = _relative(now_reference, now)
-    T = np.asarray(se3.inverse(before) @ after, np.float64)
+    T_before, C_before = _relative(reference, camera)
+    camera_now, reference_now = current.camera(camera.name), current.camera(reference.name)
+    assert camera_now is not None
+    assert reference_now is not None
+    T_after, C_after = _relative(reference_now, camera_now)
+    T = np.asarray(se3.inverse(T_before) @ T_after, np.float64)
     xi = se3.log(T)
     # The covariance of the file, transformed from the previous frame of the camera to the new one.
     A = se3.adjoint(se3.inverse(T))

@@ -1,7 +1,7 @@
 """Synchronisation of clocks by cross-correlation.
 
-Two signals of the same quantity, such as the angular velocity of a rig or the moving fraction of a
-scene, are correlated at every lag. The best lag is certain if no other has a similar correlation.
+Two signals of the same quantity, for instance the angular speed of a rig or the moving fraction of
+a scene, are correlated at every lag. The best lag is certain if no other one correlates similarly.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from tofuse.arrays import Float64
 # Minimum overlap of the signals, as a fraction of the shorter one, and minimum number of samples.
 _OVERLAP, _MIN_SAMPLES = 0.5, 12
 # Samples of the lag per sample of the faster signal.
-_FINE = 4
-# Largest ratio of another peak, further away than the width, to the best; minimum correlation.
-_RIVAL, _MIN_CORRELATION = 0.8, 0.7
+_OVERSAMPLING = 4
+# Largest ratio of another peak, outside the main one, to the best; minimum correlation.
+_MAX_RIVAL, _MIN_CORRELATION = 0.8, 0.7
 _MAX_LAGS = 200_000
 
 
@@ -46,31 +46,33 @@ def lag_between(
     Returns
     -------
     Lag or None
-        None where a signal is too short or does not change.
+        None if a signal is too short or constant.
     """
     if min(len(times), len(other_times)) < _MIN_SAMPLES:
         return None
     interval = min(float(np.median(np.diff(times))), float(np.median(np.diff(other_times))))
-    step = interval / _FINE
+    step = interval / _OVERSAMPLING
     if not step > 0 or values.std() == 0 or other_values.std() == 0:
         return None
-    first = _sampled(times, values, step)
-    second = _sampled(other_times, other_values, step)
-    least = max(round(_OVERLAP * min(len(first), len(second))), 2)
+    first = _resampled(times, values, step)
+    second = _resampled(other_times, other_values, step)
+    min_overlap = max(round(_OVERLAP * min(len(first), len(second))), 2)
     if len(first) + len(second) > _MAX_LAGS:
         return None
-    correlation = _correlations(first, second, least)
+    correlation = _correlations(first, second, min_overlap)
     if not np.isfinite(correlation).any():
         return None
     best = int(np.nanargmax(correlation))
     peak = float(correlation[best])
-    fine = 0.0
+    subsample = 0.0
     if 0 < best < len(correlation) - 1:
         left, right = correlation[best - 1], correlation[best + 1]
-        bend = left - 2 * peak + right
-        fine = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0 else 0.0
-        fine = fine if np.isfinite(fine) else 0.0
-    # The peak itself reaches as far as correlation falls.
+        curvature = left - 2 * peak + right
+        subsample = (
+            float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0
+        )
+        subsample = subsample if np.isfinite(subsample) else 0.0
+    # The peak extends to the nearest minima of the correlation.
     low = high = best
     while low > 0 and correlation[low - 1] <= correlation[low]:
         low -= 1
@@ -79,22 +81,22 @@ def lag_between(
     elsewhere = np.concatenate([correlation[:low], correlation[high + 1 :]])
     elsewhere = elsewhere[np.isfinite(elsewhere)]
     rival = float(elsewhere.max()) if len(elsewhere) else 0.0
-    shift = (best + fine - (len(second) - 1)) * step
+    shift = (best + subsample - (len(second) - 1)) * step
     seconds = float(times[0] + shift - other_times[0])
-    certain = peak >= _MIN_CORRELATION and rival <= _RIVAL * peak
+    certain = peak >= _MIN_CORRELATION and rival <= _MAX_RIVAL * peak
     return Lag(seconds, peak, certain)
 
 
-def _sampled(times: Float64, values: Float64, step: float) -> Float64:
-    """A signal at even times from the first one on, without its mean."""
+def _resampled(times: Float64, values: Float64, step: float) -> Float64:
+    """Return a signal resampled at regular times from the first one on."""
     at = times[0] + step * np.arange(int((times[-1] - times[0]) / step) + 1)
     return np.interp(at, times, values)
 
 
-def _correlations(a: Float64, b: Float64, least: int) -> Float64:
-    """Pearson correlations over the overlap at shifts 1 - len(b) to len(a) - 1 of b.
+def _correlations(a: Float64, b: Float64, min_overlap: int) -> Float64:
+    """Return Pearson correlations over the overlap at shifts 1 - len(b) to len(a) - 1 of b.
 
-    NaN where fewer than `least` samples overlap.
+    NaN where fewer than `min_overlap` samples overlap.
     """
     from scipy.signal import fftconvolve
 
@@ -107,10 +109,10 @@ def _correlations(a: Float64, b: Float64, least: int) -> Float64:
     n = np.round(summed(ones_a, ones_b))
     sa, sb = summed(a, ones_b), summed(ones_a, b)
     saa, sbb, sab = summed(a * a, ones_b), summed(ones_a, b * b), summed(a, b)
-    enough = n >= least
+    enough = n >= min_overlap
     n = np.where(enough, n, 1)
     va, vb = saa - sa * sa / n, sbb - sb * sb / n
     floor_a, floor_b = 1e-6 * (a * a).mean(), 1e-6 * (b * b).mean()
-    good = enough & (va > floor_a * n) & (vb > floor_b * n)
-    product = np.sqrt(np.where(good, va * vb, 1.0))
-    return np.where(good, (sab - sa * sb / n) / product, np.nan)
+    valid = enough & (va > floor_a * n) & (vb > floor_b * n)
+    product = np.sqrt(np.where(valid, va * vb, 1.0))
+    return np.where(valid, (sab - sa * sb / n) / product, np.nan)

@@ -23,17 +23,17 @@ from tofuse.rigs.clocks import Lag, lag_between
 # Units of the unknowns: 1 cm, 1 degree, and 1 ms.
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _TIME_UNIT = 1e-3
-# Largest gap over which poses are interpolated, in intervals; and minimum number of common poses.
-_GAP, _MIN_COMMON = 3.5, 12
+# Largest gap across which poses are interpolated, in intervals; minimum number of common poses.
+_MAX_GAP, _MIN_COMMON = 3.5, 12
 # Durations of motions A and B, as fractions of the common time.
 _SPANS = (0.02, 0.05, 0.1, 0.2, 0.35)
-_ITERATIONS, _CONVERGED = 30, 1e-4
-# Cut-off of Tukey's biweight in sigmas; minimum sigma of a pose.
-_ROBUST, _MIN_SIGMA = 4.7, 0.02
+_ITERATIONS, _CONVERGENCE = 30, 1e-4
+# Threshold of Tukey's biweight in sigmas; minimum sigma of a pose, in units.
+_TUKEY, _MIN_SIGMA = 4.7, 0.02
 # Upper 95 % bound, in standard errors.
-_UPPER = 1.64
+_BOUND_SIGMAS = 1.64
 # Sigma of an unconstrained direction, in units.
-_LOOSEST = 100.0
+_UNCONSTRAINED_SIGMA = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Track:
     @classmethod
     def of(cls, times: Float64, poses: Float64) -> Track:
         """Return the track of the frames with a pose."""
-        known = np.isfinite(poses[:, 0, 0])
-        return cls(times[known], poses[known])
+        posed = np.isfinite(poses[:, 0, 0])
+        return cls(times[posed], poses[posed])
 
     @property
     def interval(self) -> float:
@@ -55,22 +55,22 @@ class Track:
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
 
     def at(self, times: Float64) -> tuple[Float64, Bool]:
-        """Poses at other times, and whether they are known there."""
+        """Return the interpolated poses at other times, and whether they are valid."""
         right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         before, after = self.times[right - 1], self.times[right]
         gap = after - before
         fraction = (times - before) / np.maximum(gap, 1e-12)
-        known = (fraction >= 0) & (fraction <= 1) & (gap <= _GAP * self.interval)
+        valid = (fraction >= 0) & (fraction <= 1) & (gap <= _MAX_GAP * self.interval)
         T = se3.interpolate(self.poses[right - 1], self.poses[right], np.clip(fraction, 0, 1))
-        return T, known
+        return T, valid
 
-    def turning(self) -> tuple[Float64, Float64]:
-        """Times (M,) and speed of rotation in rad/s between neighbouring poses."""
+    def angular_speed(self) -> tuple[Float64, Float64]:
+        """Return times (M,) and the angular speed in rad/s between consecutive poses."""
         gap = np.diff(self.times)
-        near = gap <= _GAP * self.interval
-        turned = np.asarray(se3.angle(se3.inverse(self.poses[:-1]) @ self.poses[1:]))
-        middle = 0.5 * (self.times[:-1] + self.times[1:])
-        return middle[near], (turned / np.maximum(gap, 1e-12))[near]
+        consecutive = gap <= _MAX_GAP * self.interval
+        rotation = np.asarray(se3.angle(se3.inverse(self.poses[:-1]) @ self.poses[1:]))
+        midpoints = 0.5 * (self.times[:-1] + self.times[1:])
+        return midpoints[consecutive], (rotation / np.maximum(gap, 1e-12))[consecutive]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,27 +101,27 @@ class HandEye:
 
 
 def clock_of(a: Track, b: Track) -> Lag | None:
-    """Offset to be added to b's timestamps, by the angular speeds; see `lag_between`."""
-    return lag_between(*a.turning(), *b.turning())
+    """Return the offset to add to b's timestamps, by the angular speeds; see `lag_between`."""
+    return lag_between(*a.angular_speed(), *b.angular_speed())
 
 
-def hand_eye(a: Track, b: Track, time_offset_s: float, *, one_world: bool = False) -> HandEye:
+def hand_eye(a: Track, b: Track, time_offset_s: float, *, common_world: bool = False) -> HandEye:
     """Fit two trajectories of a rig.
 
     Parameters
     ----------
     time_offset_s
         Initial value.
-    one_world
-        Whether both trajectories are in one world frame already.
+    common_world
+        Whether both trajectories are in a common world frame already.
 
     Raises
     ------
     RegistrationError
         If there are too few common poses.
     """
-    X, Y = _start(a, b, time_offset_s, one_world=one_world)
-    return _Fit(a, b, one_world).solve(X, Y, time_offset_s)
+    X, Y = _initial_estimate(a, b, time_offset_s, common_world=common_world)
+    return _Fit(a, b, common_world).solve(X, Y, time_offset_s)
 
 
 def combined(a: HandEye, b: HandEye) -> HandEye:
@@ -129,39 +129,41 @@ def combined(a: HandEye, b: HandEye) -> HandEye:
 
     The covariance is scaled by the Birge ratio (Birge, 1932).
     """
-    apart = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
-    both = a.covariance + b.covariance
-    ratio = float(apart @ np.linalg.pinv(both, hermitian=True) @ apart) / len(apart)
-    gain = a.covariance @ np.linalg.pinv(both, hermitian=True)
+    difference = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
+    total = a.covariance + b.covariance
+    ratio = float(difference @ np.linalg.pinv(total, hermitian=True) @ difference) / len(difference)
+    gain = a.covariance @ np.linalg.pinv(total, hermitian=True)
     C = a.covariance - gain @ a.covariance
     variances = np.array([a.time_sigma_s**2, b.time_sigma_s**2]) + 1e-18
-    known = float((1 / variances).sum())
-    offset = (a.time_offset_s / variances[0] + b.time_offset_s / variances[1]) / known
+    information = float((1 / variances).sum())
+    offset = (a.time_offset_s / variances[0] + b.time_offset_s / variances[1]) / information
     return replace(
         b,
-        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(gain @ apart)), np.float64),
+        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(gain @ difference)), np.float64),
         covariance=np.asarray(0.5 * (C + C.T) * max(ratio, 1.0), np.float64),
         time_offset_s=float(offset),
-        time_sigma_s=float(known**-0.5),
+        time_sigma_s=float(information**-0.5),
     )
 
 
 def _common(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:
-    """Times of a's poses at which b's are known too, and both poses."""
-    T_b, known = b.at(a.times - offset)
-    if known.sum() < _MIN_COMMON:
+    """Return the times of a's poses at which b has a pose too, and the poses of both."""
+    T_b, valid = b.at(a.times - offset)
+    if valid.sum() < _MIN_COMMON:
         raise RegistrationError(
-            f"only {known.sum()} poses of both cameras are of one time",
+            f"only {valid.sum()} poses of both cameras are of one time",
             remedy="record all cameras at the same time",
         )
-    return a.times[known], a.poses[known], T_b[known]
+    return a.times[valid], a.poses[valid], T_b[valid]
 
 
-def _start(a: Track, b: Track, offset: float, *, one_world: bool) -> tuple[Float64, Float64]:
-    """X and Y by Tsai and Lenz, from motions over several spans."""
+def _initial_estimate(
+    a: Track, b: Track, offset: float, *, common_world: bool
+) -> tuple[Float64, Float64]:
+    """Return X and Y by Tsai and Lenz, from relative motions over several spans."""
     _, T_a, T_b = _common(a, b, offset)
-    if one_world:
-        return _mean(se3.inverse(T_a) @ T_b), np.eye(4)
+    if common_world:
+        return _median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
     motions_a, motions_b = [], []
     for span in _SPANS:
         step = max(1, round(span * len(T_a)))
@@ -175,52 +177,52 @@ def _start(a: Track, b: Track, offset: float, *, one_world: bool) -> tuple[Float
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     M = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     d = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
-    # The prior along directions that the motion does not constrain: cameras near each other.
+    # Prior for directions that the motion does not constrain: the cameras are close together.
     t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = R, t
-    return X, _mean(T_a @ X @ se3.inverse(T_b))
+    return X, _median_pose(T_a @ X @ se3.inverse(T_b))
 
 
-def _mean(poses: Float64) -> Float64:
-    """Mean of poses (N, 4, 4) that are near each other, against outliers."""
-    middle = poses[len(poses) // 2]
+def _median_pose(poses: Float64) -> Float64:
+    """Return the component-wise median of nearby poses (N, 4, 4), in their tangent space."""
+    centre = poses[len(poses) // 2]
     for _ in range(10):
-        away = se3.log(se3.inverse(middle) @ poses)
-        middle = middle @ se3.exp(np.median(away, axis=0))
-    return np.asarray(se3.orthonormalise(middle), np.float64)
+        deviations = se3.log(se3.inverse(centre) @ poses)
+        centre = centre @ se3.exp(np.median(deviations, axis=0))
+    return np.asarray(se3.orthonormalise(centre), np.float64)
 
 
 class _Fit:
     """Gauss-Newton over X, Y and the clock, with robust weights."""
 
-    def __init__(self, a: Track, b: Track, one_world: bool) -> None:
-        self.a, self.b, self.one_world = a, b, one_world
+    def __init__(self, a: Track, b: Track, common_world: bool) -> None:
+        self.a, self.b, self.common_world = a, b, common_world
         span = min(a.interval, b.interval)
-        self.half = 0.5 * span  # for the derivative by time
+        self.half_step = 0.5 * span  # for the derivative by time
 
     def residuals(self, X: Float64, Y: Float64, offset: float) -> Float64:
-        """(N, 6) log((T_a X)^-1 Y T_b), where both are known."""
+        """Return (N, 6) log((T_a X)^-1 Y T_b) at the common times."""
         _, T_a, T_b = _common(self.a, self.b, offset)
         return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b), np.float64)
 
     def solve(self, X: Float64, Y: Float64, offset: float) -> HandEye:
         """Iterate to convergence."""
         for _ in range(_ITERATIONS):
-            J, e, _ = self.linear(X, Y, offset)
+            J, e, _ = self.linearised(X, Y, offset)
             sigma = _sigma(e)
             w = _weights(e, sigma)
-            H = _product(J, w / sigma**2, J)
-            g = _product(J, w / sigma**2, e[..., None])[:, 0]
+            H = _weighted_product(J, w / sigma**2, J)
+            g = _weighted_product(J, w / sigma**2, e[..., None])[:, 0]
             H += np.diag(1e-9 * H.diagonal() + 1e-6)
             step = -np.linalg.solve(H, g)
             X = se3.orthonormalise(X @ se3.exp(step[:6] * _UNITS))
-            if not self.one_world:
+            if not self.common_world:
                 Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * _UNITS))
-            offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half, self.half))
-            if np.abs(step).max() < _CONVERGED:
+            offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half_step, self.half_step))
+            if np.abs(step).max() < _CONVERGENCE:
                 break
-        J, e, times = self.linear(X, Y, offset)
+        J, e, times = self.linearised(X, Y, offset)
         sigma = _sigma(e)
         C = _covariance(J, e, times, sigma)
         units = np.outer(_UNITS, _UNITS)
@@ -229,77 +231,82 @@ class _Fit:
             sigma * _UNITS,
         )  # fmt: skip
 
-    def linear(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
-        """Derivatives (N, 6, 13) or (N, 6, 7), residuals (N, 6) in units, and their times."""
+    def linearised(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
+        """Return derivatives (N, 6, 13) or (N, 6, 7), residuals (N, 6) in units, and times."""
         times, T_a, T_b = _common(self.a, self.b, offset)
         e = se3.log(se3.inverse(T_a @ X) @ Y @ T_b)
         right = se3.jacobian_inverse(e)
         left = se3.jacobian_inverse(-e)
         by_x = -left
         columns = [by_x * _UNITS]
-        if not self.one_world:
+        if not self.common_world:
             columns.append(right @ se3.adjoint(se3.inverse(T_b)) * _UNITS)
-        # The motion of b over time: a larger offset takes an earlier pose.
-        ahead, known_ahead = self.b.at(times - offset + self.half)
-        behind, known_behind = self.b.at(times - offset - self.half)
-        speed = se3.log(se3.inverse(behind) @ ahead) / (2 * self.half)
-        speed = np.where((known_ahead & known_behind)[:, None], speed, 0.0)
-        columns.append((-(right @ speed[..., None])) * _TIME_UNIT)
+        # The velocity of b: a larger offset selects an earlier pose.
+        T_after, valid_after = self.b.at(times - offset + self.half_step)
+        T_before, valid_before = self.b.at(times - offset - self.half_step)
+        velocity = se3.log(se3.inverse(T_before) @ T_after) / (2 * self.half_step)
+        velocity = np.where((valid_after & valid_before)[:, None], velocity, 0.0)
+        columns.append((-(right @ velocity[..., None])) * _TIME_UNIT)
         J = np.concatenate(columns, axis=2) / _UNITS[:, None]
         return np.asarray(J, np.float64), np.asarray(e / _UNITS, np.float64), times
 
 
 def _sigma(e: Float64) -> Float64:
-    """Return the robust standard deviation (6,) of residuals, equal for the axes of each kind."""
-    each = np.median(np.abs(e), axis=0) / MEDIAN_OF_NORMAL
-    both = [np.sqrt((each[:3] ** 2).mean())] * 3 + [np.sqrt((each[3:] ** 2).mean())] * 3
-    return np.maximum(both, _MIN_SIGMA)
+    """Return the robust sigma (6,) of the residuals, isotropic in position and in rotation."""
+    by_axis = np.median(np.abs(e), axis=0) / MEDIAN_OF_NORMAL
+    by_kind = [np.sqrt((by_axis[:3] ** 2).mean())] * 3 + [np.sqrt((by_axis[3:] ** 2).mean())] * 3
+    return np.maximum(by_kind, _MIN_SIGMA)
 
 
 def _weights(e: Float64, sigma: Float64) -> Float64:
-    """Return weights (N, 6): Tukey's biweight of the residual of each pose."""
-    ratio = ((e / sigma) ** 2).mean(1) / _ROBUST**2
+    """Return Tukey's biweights (N, 6) of the residual of each pose."""
+    ratio = ((e / sigma) ** 2).mean(1) / _TUKEY**2
     return np.repeat((np.maximum(1 - ratio, 0) ** 2)[:, None], 6, axis=1)
 
 
 def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:
-    """Return the covariance of the unknowns, in units, with errors that are correlated in time."""
+    """Return the covariance of the unknowns, in units, for errors correlated in time."""
     w = _weights(e, sigma) / sigma**2
-    H = _product(J, w, J)
-    lasting = _correlation_time(e / sigma, times, H.shape[0] / 6)
-    alike = np.exp(-2 * np.abs(times[:, None] - times[None]) / lasting)
-    # Degrees of freedom: independent errors minus unknowns.
-    independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
-    left = max(independent - H.shape[0], 6.0)
-    weighed = J * (w * sigma)[..., None]
-    spread = np.tensordot(alike, weighed, 1)
-    B = independent / left * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
-    if H.shape[0] > 7:  # between two worlds
-        H[:6, :6] -= _spurious(w, sigma)
+    H = _weighted_product(J, w, J)
+    correlation_time = _correlation_time(e / sigma, times, H.shape[0] / 6)
+    correlation = np.exp(-2 * np.abs(times[:, None] - times[None]) / correlation_time)
+    # Degrees of freedom: number of independent errors minus unknowns.
+    independent = 6 * max((times[-1] - times[0]) / correlation_time, 1.0)
+    freedom = max(independent - H.shape[0], 6.0)
+    weighted = J * (w * sigma)[..., None]
+    correlated = np.tensordot(correlation, weighted, 1)
+    B = independent / freedom * np.tensordot(weighted, correlated, ((0, 1), (0, 1)))
+    if H.shape[0] > 7:  # two world frames
+        H[:6, :6] -= _spurious_information(w, sigma)
     values, vectors = np.linalg.eigh(H)
-    bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
-    weak = vectors[:, values < _LOOSEST**-2]
-    # Of a pose's six unknowns, and of the clock alone.
-    wider = np.sqrt([_heavier_tails(6, left)] * (len(H) - 1) + [_heavier_tails(1, left)])
-    C = np.outer(wider, wider) * (bread @ B @ bread) + _LOOSEST**2 * weak @ weak.T
+    bread = (vectors / np.maximum(values, _UNCONSTRAINED_SIGMA**-2)) @ vectors.T
+    weak = vectors[:, values < _UNCONSTRAINED_SIGMA**-2]
+    # For the six unknowns of a pose, and for the clock alone.
+    inflation = np.sqrt(
+        [_small_sample_factor(6, freedom)] * (len(H) - 1) + [_small_sample_factor(1, freedom)]
+    )
+    C = (
+        np.outer(inflation, inflation) * (bread @ B @ bread)
+        + _UNCONSTRAINED_SIGMA**2 * weak @ weak.T
+    )
     return np.asarray(0.5 * (C + C.T), np.float64)
 
 
-def _heavier_tails(unknowns: int, left: float) -> float:
+def _small_sample_factor(unknowns: int, freedom: float) -> float:
     """Return the factor on variances by which the 95 % ellipsoid of unknowns is larger.
 
-    With few degrees of freedom `left` it is that of the F distribution instead of chi-square's.
+    With few degrees of `freedom` it is that of the F distribution instead of chi-square.
     """
-    ratio = stats.f.ppf(0.95, unknowns, left) / stats.chi2.ppf(0.95, unknowns)
+    ratio = stats.f.ppf(0.95, unknowns, freedom) / stats.chi2.ppf(0.95, unknowns)
     return float(unknowns * ratio)
 
 
-def _spurious(w: Float64, sigma: Float64) -> Float64:
+def _spurious_information(w: Float64, sigma: Float64) -> Float64:
     """Return the information (6, 6) on X that noise of the poses alone would provide.
 
-    Noise (tau, omega) of T_b changes the derivative of a residual by (rho, phi) of X relative to
-    that by Y, by omega x rho + tau x phi in position and omega x phi in rotation. So a rig that
-    rotates about one axis, for instance, seems to rotate about the others as well.
+    Noise (tau, omega) of T_b changes the derivative of a residual with respect to (rho, phi) of X,
+    relative to that of Y, by omega x rho + tau x phi in position and omega x phi in rotation. For
+    instance, a rig that rotates about one axis appears to rotate about the others as well.
 
     Parameters
     ----------
@@ -313,18 +320,18 @@ def _spurious(w: Float64, sigma: Float64) -> Float64:
     return np.diag([omega * position] * 3 + [tau * position + omega * rotation] * 3)
 
 
-def _product(J: Float64, w: Float64, K: Float64) -> Float64:
-    """Sum of J^T w K over all residuals."""
+def _weighted_product(J: Float64, w: Float64, K: Float64) -> Float64:
+    """Return the sum of J^T w K over all residuals."""
     out = np.tensordot(J * w[..., None], K, ((0, 1), (0, 1)))
     return np.asarray(out, np.float64)
 
 
-def _correlation_time(e: Float64, times: Float64, taken: float) -> float:
+def _correlation_time(e: Float64, times: Float64, unknowns: float) -> float:
     """Return the correlation time of errors, s: the integral of the residuals' autocorrelation.
 
-    It is corrected for what a fit with `taken` unknowns per axis absorbs: about `taken` independent
-    errors at all lags. As a time that is too short understates errors, the upper 95 % bound is
-    returned (by Bartlett's standard error).
+    It is corrected for the errors that a fit absorbs: at all lags about as many independent ones as
+    it has `unknowns` per axis. As a short time understates errors, the upper 95 % bound is returned
+    (by Bartlett's standard error).
     """
     interval = float(np.median(np.diff(times)))
     power = float((e**2).sum())
@@ -334,6 +341,6 @@ def _correlation_time(e: Float64, times: Float64, taken: float) -> float:
         if correlation <= 0:
             break
         correlations.append(correlation)
-    first = 1 + 2 * sum(correlations)
-    missing = min(taken * first / len(e) + _UPPER * np.sqrt(first / e.size), 0.5)
-    return float(1 + 2 * sum((s + missing) / (1 + missing) for s in correlations)) * interval
+    uncorrected = 1 + 2 * sum(correlations)
+    bias = min(unknowns * uncorrected / len(e) + _BOUND_SIGMAS * np.sqrt(uncorrected / e.size), 0.5)
+    return float(1 + 2 * sum((s + bias) / (1 + bias) for s in correlations)) * interval

@@ -29,13 +29,13 @@ class Camera:
 
     @cached_property
     def config(self) -> Config:
-        """How its images are prepared.
+        """The configuration that prepares its images.
 
-        Corrections on trial are left out: the trial compares consecutive views of a moving camera.
+        Corrections that need a trial are omitted: it compares consecutive views of a moving camera.
         """
         config = with_recording_defaults(from_method("default", "range"), self.recording)
-        kept = tuple(c for c in config.corrections if not c.needs_trial)
-        return replace(config, corrections=kept)
+        corrections = tuple(c for c in config.corrections if not c.needs_trial)
+        return replace(config, corrections=corrections)
 
     def images(self, count: int) -> list[RangeFrame]:
         """Read up to `count` evenly spaced images.
@@ -43,7 +43,7 @@ class Camera:
         Raises
         ------
         InputError
-            If none can be read, or it holds clouds.
+            If none can be read, or the recording contains clouds.
         """
         frames = [frame for frame in self.recording.images(count) if len(frame)]
         if not frames:
@@ -82,7 +82,7 @@ class Camera:
 
 
 def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002
-    """Open the recordings of a rig's cameras, each called after its file or folder.
+    """Open the recordings of a rig's cameras, each named after its file or folder.
 
     Raises
     ------

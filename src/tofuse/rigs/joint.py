@@ -4,7 +4,7 @@ Overlapping views of different cameras are compared in both directions. As the c
 each other, all instants share the unknowns: a pose and a depth offset for each camera but the
 first. The covariance is that of an M-estimator with spatially correlated errors (Conley, "GMM
 estimation with cross sectional dependence", 1999): depth errors due to multipath, the lens and
-motion are equal for neighbouring points, in all views of a place.
+motion are the same for neighbouring points, in all views of a place.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _PAIRS_PER_CHUNK = 8
 _MEDIAN_OF_SQUARES = 0.455
 _MIN_SCALE, _MAX_SCALE = 0.7, 30.0
 _MIN_COMPARED = 50
-# Points further from a surface than this fraction of the depth are on another one.
-_OTHER_SURFACE = 0.1
-# Windows of plane fits overlap: number of pixels per independent value of noise (half the smallest
-# window; covariances of simulated boards are then consistent, see tests).
-_SHARED_NOISE = 12.0
+# Points further from a surface than this fraction of the depth belong to a different surface.
+_MAX_DISTANCE = 0.1
+# Windows of plane fits overlap: number of pixels per independent noise value (half the smallest
+# window, with which the covariances of simulated boards are consistent, see tests).
+_CORRELATED_PIXELS = 12.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class JointOptions:
     overlap
         Minimum fraction of a view's points that project onto surfaces of another one.
     offset_sigma_m
-        Prior standard deviation of a camera's depth offset. Makers specify about a centimetre.
+        Prior standard deviation of a camera's depth offset. Data sheets specify about a centimetre.
     reach
         Correlation length of errors (to 1/e), as a fraction of the depth.
     steepness
@@ -62,7 +62,7 @@ class JointOptions:
         Standard deviation of the systematic error of a camera's ranges, as a fraction of the range:
         calibrated on simulated rigs with multipath (`benchmarks/rigs.py systematic`).
     convergence
-        Iterations stop when no unknown changes by more, in units of 1 cm and 1 degree.
+        Iterations stop when no unknown changes by more than this, in units of 1 cm and 1 degree.
     """
 
     rounds: tuple[Round, ...] = (Round(6, 0.03, 0.0), Round(6, 0.01, 0.0), Round(12, 0.0, 0.0))
@@ -86,7 +86,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class JointPoses:
     """Refined poses and depth offsets of the cameras.
 
     Attributes
@@ -116,7 +116,7 @@ class Placed:
 
 def refine_together(
     views: Sequence[View], poses: Float64, options: JointOptions | None = None
-) -> Placed:
+) -> JointPoses:
     """Optimise the poses and depth offsets of all cameras jointly.
 
     Parameters
@@ -141,7 +141,7 @@ def refined_poses(
 def disagreements(
     views: Sequence[View], poses: Float64
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Return, by pair of cameras, the median distance of surfaces in m, and compared pixels."""
+    """Return, by pair of cameras, the median distance between surfaces in m and the pixel count."""
     system = _System(views, poses, JointOptions())
     return system.disagreement(system.compare())
 
@@ -149,21 +149,21 @@ def disagreements(
 def disagreements_of(
     views: Sequence[SampledView], camera: Intp, poses: Float64, pairs: Intp
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """As `disagreements`, for pairs (M, 2) of views at any time with poses (N, 4, 4)."""
-    found: dict[tuple[int, int], list[Float64]] = {}
+    """Return `disagreements` for pairs (M, 2) of views at any time with poses (N, 4, 4)."""
+    distances: dict[tuple[int, int], list[Float64]] = {}
     for i, j in pairs:
         a, b = sorted((int(camera[i]), int(camera[j])))
         if a != b:
             T = se3.inverse(poses[i]) @ poses[j]
-            found.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
-    every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
-    return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
+            distances.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
+    by_pair = {ends: np.concatenate(parts) for ends, parts in sorted(distances.items())}
+    return {ends: (float(np.median(d)), len(d)) for ends, d in by_pair.items() if len(d)}
 
 
 def distances_between(
     target: SampledView, source: SampledView, T_target_source: Float64
 ) -> Float64:
-    """Return the (N,) distances in m between the surfaces that both views see."""
+    """Return the (N,) distances in m between the surfaces visible in both views."""
     rows = np.empty((len(source.points), kernels.ROW))
     options = JointOptions()
     kernels.residuals(
@@ -175,9 +175,9 @@ def distances_between(
         float(np.cos(options.max_angle)),
         rows,
     )
-    far = np.abs(rows[:, kernels.RESIDUAL])
-    near = (rows[:, kernels.OWN] > 0) & (far < _OTHER_SURFACE * target.depth)
-    return np.asarray(far[near], np.float64)
+    distance = np.abs(rows[:, kernels.RESIDUAL])
+    valid = (rows[:, kernels.OWN] > 0) & (distance < _MAX_DISTANCE * target.depth)
+    return np.asarray(distance[valid], np.float64)
 
 
 def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> _System:
@@ -197,17 +197,17 @@ class _System:
         self.views = views
         self.poses = np.array(poses, float)
         self.offsets = np.zeros(len(poses))
-        at: dict[int, list[int]] = {}
+        by_instant: dict[int, list[int]] = {}
         for k, view in enumerate(views):
-            at.setdefault(view.instant, []).append(k)
-        self.pairs = [(i, j) for one in at.values() for i in one for j in one if i != j]
+            by_instant.setdefault(view.instant, []).append(k)
+        self.pairs = [(i, j) for same in by_instant.values() for i in same for j in same if i != j]
         count = len(poses)
         self.scale = np.full((count, count), 3.0)
         depths = [view.sampled.depth for view in views]
         self.depth = float(np.median(depths)) if depths else 1.0
 
     def compare(self) -> list[Float64]:
-        """Return the residual rows of each pair (target, source): near correspondences only."""
+        """Return the residual rows of each pair (target, source): close correspondences only."""
         rows: list[Float64] = [np.zeros((0, kernels.ROW))] * len(self.pairs)
         cosine = float(np.cos(self.options.max_angle))
         inverse = se3.inverse(self.poses)
@@ -227,17 +227,17 @@ class _System:
                     out,
                 )
                 # Larger distances are between different surfaces.
-                near = (out[:, kernels.OWN] > 0) & (
-                    np.abs(out[:, kernels.RESIDUAL]) < _OTHER_SURFACE * self.depth
+                valid = (out[:, kernels.OWN] > 0) & (
+                    np.abs(out[:, kernels.RESIDUAL]) < _MAX_DISTANCE * self.depth
                 )
-                if near.sum() >= self.options.overlap * len(points):
-                    rows[k] = out[near]
+                if valid.sum() >= self.options.overlap * len(points):
+                    rows[k] = out[valid]
 
         run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_PER_CHUNK))
         return rows
 
     def rescale(self, rows: Sequence[Float64]) -> None:
-        """Estimate the noise scale of each two cameras from the distances of their surfaces."""
+        """Estimate the noise scale of each camera pair from the distances between surfaces."""
         count = len(self.poses)
         ratios: dict[tuple[int, int], list[Float64]] = {}
         for (i, j), row in zip(self.pairs, rows, strict=True):
@@ -245,32 +245,32 @@ class _System:
             ratios.setdefault(ends, []).append(row[:, kernels.RESIDUAL] ** 2 / row[:, kernels.OWN])
         for a in range(count):
             for b in range(count):
-                found = np.concatenate(ratios.get((a, b), [np.zeros(0)]))
-                if len(found) >= _MIN_COMPARED:
-                    scale = np.sqrt(np.median(found) / _MEDIAN_OF_SQUARES)
+                normalised = np.concatenate(ratios.get((a, b), [np.zeros(0)]))
+                if len(normalised) >= _MIN_COMPARED:
+                    scale = np.sqrt(np.median(normalised) / _MEDIAN_OF_SQUARES)
                     self.scale[a, b] = np.clip(scale, _MIN_SCALE, _MAX_SCALE)
 
     def jacobian(self, k: int, row: Float64) -> tuple[Float64, Float64]:
         """Return the (N, 14) derivatives by the source's and the target's unknowns.
 
-        Also half the difference between those with the normals of the two.
+        The first uses the mean of both normals, the second half of their difference.
         """
         target, source = (self.views[i].camera for i in self.pairs[k])
         p = row[:, kernels.MOVED : kernels.MOVED + 3]
         m = row[:, kernels.TARGET_NORMAL : kernels.TARGET_NORMAL + 3]
         s = row[:, kernels.SOURCE_NORMAL : kernels.SOURCE_NORMAL + 3]
         T_source_target = se3.inverse(self.poses[source]) @ self.poses[target]
-        back = -se3.adjoint(T_source_target)
+        by_target = -se3.adjoint(T_source_target)
         out = []
         for normal in (0.5 * (m + s), 0.5 * (m - s)):
             J = np.concatenate([normal, np.cross(p, normal)], 1)
             out.append(
-                np.concatenate([J, np.zeros((len(J), 1)), J @ back, np.zeros((len(J), 1))], 1)
+                np.concatenate([J, np.zeros((len(J), 1)), J @ by_target, np.zeros((len(J), 1))], 1)
             )
-        both, half = out
-        both[:, 6] = row[:, kernels.BY_SOURCE]
-        both[:, 13] = row[:, kernels.BY_TARGET]
-        return both * np.tile(_UNITS, 2), half * np.tile(_UNITS, 2)
+        by_mean, by_difference = out
+        by_mean[:, 6] = row[:, kernels.BY_SOURCE]
+        by_mean[:, 13] = row[:, kernels.BY_TARGET]
+        return by_mean * np.tile(_UNITS, 2), by_difference * np.tile(_UNITS, 2)
 
     def unknowns(self, k: int) -> Intp:
         """Return the (14,) indices of the unknowns of a pair's cameras."""
@@ -298,14 +298,14 @@ class _System:
         g[6::_SIZE] += prior[6::_SIZE] * self.offsets / 0.01
         free = np.arange(_SIZE, size)
         H = H[np.ix_(free, free)]
-        # Damping, so that an unconstrained camera stays.
+        # Damping, so that an unconstrained camera does not move.
         H[np.diag_indices(len(H))] += 1e-3 + 1e-6 * H.diagonal()
         step = np.asarray(-np.linalg.solve(H, g[free]), np.float64)
         self._move(step)
         return float(np.abs(step).max(initial=0.0))
 
     def _move(self, step: Float64) -> None:
-        """Change poses and offsets of all cameras but the first by (7 (K - 1),), in units."""
+        """Update poses and offsets of all cameras but the first by (7 (K - 1),), in units."""
         change = step.reshape(-1, _SIZE) * _UNITS
         self.poses[1:] = se3.orthonormalise(self.poses[1:] @ se3.exp(change[:, :6]))
         self.offsets[1:] += change[:, 6]
@@ -322,14 +322,14 @@ class _System:
         """Return the (7,) information of a camera's prior, in units."""
         return np.array([0.0] * 6 + [(0.01 / self.options.offset_sigma_m) ** 2])
 
-    def placed(self) -> Placed:
+    def placed(self) -> JointPoses:
         """Return the poses and offsets of the cameras, with covariances."""
         rows = self.compare()
         self.rescale(rows)
         count, size = len(self.poses), _SIZE * len(self.poses)
         plain, cross = np.zeros((size, size)), np.zeros((size, size))
         noise = np.zeros((size, size))
-        places, gradients = [], []
+        regions, gradients = [], []
         responses = np.zeros((count, shared_error.PATCHES, size))
         squares = weight = 0.0
         for k, row in enumerate(rows):
@@ -341,24 +341,24 @@ class _System:
             plain[np.ix_(at, at)] += (J * w[:, None]).T @ J - (D * w[:, None]).T @ D
             cross[np.ix_(at, at)] += (J * slope[:, None]).T @ J - (D * slope[:, None]).T @ D
             r = row[:, kernels.RESIDUAL]
-            noise[np.ix_(at, at)] += self._shared(k) * (J * (w * w * r * r)[:, None]).T @ J
-            each = np.zeros((len(row), size))
-            each[:, at] = J * (w * r)[:, None]
+            noise[np.ix_(at, at)] += self._redundancy(k) * (J * (w * w * r * r)[:, None]).T @ J
+            gradient = np.zeros((len(row), size))
+            gradient[:, at] = J * (w * r)[:, None]
             source = self.views[self.pairs[k][1]].camera
-            where = se3.transform(self.poses[source], row[:, kernels.MOVED : kernels.MOVED + 3])
-            where /= self.depth
-            region, summed = by_region(where, each)
-            places.append(region)
+            positions = se3.transform(self.poses[source], row[:, kernels.MOVED : kernels.MOVED + 3])
+            positions /= self.depth
+            region, summed = by_region(positions, gradient)
+            regions.append(region)
             gradients.append(summed)
             self._add_responses(responses, k, row, J * w[:, None])
             squares += float((w * r * r).sum())
             weight += float(w.sum())
         random = systematic = np.full((size - _SIZE, size - _SIZE), np.nan)
-        if places:
+        if regions:
             free = slice(_SIZE, None)
             B = noise[free, free] + np.diag(np.tile(self._prior(), count - 1))
             B += correlated(
-                np.concatenate(places), np.concatenate(gradients)[:, free], self.options.reach
+                np.concatenate(regions), np.concatenate(gradients)[:, free], self.options.reach
             )
             for matrix in (plain, cross):
                 matrix[np.diag_indices(size)] += np.tile(self._prior(), count)
@@ -368,7 +368,7 @@ class _System:
             random = bread @ B @ bread + unconstrained
             systematic = bread @ self._systematic(responses[:, :, free]) @ bread
         rms = float(np.sqrt(squares / weight)) if weight else float("nan")
-        return Placed(
+        return JointPoses(
             self.poses,
             self.offsets,
             self._marginals(random + systematic),
@@ -381,8 +381,8 @@ class _System:
         """Return the (K, 7, 7) blocks of the cameras, m and rad; the first camera is fixed."""
         blocks = np.zeros((len(self.poses), _SIZE, _SIZE))
         for c in range(1, len(blocks)):
-            own = slice(_SIZE * (c - 1), _SIZE * c)
-            blocks[c] = 0.5 * (C[own, own] + C[own, own].T) * np.outer(_UNITS, _UNITS)
+            block = slice(_SIZE * (c - 1), _SIZE * c)
+            blocks[c] = 0.5 * (C[block, block] + C[block, block].T) * np.outer(_UNITS, _UNITS)
         return blocks
 
     def _systematic(self, responses: Float64) -> Float64:
@@ -396,7 +396,7 @@ class _System:
         shapes = {view.camera: view.sampled.shape for view in self.views}
         B = np.zeros((responses.shape[2],) * 2)
         for camera, shape in shapes.items():
-            # Twice the correlation length of errors that leave residuals, as in the tracker.
+            # Twice the correlation length of errors that cause residuals, as in the tracker.
             correlation = np.sqrt(shared_error.patch_correlation(shape))
             L = self.options.systematic * responses[camera]
             B += L.T @ correlation @ L
@@ -408,7 +408,7 @@ class _System:
         Parameters
         ----------
         responses
-            (K, PATCHES, 7 K) sums, which are changed.
+            (K, PATCHES, 7 K) sums, updated in place.
         k, row
             A pair and its residual rows.
         weighted
@@ -427,19 +427,21 @@ class _System:
             np.add.at(sums, patch, weighted * by_error[:, None])
             responses[view.camera][:, at] += sums
 
-    def _shared(self, k: int) -> float:
-        """Return the number of residuals of a pair per independent value of noise.
+    def _redundancy(self, k: int) -> float:
+        """Return the number of residuals of a pair per independent noise value.
 
-        Windows of neighbouring pixels overlap, and the pair is compared both ways.
+        Windows of neighbouring pixels overlap, and the pair is compared in both directions.
         """
         source = self.views[self.pairs[k][1]].sampled
-        return 2 * max(1.0, _SHARED_NOISE * len(source.points) / max(math.prod(source.shape), 1))
+        return 2 * max(
+            1.0, _CORRELATED_PIXELS * len(source.points) / max(math.prod(source.shape), 1)
+        )
 
     def disagreement(self, rows: Sequence[Float64]) -> dict[tuple[int, int], tuple[float, int]]:
         """See `disagreements`."""
-        found: dict[tuple[int, int], list[Float64]] = {}
+        distances: dict[tuple[int, int], list[Float64]] = {}
         for (i, j), row in zip(self.pairs, rows, strict=True):
             a, b = sorted((self.views[i].camera, self.views[j].camera))
-            found.setdefault((a, b), []).append(np.abs(row[:, kernels.RESIDUAL]))
-        every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
-        return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
+            distances.setdefault((a, b), []).append(np.abs(row[:, kernels.RESIDUAL]))
+        by_pair = {ends: np.concatenate(parts) for ends, parts in sorted(distances.items())}
+        return {ends: (float(np.median(d)), len(d)) for ends, d in by_pair.items() if len(d)}

@@ -11,23 +11,23 @@ from tofuse.registration.uncertainty import bounded_below
 _REGION = 0.1
 # Largest sigma of a constrained direction, and the sigma of an unconstrained one, in units of 1 cm
 # and 1 degree.
-_MAX_SIGMA, _LOOSEST = 3.0, 30.0
+_MAX_SIGMA, _UNCONSTRAINED_SIGMA = 3.0, 30.0
 
 
-def by_region(where: Float64, rows: Float64) -> tuple[Float64, Float64]:
+def by_region(positions: Float64, rows: Float64) -> tuple[Float64, Float64]:
     """Sum rows (N, n) over regions of space.
 
     Parameters
     ----------
-    where
+    positions
         (N, 3) positions, as fractions of the depth.
 
     Returns
     -------
     The regions (R, 3), integers, and their sums (R, n).
     """
-    cube = np.floor(where / _REGION)
-    regions, inverse = np.unique(cube, axis=0, return_inverse=True)
+    cells = np.floor(positions / _REGION)
+    regions, inverse = np.unique(cells, axis=0, return_inverse=True)
     out = np.zeros((len(regions), rows.shape[1]))
     np.add.at(out, inverse.ravel(), rows)
     return regions, out
@@ -47,14 +47,14 @@ def correlated(places: Float64, gradients: Float64, reach: float) -> Float64:
     g = np.zeros((len(regions), gradients.shape[1]))
     np.add.at(g, inverse.ravel(), gradients)
     at = (regions + 0.5) * _REGION
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    return np.asarray(g.T @ np.exp(-apart / reach) @ g, np.float64)
+    distance = np.linalg.norm(at[:, None] - at[None], axis=2)
+    return np.asarray(g.T @ np.exp(-distance / reach) @ g, np.float64)
 
 
 def inverse_slope(plain: Float64, cross: Float64, steepness: float) -> tuple[Float64, Float64]:
     """Return the inverse of the gradient's derivative, and the covariance where that vanishes.
 
-    Directions beyond the largest sigma are unconstrained: there is only the noise of normals.
+    Directions beyond the largest sigma are unconstrained: their information is noise of normals.
 
     Parameters
     ----------
@@ -68,4 +68,4 @@ def inverse_slope(plain: Float64, cross: Float64, steepness: float) -> tuple[Flo
     values, vectors = np.linalg.eigh(plain)
     weak, strong = vectors[:, values < _MAX_SIGMA**-2], vectors[:, values >= _MAX_SIGMA**-2]
     inverse = strong @ np.linalg.inv(strong.T @ X @ strong) @ strong.T
-    return inverse, _LOOSEST**2 * weak @ weak.T
+    return inverse, _UNCONSTRAINED_SIGMA**2 * weak @ weak.T

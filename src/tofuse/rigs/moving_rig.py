@@ -1,7 +1,7 @@
 """Calibration of a moving rig: cameras are tracked separately, and their trajectories aligned.
 
-No two cameras need to overlap at any instant. Views of the same place at different times are used
-in a joint refinement of all views, once the trajectories are in one world.
+The cameras need not overlap at any instant. Views of the same place at different times are used in
+a joint refinement of all views, once the trajectories are in one world frame.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
-# Views of each camera that are refined jointly, and their points.
+# Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500
-# Largest difference of clocks of one rig, s, unless the rotations of the cameras correlate.
-_SAME_CLOCK_S = 0.5
-# Largest sigma of a placed camera: fraction of the depth, and rad.
+# Clock differences above this, s, are reported.
+_MAX_CLOCK_DIFFERENCE_S = 0.5
+# Maximum sigma of a placed camera: fraction of the depth, and rad.
 _MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
 _OPTIONS = RefineOptions(neighbours=16)
 
@@ -43,9 +43,9 @@ class MovingRig:
     Attributes
     ----------
     results
-        The reconstruction of each camera by itself.
+        The separate reconstruction of each camera.
     tracks
-        Trajectories of the cameras in one world, by camera; of those not placed, in their own.
+        Trajectories by camera, in one world frame; those of cameras not placed are in their own.
     fits
         Calibration of each camera but the first relative to the first, by camera.
     reasons
@@ -66,7 +66,7 @@ class MovingRig:
 
 
 def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig:
-    """Track each camera, fit the trajectories to each other, and refine all views together.
+    """Track each camera, fit the trajectories to each other, and refine all views jointly.
 
     Raises
     ------
@@ -91,36 +91,40 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
     notes: list[str] = []
     for k in range(1, len(cameras)):
         try:
-            offset = _clock(cameras, tracks, k, notes)
+            offset = _initial_offset(cameras, tracks, k, notes)
             fits[k] = hand_eye(tracks[0], tracks[k], offset)
         except RegistrationError as error:
             reasons[k] = str(error)
     progress.stage("refining")
-    together = _Together.of(cameras, tracks, fits)
-    moved = together.refined()
+    joint = _JointViews.of(cameras, tracks, fits)
+    refined = joint.refined()
     for k in list(fits):
         offset = fits[k].time_offset_s
-        fits[k] = hand_eye(moved[0], moved[k], offset)
-        if together.kept:
-            common = hand_eye(moved[0], moved[k], offset, one_world=True)
-            more = together.systematic(k, common)
-            fits[k] = combined(fits[k], replace(common, covariance=common.covariance + more))
-        why = _too_uncertain(fits[k], together.depth)
-        if why:
-            reasons[k] = why
+        fits[k] = hand_eye(refined[0], refined[k], offset)
+        if joint.improved:
+            common_fit = hand_eye(refined[0], refined[k], offset, common_world=True)
+            systematic = joint.systematic(k, common_fit)
+            fits[k] = combined(
+                fits[k], replace(common_fit, covariance=common_fit.covariance + systematic)
+            )
+        reason = _too_uncertain(fits[k], joint.depth)
+        if reason:
+            reasons[k] = reason
             del fits[k]
     placed = {0, *fits}
     return MovingRig(
         tuple(results),
-        {k: moved.get(k, tracks[k]) for k in range(len(cameras))},
+        {k: refined.get(k, tracks[k]) for k in range(len(cameras))},
         fits,
         reasons,
-        {ends: found for ends, found in together.disagreement().items() if set(ends) <= placed},
+        {ends: distance for ends, distance in joint.disagreement().items() if set(ends) <= placed},
         tuple(notes),
     )
 
 
-def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: list[str]) -> float:
+def _initial_offset(
+    cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: list[str]
+) -> float:
     """Return the initial offset to add to the timestamps of camera k.
 
     Raises
@@ -130,7 +134,7 @@ def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: li
     """
     lag = clock_of(tracks[0], tracks[k]) if len(tracks[k].times) > 1 else None
     if lag is not None and lag.certain:
-        if abs(lag.seconds) > _SAME_CLOCK_S:
+        if abs(lag.seconds) > _MAX_CLOCK_DIFFERENCE_S:
             notes.append(
                 f"the clock of {cameras[k].name} differs by {lag.seconds:.3f} s from that of "
                 f"{cameras[0].name}, by their rotations"
@@ -172,23 +176,26 @@ def _too_uncertain(fit: HandEye, depth: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    """Views of one camera, and the positions of their poses in its track."""
+class _CameraViews:
+    """Views of one camera, and the rows (N,) of their poses in its track."""
 
-    at: Intp
+    rows: Intp
     views: tuple[SampledView, ...]
 
 
-class _Together:
+class _JointViews:
     """Views of all cameras in the world of the first one."""
 
     def __init__(
-        self, tracks: dict[int, Track], kept: dict[int, _Kept], fits: dict[int, HandEye]
+        self,
+        tracks: dict[int, Track],
+        camera_views: dict[int, _CameraViews],
+        fits: dict[int, HandEye],
     ) -> None:
-        self.tracks, self._kept = tracks, kept
-        self.kept = False
+        self.tracks, self._views = tracks, camera_views
+        self.improved = False
         self._fits = fits
-        views = [v for k in sorted(kept) for v in kept[k].views]
+        views = [v for k in sorted(camera_views) for v in camera_views[k].views]
         self.depth = float(np.median([v.depth for v in views])) if views else 1.0
         self._halves: list[tuple[dict[int, Track], ...]] = []
         self._pairs = np.zeros((0, 2), np.intp)
@@ -197,77 +204,79 @@ class _Together:
     @classmethod
     def of(
         cls, cameras: Sequence[Camera], tracks: Sequence[Track], fits: dict[int, HandEye]
-    ) -> _Together:
+    ) -> _JointViews:
         """Prepare views of the calibrated cameras."""
         world = {0: tracks[0]}
         for k, fit in fits.items():
             world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
-        kept = {}
+        camera_views = {}
         for k, track in world.items():
-            at, views = [], []
+            rows, sampled = [], []
             for p in np.unique(np.linspace(0, len(track.times) - 1, _VIEWS).round().astype(int)):
                 row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
                 frame = cameras[k].image(row)
                 if frame is not None:
-                    at.append(p)
-                    views.append(SampledView.of(cameras[k].surface(frame), _POINTS))
-            kept[k] = _Kept(np.array(at, np.intp), tuple(views))
-        return cls(world, kept, fits)
+                    rows.append(p)
+                    sampled.append(SampledView.of(cameras[k].surface(frame), _POINTS))
+            camera_views[k] = _CameraViews(np.array(rows, np.intp), tuple(sampled))
+        return cls(world, camera_views, fits)
 
     def refined(self) -> dict[int, Track]:
         """Return the tracks in one world, after a joint refinement if that improved them."""
-        order = sorted(self._kept)
-        views = [v for k in order for v in self._kept[k].views]
-        poses = np.concatenate([self.tracks[k].poses[self._kept[k].at] for k in order])
+        order = sorted(self._views)
+        views = [v for k in order for v in self._views[k].views]
+        poses = np.concatenate([self.tracks[k].poses[self._views[k].rows] for k in order])
         first = poses[0]
-        done = refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
+        refinement = refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
         count = len(views)
-        before, after = done.before.of_views(count), done.after.of_views(count)
-        camera = np.repeat(order, [len(self._kept[k].views) for k in order])
-        # One world only where views of both cameras of a pair were compared.
-        across = {tuple(sorted(ends)) for ends in camera[done.pairs].tolist()}
-        joined = all((0, k) in across for k in order if k)
-        self._pairs, self._poses = done.pairs, first @ done.poses
+        before, after = refinement.before.of_views(count), refinement.after.of_views(count)
+        camera = np.repeat(order, [len(self._views[k].views) for k in order])
+        # The cameras are in one world frame only if views of each and the first were compared.
+        compared = {tuple(sorted(ends)) for ends in camera[refinement.pairs].tolist()}
+        connected = all((0, k) in compared for k in order if k)
+        self._pairs, self._poses = refinement.pairs, first @ refinement.poses
         self._camera = camera
-        if after.mean() < before.mean() or not joined:
+        if after.mean() < before.mean() or not connected:
             self._poses = poses
             return dict(self.tracks)
-        self.kept = True
+        self.improved = True
         self._halves = [
-            tuple(self._moved(first @ poses) for poses in pair)
-            for pair in refined_by_halves(views, done, _OPTIONS, Priors.none())
+            tuple(self._followed(first @ poses) for poses in pair)
+            for pair in refined_by_halves(views, refinement, _OPTIONS, Priors.none())
         ]
-        return self._moved(self._poses)
+        return self._followed(self._poses)
 
-    def _moved(self, poses: Float64) -> dict[int, Track]:
+    def _followed(self, poses: Float64) -> dict[int, Track]:
         """Return the tracks that follow the refined poses of all views."""
-        start, moved = 0, {}
-        for k in sorted(self._kept):
-            own = self._kept[k]
-            new = poses[start : start + len(own.views)]
-            start += len(own.views)
-            moved[k] = replace(self.tracks[k], poses=followed(self.tracks[k].poses, own.at, new))
-        return moved
+        start, tracks = 0, {}
+        for k in sorted(self._views):
+            camera_views = self._views[k]
+            new_poses = poses[start : start + len(camera_views.views)]
+            start += len(camera_views.views)
+            tracks[k] = replace(
+                self.tracks[k], poses=followed(self.tracks[k].poses, camera_views.rows, new_poses)
+            )
+        return tracks
 
     def systematic(self, k: int, fit: HandEye) -> Float64:
-        """Return the covariance (6, 6) of camera k shown by halves of the images (`split_half`).
+        """Return the covariance (6, 6) of camera k from halves of the images (`split_half`).
 
-        Distortions that all views share bend the common world, and leave no residuals.
+        Distortions common to all views deform the common world, and cause no residuals.
         """
         C = np.zeros((6, 6))
         for halves in self._halves:
-            one, other = (
+            xi_first, xi_second = (
                 se3.log(
                     se3.inverse(fit.T_a_b)
-                    @ hand_eye(tracks[0], tracks[k], fit.time_offset_s, one_world=True).T_a_b
+                    @ hand_eye(tracks[0], tracks[k], fit.time_offset_s, common_world=True).T_a_b
                 )
                 for tracks in halves
             )
-            C -= 0.5 * (np.outer(one, other) + np.outer(other, one))
+            C -= 0.5 * (np.outer(xi_first, xi_second) + np.outer(xi_second, xi_first))
         values, vectors = np.linalg.eigh(C)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, np.float64)
 
     def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
         """See `MovingRig`."""
-        views = [v for k in sorted(self._kept) for v in self._kept[k].views]
+        views = [v for k in sorted(self._views) for v in self._views[k].views]
         return disagreements_of(views, self._camera, self._poses, self._pairs)

@@ -1,7 +1,7 @@
-"""The trajectory of a moving rig: one pose for each instant.
+"""The trajectory of a moving rig: one pose per instant.
 
-Each camera is tracked separately. The mean of their estimates of the rig's pose, weighted by
-covariances, is refined: views of all cameras are compared, those of one instant as one rigid body.
+Each camera is tracked separately. The covariance-weighted mean of their rig poses is refined: views
+of all cameras are compared, those of one instant as one rigid body.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from tofuse.rigs.hand_eye import Track
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
-# Median distance between the surfaces of two cameras, m, and compared pixels, by pair a < b.
-Apart = dict[tuple[int, int], tuple[float, int]]
+# Median distance between the surfaces of two cameras, m, and number of pixels, by pair a < b.
+SurfaceDistances = dict[tuple[int, int], tuple[float, int]]
 
-# Spacing of views, as for a single camera, and their points.
+# Spacing of views, as for a single camera, and their number of points.
 _SPACING = Spacing()
 _POINTS = 1500
 # Variances, m^2 and rad^2, of a pose without a covariance; and the fraction of them that is added
-# to each pose, as even the first one of a track has an error.
-_UNKNOWN, _AT_LEAST = np.array([0.1**2] * 6), 1e-4
-# More neighbours than for one camera, as each camera sees the places of all others.
+# to each pose, as even the first pose of a track has an error.
+_DEFAULT_VARIANCES, _MIN_FRACTION = np.array([0.1**2] * 6), 1e-4
+# More neighbours than for one camera, as each camera observes the same places as the others.
 _OPTIONS = RefineOptions(neighbours=16)
 
 
@@ -53,19 +53,19 @@ class RigTrajectory:
     poses
         (N, 4, 4) T_world_rig of the instants; NaN where no camera has a pose.
     T_rig_frame
-        (F, 4, 4) pose of each image in the rig's frame at its instant: that of its camera, and the
-        motion since, as free-running cameras take images at different times.
+        (F, 4, 4) pose of each image in the rig's frame at its instant: the pose of its camera, and
+        the motion since then, as free-running cameras take images at different times.
     disagreement
         See `MovingRig`.
     measured
-        Measurements of pairs of views, by the index of their frames.
+        Relative poses of view pairs, by the index of their frames.
     tracked
-        Measurements from the cameras' own trajectories, for instants that were not refined.
+        Relative poses from the cameras' own trajectories, for instants that were not refined.
     """
 
     poses: Float64
     T_rig_frame: Float64
-    disagreement: Apart
+    disagreement: SurfaceDistances
     measured: tuple[Measured, ...]
     tracked: tuple[Measured, ...] = ()
 
@@ -80,19 +80,23 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
     """
     source = recording.source
     assert isinstance(source, RigSource)
-    _, first, at = np.unique(
+    _, first, instant = np.unique(
         source.instant[recording.indices], return_index=True, return_inverse=True
     )
-    rig_estimates = [s.at(recording.timestamps) for s in _tracks(cameras, source, progress)]
-    mean = _mean_path([s.some(first) for s in rig_estimates])
-    # Motion within an instant, independent of the cameras' world frames.
-    since = [
-        _RigEstimate(se3.inverse(s.poses[first][at]) @ s.poses, s.information)
-        for s in rig_estimates
+    rig_estimates = [
+        estimate.at(recording.timestamps) for estimate in _tracks(cameras, source, progress)
     ]
-    moved = _means(since)
-    moved = np.where(np.isfinite(moved[:, :1, :1]), moved, np.eye(4))
-    T_rig_frame = moved @ source.T_rig_camera[recording.indices]
+    mean = _mean_trajectory([estimate.subset(first) for estimate in rig_estimates])
+    # Motion within an instant, independent of the cameras' world frames.
+    motions = [
+        _RigEstimate(
+            se3.inverse(estimate.poses[first][instant]) @ estimate.poses, estimate.information
+        )
+        for estimate in rig_estimates
+    ]
+    motion = _weighted_means(motions)
+    motion = np.where(np.isfinite(motion[:, :1, :1]), motion, np.eye(4))
+    T_rig_frame = motion @ source.T_rig_camera[recording.indices]
     if not np.isfinite(mean[:, 0, 0]).any():
         raise InputError(
             "no camera has a pose at the instants that all of them saw",
@@ -100,13 +104,13 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
             remedy="calibrate the clocks again",
         )
     progress.stage("refining the rig")
-    found = refined(cameras, recording, mean, T_rig_frame, at)
-    used = {index for edge in found.measured for index in (edge.i, edge.j)}
-    more = _of_tracking(source, recording, rig_estimates, found.poses, at, used)
-    return replace(found, tracked=tuple(more))
+    trajectory = refined(cameras, recording, mean, T_rig_frame, instant)
+    used = {index for edge in trajectory.measured for index in (edge.i, edge.j)}
+    tracked = _tracking_edges(source, recording, rig_estimates, trajectory.poses, instant, used)
+    return replace(trajectory, tracked=tuple(tracked))
 
 
-def _of_tracking(
+def _tracking_edges(
     source: RigSource,
     recording: Recording,
     rig_estimates: Sequence[_RigEstimate],
@@ -118,23 +122,25 @@ def _of_tracking(
 
     Their information is the sum of that of the cameras' own trajectories.
     """
-    known = np.flatnonzero(np.isfinite(poses[instant][:, 0, 0]))
-    taken = {int(instant[k]) for k in known if int(recording.indices[k]) in used}
-    information = sum(s.information * np.isfinite(s.poses[:, :1, :1]) for s in rig_estimates)
-    found = []
-    for k in known[1:]:
-        here = int(instant[k])
-        if here in taken or source.camera[recording.indices[k]]:
+    posed = np.flatnonzero(np.isfinite(poses[instant][:, 0, 0]))
+    refined = {int(instant[k]) for k in posed if int(recording.indices[k]) in used}
+    information = sum(
+        estimate.information * np.isfinite(estimate.poses[:, :1, :1]) for estimate in rig_estimates
+    )
+    edges = []
+    for k in posed[1:]:
+        row = int(instant[k])
+        if row in refined or source.camera[recording.indices[k]]:
             continue
-        T = se3.inverse(poses[instant[known[0]]]) @ poses[here]
-        ends = int(recording.indices[known[0]]), int(recording.indices[k])
-        found.append(Measured(*ends, T, np.asarray(information, np.float64)[k]))
-    return found
+        T = se3.inverse(poses[instant[posed[0]]]) @ poses[row]
+        ends = int(recording.indices[posed[0]]), int(recording.indices[k])
+        edges.append(Measured(*ends, T, np.asarray(information, np.float64)[k]))
+    return edges
 
 
 @dataclass(frozen=True, eq=False)
 class _RigEstimate:
-    """One camera's estimate of the rig: T_world_rig (N, 4, 4), NaN where unknown, and information.
+    """A camera's estimate of the rig: T_world_rig (N, 4, 4), NaN where unknown, and information.
 
     `information` is (N, 6, 6), of right perturbations.
     """
@@ -142,8 +148,8 @@ class _RigEstimate:
     poses: Float64
     information: Float64
 
-    def some(self, rows: Intp) -> _RigEstimate:
-        """Return only some rows."""
+    def subset(self, rows: Intp) -> _RigEstimate:
+        """Return the estimate at a subset of rows."""
         return _RigEstimate(self.poses[rows], self.information[rows])
 
 
@@ -157,31 +163,33 @@ class _Tracked:
 
     @classmethod
     def of(cls, result: Reconstruction, stated: RigCamera) -> _Tracked:
-        known = result.has_pose
+        posed = result.has_pose
         track = Track.of(result.timestamps + stated.time_offset_s, result.trajectory)
-        unknown = np.diag(_UNKNOWN)
+        default = np.diag(_DEFAULT_VARIANCES)
         C = np.stack(
             [
-                unknown if record.covariance is None else record.covariance + unknown * _AT_LEAST
-                for record, has in zip(result.diagnostics.frames, known, strict=True)
-                if has
+                default
+                if record.covariance is None
+                else record.covariance + default * _MIN_FRACTION
+                for record, has_pose in zip(result.diagnostics.frames, posed, strict=True)
+                if has_pose
             ]
-            or [unknown]
+            or [default]
         )
-        # Covariance of the rig's pose, from that of the camera's.
+        # Transform the covariance from the camera's frame to the rig's.
         A = se3.adjoint(stated.T_rig_camera)
         return cls(track, np.linalg.inv(A @ C @ A.T), stated.T_rig_camera)
 
     def at(self, times: Float64) -> _RigEstimate:
-        T, known = self.track.at(times)
+        T, valid = self.track.at(times)
         T = T @ se3.inverse(self.T_rig_camera)
-        near = np.abs(self.track.times[None] - times[:, None]).argmin(1)
-        return _RigEstimate(np.where(known[:, None, None], T, np.nan), self.information[near])
+        nearest = np.abs(self.track.times[None] - times[:, None]).argmin(1)
+        return _RigEstimate(np.where(valid[:, None, None], T, np.nan), self.information[nearest])
 
 
 def _tracks(cameras: Sequence[Camera], source: RigSource, progress: Progress) -> list[_Tracked]:
-    """Return the cameras that have a trajectory, each in a world frame of its own."""
-    found = []
+    """Return the trajectories of the cameras that have one, each in its own world frame."""
+    tracks = []
     for stated, camera in zip(source.rig.cameras, cameras, strict=True):
         progress.stage(f"tracking {camera.name}")
         result = reconstruct(camera.recording, progress=Silent())
@@ -189,21 +197,21 @@ def _tracks(cameras: Sequence[Camera], source: RigSource, progress: Progress) ->
         if len(tracked.track.times) < 2:
             progress.note(f"{camera.name} has no trajectory")
             continue
-        found.append(tracked)
-    if not found:
+        tracks.append(tracked)
+    if not tracks:
         raise InputError("no camera has a trajectory", where="the rig")
-    return found
+    return tracks
 
 
-def _mean_path(rig_estimates: Sequence[_RigEstimate]) -> Float64:
+def _mean_trajectory(rig_estimates: Sequence[_RigEstimate]) -> Float64:
     """Return (N, 4, 4) T_world_rig, the mean of the estimates in the first one's world frame."""
     first, stacked = rig_estimates[0], [rig_estimates[0]]
     for other in rig_estimates[1:]:
-        both = np.isfinite(first.poses[:, 0, 0]) & np.isfinite(other.poses[:, 0, 0])
-        if both.any():
-            T = _median_pose(first.poses[both] @ se3.inverse(other.poses[both]))
+        common = np.isfinite(first.poses[:, 0, 0]) & np.isfinite(other.poses[:, 0, 0])
+        if common.any():
+            T = _median_pose(first.poses[common] @ se3.inverse(other.poses[common]))
             stacked.append(_RigEstimate(T @ other.poses, other.information))
-    mean = _means(stacked)
+    mean = _weighted_means(stacked)
     rows = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
     return np.asarray(se3.inverse(mean[rows[0]]) @ mean, np.float64) if len(rows) else mean
 
@@ -221,55 +229,59 @@ def refined(
     """
     source = recording.source
     assert isinstance(source, RigSource)
-    chosen = _chosen(cameras, recording, poses, instant)
+    selected = _spaced_instants(cameras, recording, poses, instant)
     views, frames = [], []
-    for frame in np.flatnonzero(np.isin(instant, chosen)):
+    for frame in np.flatnonzero(np.isin(instant, selected)):
         image = _image(recording, int(frame))
         if image is not None:
             camera = cameras[int(source.camera[recording.indices[frame]])]
             views.append(SampledView.of(camera.surface(image), _POINTS))
             frames.append(int(frame))
-    used, of = np.unique(instant[frames], return_inverse=True)
+    used, body = np.unique(instant[frames], return_inverse=True)
     if len(used) < 2:
         return RigTrajectory(poses, T_rig_frame, {}, ())
-    bodies = Bodies(of, T_rig_frame[frames])
-    start = bodies.view_poses(poses[used])
-    done = refine(views, np.asarray(se3.inverse(start[0]) @ start), _OPTIONS, bodies=bodies)
+    bodies = Bodies(body, T_rig_frame[frames])
+    initial = bodies.view_poses(poses[used])
+    refinement = refine(
+        views, np.asarray(se3.inverse(initial[0]) @ initial), _OPTIONS, bodies=bodies
+    )
     count = len(views)
-    of_view = source.camera[recording.indices[frames]]
-    if not len(done.pairs) or support_fell(
-        done.after.of_views(count) - done.before.of_views(count)
+    view_camera = source.camera[recording.indices[frames]]
+    if not len(refinement.pairs) or support_fell(
+        refinement.after.of_views(count) - refinement.before.of_views(count)
     ):
-        apart = disagreements_of(views, of_view, start, done.pairs)
-        return RigTrajectory(poses, T_rig_frame, apart, ())
-    after = bodies.body_poses(start[0] @ done.poses)
-    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+        disagreement = disagreements_of(views, view_camera, initial, refinement.pairs)
+        return RigTrajectory(poses, T_rig_frame, disagreement, ())
+    after = bodies.body_poses(initial[0] @ refinement.poses)
+    posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     out = poses.copy()
-    out[known] = followed(poses[known], np.searchsorted(known, used), after)
-    apart = disagreements_of(views, of_view, done.poses, done.pairs)
-    measured = pairwise_measurements([int(recording.indices[k]) for k in frames], done)
-    out = np.asarray(se3.inverse(out[known[0]]) @ out, np.float64)
-    return RigTrajectory(out, T_rig_frame, apart, measured)
+    out[posed] = followed(poses[posed], np.searchsorted(posed, used), after)
+    disagreement = disagreements_of(views, view_camera, refinement.poses, refinement.pairs)
+    measured = pairwise_measurements([int(recording.indices[k]) for k in frames], refinement)
+    out = np.asarray(se3.inverse(out[posed[0]]) @ out, np.float64)
+    return RigTrajectory(out, T_rig_frame, disagreement, measured)
 
 
-def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp) -> Intp:
-    """Return instants spaced by the motion of the rig, with no more views than are refined."""
-    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
-    frame = _image(recording, int(np.flatnonzero(instant == known[0])[0]))
+def _spaced_instants(
+    cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp
+) -> Intp:
+    """Return instants spaced by the motion of the rig, at most as many as can be refined."""
+    posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    frame = _image(recording, int(np.flatnonzero(instant == posed[0])[0]))
     depth = 1.0
     if frame is not None:
         depth = float(np.median(frame.z[frame.valid]))
     stretch, max_instants = 1.0, max(2, _SPACING.most // len(cameras))
     while True:
-        chosen = [known[0]]
-        for k in known[1:]:
-            motion = se3.inverse(poses[chosen[-1]]) @ poses[k]
-            turned = se3.angle(motion) >= _SPACING.angle * stretch
-            far = np.linalg.norm(motion[:3, 3]) >= _SPACING.distance * stretch * depth
-            if turned or far:
-                chosen.append(k)
-        if len(chosen) <= max_instants:
-            return np.array(chosen, np.intp)
+        selected = [posed[0]]
+        for k in posed[1:]:
+            motion = se3.inverse(poses[selected[-1]]) @ poses[k]
+            rotated = se3.angle(motion) >= _SPACING.angle * stretch
+            translated = np.linalg.norm(motion[:3, 3]) >= _SPACING.distance * stretch * depth
+            if rotated or translated:
+                selected.append(k)
+        if len(selected) <= max_instants:
+            return np.array(selected, np.intp)
         stretch *= 2
 
 
@@ -290,16 +302,20 @@ def _median_pose(poses: Float64) -> Float64:
     return np.asarray(se3.orthonormalise(centre), np.float64)
 
 
-def _means(rig_estimates: Sequence[_RigEstimate]) -> Float64:
+def _weighted_means(rig_estimates: Sequence[_RigEstimate]) -> Float64:
     """Return the (N, 4, 4) information-weighted mean over cameras; NaN where all are unknown."""
-    poses = np.stack([s.poses for s in rig_estimates])
-    known = np.isfinite(poses[..., 0, 0])
-    information = np.stack([s.information for s in rig_estimates]) * known[..., None, None]
-    rows = np.flatnonzero(known.any(0))
-    at = poses[known.argmax(0)[rows], rows]
-    away = se3.log(se3.inverse(at) @ np.where(known[:, rows, None, None], poses[:, rows], at))
-    weighed = (information[:, rows] @ away[..., None]).sum(0)
-    step = np.linalg.solve(information[:, rows].sum(0), weighed)[..., 0]
+    poses = np.stack([estimate.poses for estimate in rig_estimates])
+    valid = np.isfinite(poses[..., 0, 0])
+    information = (
+        np.stack([estimate.information for estimate in rig_estimates]) * valid[..., None, None]
+    )
+    rows = np.flatnonzero(valid.any(0))
+    reference = poses[valid.argmax(0)[rows], rows]
+    deviations = se3.log(
+        se3.inverse(reference) @ np.where(valid[:, rows, None, None], poses[:, rows], reference)
+    )
+    weighted = (information[:, rows] @ deviations[..., None]).sum(0)
+    step = np.linalg.solve(information[:, rows].sum(0), weighted)[..., 0]
     out = np.full(poses.shape[1:], np.nan)
-    out[rows] = at @ se3.exp(step)
+    out[rows] = reference @ se3.exp(step)
     return out

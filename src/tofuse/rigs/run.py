@@ -43,10 +43,10 @@ from tofuse.rigs.rig_trajectory import track_rig
 # No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
 TRAJECTORY = "rig_trajectory.txt"
-# Reason codes that concern only the tracking of a single camera.
-_OF_TRACKING = frozenset({"jumped", "weak_registration", "not_converged", "repeated_images"})
+# Reason codes that apply only to single-camera tracking.
+_TRACKING_REASONS = frozenset({"jumped", "weak_registration", "not_converged", "repeated_images"})
 # Minimum variances of a camera's pose, m^2 and rad^2: 0.1 mm and 0.005 degrees.
-_AT_LEAST = np.array([1e-4**2] * 3 + [np.radians(0.005) ** 2] * 3)
+_MIN_VARIANCES = np.array([1e-4**2] * 3 + [np.radians(0.005) ** 2] * 3)
 # Number of points of a view when the calibration is checked.
 _POINTS = 6000
 
@@ -62,7 +62,7 @@ class RigResult:
     times, poses
         (N,) times of the instants in s, and (N, 4, 4) T_world_rig; NaN where no camera has a pose.
     rig
-        The rig, with the distances between the surfaces of its cameras in these images.
+        The rig, with the distances between the surfaces measured by its cameras in these images.
     """
 
     result: Reconstruction
@@ -95,19 +95,19 @@ def run_rig(
         recordings = [camera.recording for camera in cameras]
         rig = rig_from(rig_file, recordings)
         source = RigSource(rig, recordings)
-        whole = Recording.of(source, " ".join(map(str, inputs)), "rig")
-        recording = _selected(whole, source, options)
+        full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
+        recording = _selected(full_recording, source, options)
         config = resolve(options)
         with OutputFolder(options.out, overwrite=options.overwrite) as folder:
-            found = reconstruct_rig(
+            result = reconstruct_rig(
                 rig, cameras, recording, config, seed=options.seed or 0, progress=progress
             )
             progress.stage("writing")
-            _write(found, recording, folder)
-    return found
+            _write(result, recording, folder)
+    return result
 
 
-def _selected(whole: Recording, source: RigSource, options: Options) -> Recording:
+def _selected(full_recording: Recording, source: RigSource, options: Options) -> Recording:
     """Return the recording of the instants that the options select."""
     count = int(source.instant[-1]) + 1
     chosen = np.arange(count)[slice(options.start, options.end, options.every)]
@@ -117,7 +117,7 @@ def _selected(whole: Recording, source: RigSource, options: Options) -> Recordin
             where="the rig",
             remedy="change --start, --end or --every",
         )
-    return replace(whole, indices=np.flatnonzero(np.isin(source.instant, chosen)))
+    return replace(full_recording, indices=np.flatnonzero(np.isin(source.instant, chosen)))
 
 
 def reconstruct_rig(
@@ -150,18 +150,22 @@ def reconstruct_rig(
     times = recording.timestamps[first]
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
     T_rig_frame = source.T_rig_camera[recording.indices]
-    knocked: list[CameraMotion] = []
+    displaced: list[CameraMotion] = []
     measured: tuple[Measured, ...] = ()
     tracked: tuple[Measured, ...] = ()
     if moves(cameras, motion):
-        found = track_rig(cameras, recording, progress)
-        poses, T_rig_frame, apart = found.poses, found.T_rig_frame, found.disagreement
-        measured, tracked = found.measured, found.tracked
+        trajectory = track_rig(cameras, recording, progress)
+        poses, T_rig_frame, distances = (
+            trajectory.poses,
+            trajectory.T_rig_frame,
+            trajectory.disagreement,
+        )
+        measured, tracked = trajectory.measured, trajectory.tracked
     else:
-        knocked, apart = _checked(rig, cameras, recording)
-    at = np.searchsorted(instants, source.instant[recording.indices])
-    of_frames = poses[at] @ T_rig_frame
-    given = replace(
+        displaced, distances = _check_calibration(rig, cameras, recording)
+    instant = np.searchsorted(instants, source.instant[recording.indices])
+    frame_poses = poses[instant] @ T_rig_frame
+    fusion_config = replace(
         config,
         odometry=GivenPoses(),
         loops=_NO_LOOPS,
@@ -169,25 +173,33 @@ def reconstruct_rig(
         priors=(),
         self_calibration=False,
     )
-    moved = bool(measured or tracked)
-    fixed = _fixed(rig, source, recording, at, of_frames, follow=not moved)
-    sure = replace(given, refinement=AlreadyRefined(measured, (*tracked, *fixed)))
-    result = reconstruct(with_odometry(recording, of_frames), sure, seed=seed, progress=progress)
+    is_moving = bool(measured or tracked)
+    calibration_edges = _calibration_edges(
+        rig, source, recording, instant, frame_poses, follow=not is_moving
+    )
+    refined_config = replace(
+        fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
+    )
+    result = reconstruct(
+        with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
+    )
     names = [camera.name for camera in rig.cameras]
-    of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
+    rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
     result = replace(
-        _as_rig(result, names, source.camera, moves=moved),
-        config=given.to_dict(),
-        recording={**result.recording, "rig": of_rig},
+        _without_tracking_diagnostics(result, names, source.camera, moves=is_moving),
+        config=fusion_config.to_dict(),
+        recording={**result.recording, "rig": rig_fields},
     )
-    between = tuple(
+    pairs = tuple(
         Disagreement(names[a], names[b], median, pixels)
-        for (a, b), (median, pixels) in sorted(apart.items())
+        for (a, b), (median, pixels) in sorted(distances.items())
     )
-    return RigResult(_marked(result, knocked), times, poses, replace(rig, disagreement=between))
+    return RigResult(
+        _with_rig_reason(result, displaced), times, poses, replace(rig, disagreement=pairs)
+    )
 
 
-def _fixed(
+def _calibration_edges(
     rig: Rig,
     source: RigSource,
     recording: Recording,
@@ -196,56 +208,56 @@ def _fixed(
     *,
     follow: bool,
 ) -> list[Measured]:
-    """Return the edges of an instant's frames to that of the first camera, with their covariance.
+    """Return edges from the first camera's frame of each instant to the others, with information.
 
-    Calibration errors are equal at all instants: if the rig is static (`follow`), later frames are
-    tied to the first ones of their cameras.
+    Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
+    are tied to the first frame of their camera.
     """
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
-        c.covariance / UNOBSERVED_ERROR_FACTOR**2 + np.diag(_AT_LEAST) for c in rig.cameras
+        c.covariance / UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES) for c in rig.cameras
     ]
-    covariances[0] = np.diag(_AT_LEAST)
-    known = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
+    covariances[0] = np.diag(_MIN_VARIANCES)
+    posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
-    found: list[Measured] = []
-    first: dict[int, int] = {}
-    seen: dict[int, int] = {}
-    for k in known:
+    edges: list[Measured] = []
+    reference: dict[int, int] = {}
+    first_of_camera: dict[int, int] = {}
+    for k in posed:
         c = int(cameras[k])
-        i = first.setdefault(0 if follow else int(instant[k]), int(k))
+        i = reference.setdefault(0 if follow else int(instant[k]), int(k))
         C = covariances[c]
-        if follow and c in seen:
-            C, i = np.diag(_AT_LEAST), seen[c]
-        seen.setdefault(c, int(k))
+        if follow and c in first_of_camera:
+            C, i = np.diag(_MIN_VARIANCES), first_of_camera[c]
+        first_of_camera.setdefault(c, int(k))
         if i != k:
             T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
             ends = int(recording.indices[i]), int(recording.indices[k])
-            found.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
-    return found
+            edges.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
+    return edges
 
 
-def _as_rig(
+def _without_tracking_diagnostics(
     result: Reconstruction, names: Sequence[str], cameras: Intp, *, moves: bool
 ) -> Reconstruction:
-    """Return the result without diagnostics that concern only single-camera tracking.
+    """Return the result without diagnostics that apply only to single-camera tracking.
 
-    `cameras` are those of all frames, as positions in `names`.
+    `cameras` (F,) are the cameras of all frames, as indices into `names`.
     """
     d = result.diagnostics
-    reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
+    reasons = ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
     worst = d.accuracy.worst
     if not moves and worst is not None:
         name = names[cameras[worst.frame]]
-        reasons = ranked([_of_calibration(r, worst.frame, name) for r in reasons])
+        reasons = ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
     d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
     return replace(result, diagnostics=d)
 
 
-def _of_calibration(reason: Reason, worst: int, name: str) -> Reason:
-    """Return the reason; if poses of static cameras are uncertain, the calibration is.
+def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
+    """Return the reason, attributing uncertain poses of static cameras to the calibration.
 
-    `worst` is the least certain frame, and `name` its camera.
+    `worst` is the frame with the largest uncertainty, and `name` its camera.
     """
     if reason.code != "uncertain_poses":
         return reason
@@ -257,12 +269,12 @@ def _of_calibration(reason: Reason, worst: int, name: str) -> Reason:
     return replace(reason, code="uncertain_rig", text=text)
 
 
-def _checked(
+def _check_calibration(
     rig: Rig, cameras: Sequence[Camera], recording: Recording
 ) -> tuple[list[CameraMotion], dict[tuple[int, int], tuple[float, int]]]:
-    """Return the cameras that differ from the calibration, by aligning their views from there.
+    """Return the cameras that differ from the calibration, after aligning their views.
 
-    Also the distances between the surfaces of each two at the calibrated poses, see `Placed`.
+    Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
     """
     source = recording.source
     assert isinstance(source, RigSource)
@@ -273,43 +285,43 @@ def _checked(
         if isinstance(frame, RangeFrame):
             c = int(source.camera[index])
             views.append(View(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
-    stated = np.stack([camera.T_rig_camera for camera in rig.cameras])
-    placed = refine_together(views, stated)
-    found = tuple(
+    calibrated = np.stack([camera.T_rig_camera for camera in rig.cameras])
+    refined = refine_together(views, calibrated)
+    recalibrated = tuple(
         replace(camera, T_rig_camera=T, covariance=C[:6, :6])
-        for camera, T, C in zip(rig.cameras, placed.poses, placed.covariance, strict=True)
+        for camera, T, C in zip(rig.cameras, refined.poses, refined.covariance, strict=True)
     )
-    knocked = [moved for moved in compare(rig, Rig(found)) if moved.moved]
-    return knocked, disagreements(views, stated)
+    displaced = [motion for motion in compare(rig, Rig(recalibrated)) if motion.moved]
+    return displaced, disagreements(views, calibrated)
 
 
-def _marked(result: Reconstruction, knocked: Sequence[CameraMotion]) -> Reconstruction:
+def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) -> Reconstruction:
     """Return the result with a reason for the cameras that differ from the calibration."""
-    if not knocked:
+    if not displaced:
         return result
     d = result.diagnostics
     changes = ", ".join(
         f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
-        for m in knocked
+        for m in displaced
     )
     text = f"Camera poses differ from those of the rig: {changes}."
-    everything = ((d.frames[0].index, d.frames[-1].index),)
-    reasons = ranked((*d.reasons, Reason("rig_changed", everything, text)))
+    all_frames = ((d.frames[0].index, d.frames[-1].index),)
+    reasons = ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
     verdict = verdict_of(reasons)
     return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
-def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None:
+def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
     from tofuse.report.extras import ReportExtras
     from tofuse.viewer.view_file import write_report_and_view
 
-    def report(result: Reconstruction, here: Path) -> None:
+    def report(result: Reconstruction, target: Path) -> None:
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        write_report_and_view(result, here, ReportExtras(f"rig of {cameras}", rig=found.rig))
-        if result is found.result:
-            known = np.isfinite(found.poses[:, 0, 0])
-            write_tum(here / TRAJECTORY, found.times[known], found.poses[known])
+        write_report_and_view(result, target, ReportExtras(f"rig of {cameras}", rig=rig_result.rig))
+        if result is rig_result.result:
+            posed = np.isfinite(rig_result.poses[:, 0, 0])
+            write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])
 
-    write_result(found.result, folder, report)
+    write_result(rig_result.result, folder, report)

@@ -19,10 +19,10 @@ KEYS = ("range_m", "bias_m", "pixel_bias_m")
 
 @dataclass(frozen=True, eq=False)
 class DepthCorrection:
-    """What is subtracted from the measured radial range.
+    """The bias to subtract from the measured radial range.
 
     The bias of a pixel is a function of the measured range, the same for all pixels, plus a
-    constant of the pixel: the two systematic errors that remain of a modulated camera on a plain
+    constant of the pixel: the two systematic errors of a modulated camera that remain on a plain
     wall, wiggling and the delay along the read-out chain (Lindner and Kolb 2006).
 
     Attributes

@@ -42,16 +42,18 @@ def combined(ranges: Sequence[Float32], periods_m: Sequence[float]) -> tuple[Flo
     best = np.full(stack.shape[1:], np.inf)
     out = np.zeros(stack.shape[1:])
     for k in range(int(np.ceil(limit / P[first]))):
-        guess = stack[first] + k * P[first]
-        near = np.stack([r + np.rint((guess - r) / p) * p for r, p in zip(stack, P, strict=True)])
-        mean = np.tensordot(w, near, 1)
-        error = np.sqrt(np.tensordot(w, (near - mean) ** 2, 1))
-        better = valid & (error < best) & (near >= 0).all(0) & (mean < limit)
+        candidate = stack[first] + k * P[first]
+        unwrapped = np.stack(
+            [r + np.rint((candidate - r) / p) * p for r, p in zip(stack, P, strict=True)]
+        )
+        mean = np.tensordot(w, unwrapped, 1)
+        error = np.sqrt(np.tensordot(w, (unwrapped - mean) ** 2, 1))
+        better = valid & (error < best) & (unwrapped >= 0).all(0) & (mean < limit)
         best[better], out[better] = error[better], mean[better]
-    found = np.isfinite(best)
+    solved = np.isfinite(best)
     return (
-        np.where(found, out, 0).astype(np.float32),
-        np.where(found, best, 0).astype(np.float32),
+        np.where(solved, out, 0).astype(np.float32),
+        np.where(solved, best, 0).astype(np.float32),
     )
 
 
@@ -59,7 +61,7 @@ def _beat(periods: Float64) -> float:
     """Return the joint ambiguity range of two or more periods, to 1 % of the shortest."""
     shortest = periods.min()
     for k in range(1, 1000):
-        at = k * shortest
-        if (np.abs(at / periods - np.rint(at / periods)) * periods < 0.01 * shortest).all():
-            return float(at)
+        beat = k * shortest
+        if (np.abs(beat / periods - np.rint(beat / periods)) * periods < 0.01 * shortest).all():
+            return float(beat)
     return float(1000 * shortest)

@@ -1,16 +1,16 @@
 """Multipath: the light that surfaces reflect onto each other, and the range bias it causes.
 
-The lamp is at the camera and illuminates about what the camera sees, so the reflecting surfaces are
-those that it measures (Fuchs 2010; Jimenez et al. 2012). A pixel measures ``M = D (1 + I / D)``:
-the direct light D, and the indirect light I, which arrives on longer paths with a later phase. The
+The lamp is at the camera and illuminates about its field of view, so the reflecting surfaces are
+the measured ones (Fuchs 2010; Jimenez et al. 2012). A pixel measures ``M = D (1 + I / D)``: the
+direct light D, and the indirect light I, which arrives on longer paths with a larger phase. The
 angle of ``1 + I / D`` is the bias of the phase.
 
 I is the sum over the other surfaces q of ``F L_q exp(i k d)``, with the form factor F, the
 radiosity L_q of q, and the distance d from q to the pixel's surface. L_q is the measured light of q
 without its own I ("one" bounce), or all of it, which includes all further bounces ("all").
 
-Amplitude is proportional to light by the gain of the camera: the counts of a white wall at 1 m. It
-is given, or estimated by `GainEstimator`.
+Amplitude is light times the gain of the camera: the counts of a white wall at 1 m. The gain is
+given, or estimated by `GainEstimator`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tofuse.sensor.multipath_surfaces import (
 Bounces = Literal["one", "all"]
 
 # Relative distance from a plane at which a pixel no longer belongs to it.
-_OFF_PLANE = 0.03
+_PLANE_TOLERANCE = 0.03
 # Upper limit of the ratio of indirect to direct light.
 _MAX_RATIO = 1.0
 
@@ -110,7 +110,7 @@ class MultipathModel:
         self,
         image: ToFImage,
         gain: float,
-        known: ReflectorMap | None = None,
+        reflectors: ReflectorMap | None = None,
         T_world_camera: Float64 | None = None,
     ) -> MultipathEstimate | None:
         """Compute the multipath in an image; None without surfaces.
@@ -121,38 +121,38 @@ class MultipathModel:
             Depth and raw amplitude.
         gain
             Raw amplitude, in counts, of a white wall (albedo 1) at 1 m on the optical axis.
-        known
-            Surfaces outside the image, seen by earlier views.
+        reflectors
+            Surfaces outside the image, measured by earlier views.
         T_world_camera
-            (4, 4) pose of the camera in the frame of `known`, which is not used without it.
+            (4, 4) pose of the camera in the frame of `reflectors`, which are unused without it.
         """
         step = self._step(image)
         nodes = block_nodes(image.z, image.rays, image.amplitude, step)
-        around = OffscreenCells.of(image.rays, self.lamp)
-        if known is not None and T_world_camera is not None:
-            around.add_known(known, T_world_camera)
-        found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=True)
-        if found is None:
+        offscreen = OffscreenCells.of(image.rays, self.lamp)
+        if reflectors is not None and T_world_camera is not None:
+            offscreen.add_reflectors(reflectors, T_world_camera)
+        solution = self._at_nodes(nodes, image.period_m, gain, offscreen, at_edges=True)
+        if solution is None:
             return None
-        shift, ratio, surfaces = found
+        shift, ratio, surfaces = solution
         z, factor = np.empty_like(image.z), np.empty_like(image.z)
-        over = np.abs(1 + ratio)
+        factors = np.abs(1 + ratio)
         run_chunks(
             lambda a, b: kernels.upsample_correction(
-                nodes, shift, over, image.z, image.rays, step, _OFF_PLANE, a, b, z, factor
+                nodes, shift, factors, image.z, image.rays, step, _PLANE_TOLERANCE, a, b, z, factor
             ),
             len(z),
         )
         return MultipathEstimate(z, factor, surfaces, step)
 
-    def bright(self, image: ToFImage) -> float:
+    def bright_albedo(self, image: ToFImage) -> float:
         """Return the 90 % quantile of albedo in counts (facing the camera at 1 m); 0 if unknown."""
         nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         fit_planes(nodes)
-        return Surfaces.of(nodes, np.ones(nodes.shape[:2])).bright()
+        return Surfaces.of(nodes, np.ones(nodes.shape[:2])).bright_albedo()
 
     def flatness(self, image: ToFImage, gain: float) -> float:
-        """Return how flat surfaces are after correction with a gain: the number of coplanar nodes.
+        """Return the number of coplanar nodes after correction with a gain.
 
         Parameters
         ----------
@@ -163,11 +163,11 @@ class MultipathModel:
         """
         nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         measured = ray_ranges(nodes)
-        around = OffscreenCells.of(image.rays, self.lamp)
-        found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=False)
-        if found is None:
+        offscreen = OffscreenCells.of(image.rays, self.lamp)
+        solution = self._at_nodes(nodes, image.period_m, gain, offscreen, at_edges=False)
+        if solution is None:
             return 0.0
-        _correct(nodes, measured, found[0])
+        _correct(nodes, measured, solution[0])
         fit_planes(nodes)
         return kernels.flat_nodes(nodes, 4, 0.1, 0.003)
 
@@ -179,22 +179,22 @@ class MultipathModel:
         nodes: Float64,
         period_m: float,
         gain: float,
-        around: OffscreenCells,
+        offscreen: OffscreenCells,
         *,
         at_edges: bool,
     ) -> tuple[Float64, Complex128, Surfaces] | None:
         """Return bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces.
 
-        Fits planes to the corrected nodes; `W` of the nodes becomes the corrected inverse depth of
-        the last iteration but one. `at_edges`: nodes next to an edge are compared with planes after
-        correction by the bias of those, which is more accurate, but makes surfaces flat with any
-        gain.
+        Fits planes to the corrected nodes, and sets their `W` to the corrected inverse depth of the
+        last iteration but one. `at_edges`: nodes next to an edge are compared with planes after
+        correction by the bias of these planes, which is more accurate, but makes surfaces flat with
+        any gain.
         """
         k = np.pi / period_m
-        seen = nodes[..., W] > 0
+        valid = nodes[..., W] > 0
         measured = ray_ranges(nodes)
-        shift = np.zeros(seen.shape)
-        ratio = np.zeros(seen.shape, complex)
+        shift = np.zeros(valid.shape)
+        ratio = np.zeros(valid.shape, complex)
         for _ in range(self.iterations):
             _correct(nodes, measured, shift)
             if at_edges:
@@ -204,13 +204,13 @@ class MultipathModel:
             surfaces = Surfaces.of(nodes, np.abs(1 + ratio))
             if not (surfaces.good & (surfaces.albedo > 0)).any():
                 return None
-            # The measured phase is that of the way there and back; light leaves after half of it.
+            # The measured phase is that of the round trip; light leaves the surface halfway.
             phase = 2 * k * measured - k * surfaces.range_m
             radiosity = surfaces.radiosity / gain * np.exp(1j * phase)
             if self.bounces == "one":
                 radiosity /= 1 + ratio
             sources = np.concatenate(
-                [visible_sources(surfaces, radiosity), around.sources(surfaces, gain, k)]
+                [visible_sources(surfaces, radiosity), offscreen.sources(surfaces, gain, k)]
             )
             ratio = _indirect_ratio(surfaces, sources, k)
             shift = np.minimum(np.angle(1 + ratio) / (2 * k), measured / 2)
@@ -219,9 +219,9 @@ class MultipathModel:
 
 def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
     """Set the nodes' inverse depth to that of the measured radial range minus its bias."""
-    seen = measured > 0
+    valid = measured > 0
     length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
-    nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
+    nodes[..., W] = np.where(valid, length / np.where(valid, measured - shift, 1), 0)
 
 
 def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
@@ -248,18 +248,17 @@ def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) ->
 class GainEstimator:
     """Estimates the gain of the camera from its images.
 
-    Multipath bends flat surfaces towards the edges in which they meet. Each image is corrected with
-    several gains, and the coplanar nodes are counted for each; counts are summed over images. A
-    prior states that the brightest tenth of the surfaces has an albedo of 0.7, with a standard
-    deviation of 40 %.
+    Multipath bends flat surfaces near concave edges. Each image is corrected with several gains,
+    and the coplanar nodes are counted for each; counts are summed over images. The prior albedo of
+    the brightest tenth of the surfaces is 0.7, with a standard deviation of 40 %.
 
     Attributes
     ----------
-    reflections
-        The model; the estimate uses half as many columns.
+    model
+        The multipath model; the estimate uses half as many columns.
     """
 
-    reflections: MultipathModel
+    model: MultipathModel
     _gains: Float64 = field(default_factory=lambda: np.zeros(0))
     _flat: Float64 = field(default_factory=lambda: np.zeros(0))
     _bright: list[float] = field(default_factory=list)
@@ -267,10 +266,10 @@ class GainEstimator:
 
     ALBEDO = 0.7
     SPREAD = 0.4
-    # Weight of a coplanar node, as neighbouring nodes and similar images are correlated.
+    # Weight of a coplanar node, below 1 as neighbouring nodes and similar images are correlated.
     TRUST = 0.05
     # The first images are all used, then every n-th one, up to a maximum number.
-    FIRST, EVERY, MOST = 4, 8, 40
+    FIRST, EVERY, MAX_IMAGES = 4, 8, 40
 
     @property
     def gain(self) -> float | None:
@@ -286,17 +285,17 @@ class GainEstimator:
 
     def add(self, image: ToFImage) -> None:
         """Use the next image of a recording, or skip it."""
-        turn = self._frames
+        index = self._frames
         self._frames += 1
-        if len(self._bright) >= self.MOST or (turn >= self.FIRST and turn % self.EVERY):
+        if len(self._bright) >= self.MAX_IMAGES or (index >= self.FIRST and index % self.EVERY):
             return
         coarse = MultipathModel(
-            max(8, self.reflections.columns // 2),
-            self.reflections.iterations,
-            self.reflections.lamp,
-            self.reflections.bounces,
+            max(8, self.model.columns // 2),
+            self.model.iterations,
+            self.model.lamp,
+            self.model.bounces,
         )
-        bright = coarse.bright(image)
+        bright = coarse.bright_albedo(image)
         if not bright > 0:
             return
         if not self._bright:

@@ -1,4 +1,4 @@
-"""Illuminated surfaces outside the image: mapped by earlier views, or extrapolated."""
+"""Illuminated surfaces outside the image: mapped from earlier views, or extrapolated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.arrays import Bool, Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import PATCH
-from tofuse.sensor.multipath_surfaces import FALLOFF, LEAST_COSINE, Surfaces
+from tofuse.sensor.multipath_surfaces import FALLOFF, MIN_COSINE, Surfaces
 
 # Upper limit of the illumination angle, rad.
 _MAX_LAMP_ANGLE = np.pi / 3
@@ -20,17 +20,17 @@ _MAX_LAMP_ANGLE = np.pi / 3
 _CELLS = 12
 # Rows and columns of nodes at the image's border that are extrapolated.
 _BORDER = 3
-# Range of the ratio of inverse depths up to which a plane is extrapolated.
-_GROWTH = np.array([0.3, 3.0])
+# Limits of the ratio of inverse depths within which a plane is extrapolated.
+_INVERSE_DEPTH_RATIO = np.array([0.3, 3.0])
 # A view is added when the camera has moved by this angle (rad), or distance relative to the depth,
-# since the last one; and the number of views that are kept.
+# since the last one; and the maximum number of views.
 _ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
 # Smallest cosine of incidence of surfaces that are added.
 _MIN_INCIDENCE = 0.25
 
 
 class ReflectorMap:
-    """Map of the reflecting surfaces seen by recent views, spaced by the motion of the camera."""
+    """Map of the reflecting surfaces of recent views, spaced by the motion of the camera."""
 
     def __init__(self) -> None:
         self._views: deque[Float32] = deque(maxlen=_VIEWS)
@@ -42,14 +42,14 @@ class ReflectorMap:
         """(N, PATCH) in the world frame, see `kernels.multipath.project_patches`."""
         return self._patches
 
-    def add(self, surfaces: Surfaces, trusted: Bool, T_world_camera: Float64) -> None:
-        """Add the surfaces of a view at every other node, unless the last view was near.
+    def add(self, surfaces: Surfaces, static: Bool, T_world_camera: Float64) -> None:
+        """Add the surfaces of a view at every other node, unless the last view was close.
 
         Parameters
         ----------
         surfaces
             Of the view.
-        trusted
+        static
             (Hn, Wn) nodes that belong to the static scene.
         T_world_camera
             (4, 4) pose of the view.
@@ -59,15 +59,15 @@ class ReflectorMap:
             return
         if self._T is not None:
             motion = se3.inverse(self._T) @ T_world_camera
-            reach = _DISTANCE * float(np.median(surfaces.range_m[lit]))
-            if se3.angle(motion) < _ANGLE and np.linalg.norm(motion[:3, 3]) < reach:
+            min_distance = _DISTANCE * float(np.median(surfaces.range_m[lit]))
+            if se3.angle(motion) < _ANGLE and np.linalg.norm(motion[:3, 3]) < min_distance:
                 return
-        pick = np.zeros_like(lit)
-        pick[::2, ::2] = (lit & trusted)[::2, ::2]
+        selected = np.zeros_like(lit)
+        selected[::2, ::2] = (lit & static)[::2, ::2]
         points, normals, albedo = (
-            of[pick] for of in (surfaces.points, surfaces.normals, surfaces.albedo)
+            values[selected] for values in (surfaces.points, surfaces.normals, surfaces.albedo)
         )
-        cosine = -(points * normals).sum(-1) / surfaces.range_m[pick]
+        cosine = -(points * normals).sum(-1) / surfaces.range_m[selected]
         table = np.concatenate([points, normals, albedo[:, None], cosine[:, None]], 1)
         table = table[cosine > _MIN_INCIDENCE]
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
@@ -105,7 +105,7 @@ class OffscreenCells:
 
     @classmethod
     def of(cls, rays: Float32, lamp: float) -> OffscreenCells:
-        """Make the cells around an image.
+        """Build the cells around an image.
 
         Parameters
         ----------
@@ -121,11 +121,11 @@ class OffscreenCells:
         cells = _cells(left - x, top - y, right + x, bottom + y, lamp)
         return cls(*cells, np.zeros((len(cells[1]), 3)), np.zeros(len(cells[1])))
 
-    def add_known(self, known: ReflectorMap, T_world_camera: Float64) -> None:
+    def add_reflectors(self, reflectors: ReflectorMap, T_world_camera: Float64) -> None:
         """Set the planes of the cells that contain surfaces of a map."""
-        if len(self.rays) and len(known.patches):
+        if len(self.rays) and len(reflectors.patches):
             kernels.project_patches(
-                known.patches,
+                reflectors.patches,
                 se3.inverse(T_world_camera),
                 self.rays,
                 self.pitch,
@@ -158,9 +158,9 @@ class OffscreenCells:
             self.albedo / gain,
             surfaces.nodes[border],
             surfaces.albedo[border] / gain,
-            _GROWTH,
+            _INVERSE_DEPTH_RATIO,
             FALLOFF,
-            LEAST_COSINE,
+            MIN_COSINE,
             wave_number,
             out,
         )
@@ -182,9 +182,9 @@ def _cells(
     limit = float(np.tan(min(lamp * corner, _MAX_LAMP_ANGLE)))
     first, last = np.floor((-limit - low) / pitch), np.ceil((limit - low) / pitch)
     i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
-    gi, gj = (g.ravel() for g in np.meshgrid(i, j))
-    outside = (gi < 0) | (gi >= count[0]) | (gj < 0) | (gj >= count[1])
-    rays = low + (np.stack([gi, gj], 1)[outside] + 0.5) * pitch
-    # Cells on the border of the illumination count in part.
+    all_i, all_j = (g.ravel() for g in np.meshgrid(i, j))
+    outside = (all_i < 0) | (all_i >= count[0]) | (all_j < 0) | (all_j >= count[1])
+    rays = low + (np.stack([all_i, all_j], 1)[outside] + 0.5) * pitch
+    # Cells on the border of the illumination are weighted by their illuminated fraction.
     fraction = np.clip((limit - np.sqrt((rays**2).sum(1))) / pitch.mean() + 0.5, 0, 1)
     return pitch, rays[fraction > 0], fraction[fraction > 0]

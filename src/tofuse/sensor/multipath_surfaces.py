@@ -17,10 +17,10 @@ FALLOFF = 4.0
 # Relative distance from the median depth of a block at which a pixel is on another surface.
 _JUMP = 0.03
 # Largest rms misfit of a plane, relative to the depth.
-_FLAT = 0.006
+_MAX_MISFIT = 0.006
 # Lower limit of the cosine of incidence; the direct light of more oblique surfaces is too
 # uncertain.
-LEAST_COSINE = 0.12
+MIN_COSINE = 0.12
 
 
 def block_nodes(z: Float32, rays: Float32, amplitude: Float32, step: int) -> Float64:
@@ -51,7 +51,7 @@ def fit_planes(
     planes = np.zeros((*nodes.shape[:2], 4))
     for radius in (2, 1):
         kernels.window_planes(nodes, radius, planes)
-        kernels.choose_planes(nodes, planes, radius, _FLAT, measured, shift)
+        kernels.choose_planes(nodes, planes, radius, _MAX_MISFIT, measured, shift)
 
 
 def ray_ranges(nodes: Float64) -> Float64:
@@ -109,16 +109,16 @@ class Surfaces:
         points, normals = np.empty((*shape, 3)), np.empty((*shape, 3))
         values = np.empty((5, *shape))
         kernels.surface_radiometry(
-            nodes, factor, FALLOFF, LEAST_COSINE, good, points, normals, values
+            nodes, factor, FALLOFF, MIN_COSINE, good, points, normals, values
         )
         return cls(nodes, good, points, normals, *values)
 
-    def bright(self) -> float:
+    def bright_albedo(self) -> float:
         """Return the area-weighted 90 % quantile of the albedo in counts; 0 if unknown."""
-        pick = self.good & (self.albedo > 0)
-        if not pick.any():
+        valid = self.good & (self.albedo > 0)
+        if not valid.any():
             return 0.0
-        albedo, area = self.albedo[pick], self.area[pick]
+        albedo, area = self.albedo[valid], self.area[valid]
         order = np.argsort(albedo, kind="stable")
         cumulative = np.cumsum(area[order])
         return float(albedo[order][np.searchsorted(cumulative, 0.9 * cumulative[-1])])

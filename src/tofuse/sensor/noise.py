@@ -2,7 +2,7 @@
 
 The phase of a modulated camera is the angle of a phasor of amplitude A, whose two components have
 the same noise: shot noise of the signal, which grows as the root of A, and noise that doesn't
-depend on it (ambient light, read-out). Their ratio gives
+depend on the signal (ambient light, read-out). The ratio of noise and amplitude gives
 
     sigma_r^2 = floor^2 + shot^2 / A + dark^2 / A^2,    A in raw counts
 
@@ -42,11 +42,11 @@ _CODES = {
     "confidence": kernels.BY_CONFIDENCE,
     "camera": kernels.BY_CAMERA,
 }
-# Upper limit of noise in m; larger values are probably in millimetres.
-_LARGEST_M = 5.0
+# Maximum sigma in m; larger values are probably in millimetres.
+_MAX_SIGMA_M = 5.0
 # Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
-_USUAL_AMBIENT = 0.15
-_NONE = np.empty((0, 0), np.float32)
+_TYPICAL_AMBIENT = 0.15
+_NO_IMAGE = np.empty((0, 0), np.float32)
 
 
 class NoisyImage(Protocol):
@@ -88,7 +88,7 @@ class AmplitudeLaw(Bounded):
 
     shot: Annotated[float, Bounds(0)]
     dark: Annotated[float, Bounds(0)]
-    floor: Annotated[float, Bounds(0, _LARGEST_M)] = 0.0
+    floor: Annotated[float, Bounds(0, _MAX_SIGMA_M)] = 0.0
     falloff: Annotated[float, Bounds(0)] = 0.0
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class ConfidenceLaw(Bounded):
     Attributes
     ----------
     sigma_m
-        In m, at 1 m, of the levels 0, 1, ...; must not increase. Higher levels count as the last.
+        In m, at 1 m, for the levels 0, 1, ...; must not increase. Higher levels use the last value.
     power
         Exponent of the range; 0 if sigma depends on the level only.
     """
@@ -115,8 +115,8 @@ class ConfidenceLaw(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         for value in self.sigma_m:
-            if value not in Bounds(0, _LARGEST_M):
-                raise ValueError(f"sigma_m must be {Bounds(0, _LARGEST_M)}, not {value!r}")
+            if value not in Bounds(0, _MAX_SIGMA_M):
+                raise ValueError(f"sigma_m must be {Bounds(0, _MAX_SIGMA_M)}, not {value!r}")
         if any(b > a for a, b in zip(self.sigma_m, self.sigma_m[1:], strict=False)):
             raise ValueError("sigma_m grows with confidence: higher levels must be better")
 
@@ -125,7 +125,7 @@ class ConfidenceLaw(Bounded):
 class RangeLaw(Bounded):
     """``sigma = a + b r^2`` over the radial range r; `a` in m, `b` in 1/m."""
 
-    a: Annotated[float, Bounds(0, _LARGEST_M)]
+    a: Annotated[float, Bounds(0, _MAX_SIGMA_M)]
     b: Annotated[float, Bounds(0, 1)]
 
     def __post_init__(self) -> None:
@@ -139,7 +139,7 @@ class NoiseModel(Bounded):
     """Standard deviation of the radial range of one camera, in m.
 
     A frame with a sigma stated by the camera keeps it. Otherwise the first law applies that the
-    model contains and the frame has the channel for: amplitude, confidence, range.
+    model contains and whose channel the frame has: amplitude, confidence, range.
 
     Attributes
     ----------
@@ -195,8 +195,8 @@ class NoiseModel(Bounded):
             channel = frame.confidence_image.astype(np.float32)
         cosine = incidence_cosine(frame) if incidence is None else np.asarray(incidence, np.float32)
         out = np.empty(frame.depth.shape, np.float32)
-        channel_image = _NONE if channel is None else np.asarray(channel, np.float32)
-        cosine_image = _NONE if cosine is None else cosine
+        channel_image = _NO_IMAGE if channel is None else np.asarray(channel, np.float32)
+        cosine_image = _NO_IMAGE if cosine is None else cosine
         depth, rays = np.asarray(frame.depth, np.float32), frame.camera.rays()
         parameters, levels = self._parameters(), self._levels()
         code, compensated = _CODES[law], frame.amplitude_kind == "range_compensated"
@@ -307,7 +307,7 @@ def of_camera(model: CameraModel) -> NoiseModel:
     The law over the range alone is that of a grey wall (albedo 0.4).
     """
     per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
-    ambient = _USUAL_AMBIENT * model.ambient_electrons
+    ambient = _TYPICAL_AMBIENT * model.ambient_electrons
     dark_electrons2 = (2 * model.read_noise_electrons**2 + ambient) / 2
     shot = per_rad * math.sqrt(gain / (2 * model.modulation_contrast))
     dark = per_rad * gain * math.sqrt(dark_electrons2)

@@ -1,14 +1,14 @@
 """Lens scattering: light that the lens spreads over the image, and the range bias it causes.
 
-Between lens and sensor a fraction of the light is reflected back and forth, and falls on other
-pixels: a bright, near object pulls the range of all others towards its own, in a pattern fixed to
-the image. A pixel measures, as a phasor (amplitude and phase), its own light plus a blurred image
-of all light, modelled by a sum of Gaussians (Mure-Dubois and Huegli 2007)::
+Between lens and sensor a fraction of the light is reflected repeatedly, and reaches other pixels: a
+bright, near object biases the range of all others towards its own, in a pattern fixed to the image.
+A pixel measures, as a phasor (amplitude and phase), its direct light plus a blurred image of all
+light, modelled by a sum of Gaussians (Mure-Dubois and Huegli 2007)::
 
     M = D + sum_i s_i G_i * D
 
 The fractions s_i are observable where an object moves in front of a static background: changes of
-the background that follow the blurred image of the object are due to scattering.
+the background that correlate with the blurred image of the object are due to scattering.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tofuse.arrays import Bool, Complex128, Float64
 # Columns of the coarse image on which the blur is computed.
 _COLUMNS = 44
 # Fixed-point iterations; each is accurate to one more power of the scattered fraction.
-_STEPS = 2
+_ITERATIONS = 2
 # Smallest number of static pixels.
 _MIN_PIXELS = 200
 # Smallest chi^2 that scattering must explain, as the noise of neighbouring pixels is correlated.
@@ -48,20 +48,20 @@ class Scattering:
     widths: tuple[float, ...]
     fractions: tuple[float, ...]
 
-    def removed(self, measured: Complex128) -> Complex128:
+    def without_scatter(self, measured: Complex128) -> Complex128:
         """Return the measured phasors (H, W) without scattered light.
 
         Scattered light varies slowly over the image, so it is computed on a coarse grid.
         """
         step = _coarse_step(measured.shape[1], min(self.widths))
         coarse = _reduce(measured, step)
-        own, scattered = coarse, np.zeros_like(coarse)
-        for _ in range(_STEPS):
+        direct, scattered = coarse, np.zeros_like(coarse)
+        for _ in range(_ITERATIONS):
             scattered = np.zeros_like(coarse)
             for width, fraction in zip(self.widths, self.fractions, strict=True):
                 if fraction:
-                    scattered += fraction * _blur(own, width * measured.shape[1] / step)
-            own = coarse - scattered
+                    scattered += fraction * _blur(direct, width * measured.shape[1] / step)
+            direct = coarse - scattered
         return measured - _enlarge(scattered, step, measured.shape)
 
 
@@ -76,12 +76,12 @@ def blur(phasors: Complex128, width: float) -> Complex128:
 
 
 def _coarse_step(columns: int, width: float) -> int:
-    """Side in pixels of the blocks of the coarse grid, at least two to a standard deviation."""
+    """Return the block side of the coarse grid in pixels, at least two per standard deviation."""
     return max(1, min(columns // _COLUMNS, int(width * columns / 2)))
 
 
 def _reduce(phasors: Complex128, step: int) -> Float64:
-    """Block means (h, w, 2): real and imaginary part."""
+    """Return block means (h, w, 2): real and imaginary part."""
     rows, columns = phasors.shape
     h, w = -(-rows // step), -(-columns // step)
     padded = np.zeros((h * step, w * step, 2))
@@ -104,7 +104,7 @@ def _enlarge(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
 
 
 def estimate_fractions(
-    phasors: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
+    phasors: Complex128, source: Bool, static: Bool, widths: tuple[float, ...]
 ) -> Float64:
     """Estimate the scattered fractions from moving objects in front of a static background.
 
@@ -116,7 +116,7 @@ def estimate_fractions(
     ----------
     phasors
         (N, H, W) phasors.
-    source, still
+    source, static
         (H, W) masks of moving and of static pixels, over all images.
     widths
         See `Scattering`.
@@ -125,31 +125,31 @@ def estimate_fractions(
     -------
     The fraction of each width; all 0 if scattering is insignificant or not observable.
     """
-    none = np.zeros(len(widths))
-    still = still & (phasors != 0).all(0)
-    if np.count_nonzero(still) < _MIN_PIXELS or len(phasors) < 3:
-        return none
-    seen = phasors[:, still]
-    mean = seen.mean(0)
+    zero = np.zeros(len(widths))
+    static = static & (phasors != 0).all(0)
+    if np.count_nonzero(static) < _MIN_PIXELS or len(phasors) < 3:
+        return zero
+    observed = phasors[:, static]
+    mean = observed.mean(0)
 
-    def own_change(values: Complex128) -> Float64:
+    def relative_change(values: Complex128) -> Float64:
         change = values - values.mean(0)
         common = (change * mean.conj()).sum(1) / (np.abs(mean) ** 2).sum()
         change = change - common[:, None] * mean
         return np.concatenate([change.real.ravel(), change.imag.ravel()])
 
     moving = np.where(source, phasors, 0)
-    images = [np.stack([blur(image, width)[still] for image in moving]) for width in widths]
-    A = np.stack([own_change(image) for image in images], 1)
-    b = own_change(seen)
+    images = [np.stack([blur(image, width)[static] for image in moving]) for width in widths]
+    A = np.stack([relative_change(image) for image in images], 1)
+    b = relative_change(observed)
     # einsum, not a matrix product: BLAS may sum differently with more threads.
     H, g = np.einsum("ni,nj->ij", A, A), np.einsum("ni,n->i", A, b)
     if not np.diag(H).all():
-        return none
+        return zero
     scale = 1 / np.sqrt(np.diag(H))
     fractions = nnls(H * np.outer(scale, scale), g * scale)[0] * scale
     explained = float(2 * (fractions * g).sum() - fractions @ H @ fractions)
     noise = float(np.einsum("n,n->", b, b)) - explained
     if not explained * len(b) > _MIN_CHI2 * noise or fractions.sum() > _MAX_FRACTION:
-        return none
+        return zero
     return np.asarray(fractions)

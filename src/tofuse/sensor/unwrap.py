@@ -2,11 +2,11 @@
 
 With the ambiguity range P, a surface at r + P is measured at r. Two cues identify it. Its amplitude
 is that of a far surface: raw amplitude falls with the squared range, so that the albedo implied at
-r is too small by (r / (r + P))^2, a factor of thirty at r = 1 m and P = 5 m. And it is continuous:
-a floor that leaves one period enters the next.
+r is too small by (r / (r + P))^2, a factor of 36 at r = 1 m and P = 5 m. And it is continuous: a
+floor that leaves one period enters the next.
 
-Pixels with a weak signal have random ranges, and would get random wraps. Therefore only pixels that
-measure a surface together with their neighbours (`on_surface`) are unwrapped and used.
+Pixels with a weak signal have random ranges, and would get random wrap counts. Therefore only
+pixels that measure a surface together with their neighbours (`on_surface`) are unwrapped and used.
 
 Both cues are costs of a Markov random field over the image, which is minimised by belief
 propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). For several frequencies
@@ -30,14 +30,14 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.unwrap import pass_messages
 
 # Fraction of pixels that may be brighter than white, due to gloss and noise.
-_GLOSSY = 0.01
+_GLOSSY_FRACTION = 0.01
 # Slopes are differences between blocks at this distance on either side, of the phase averaged over
 # windows of this size; and the lower limit of the cosine of incidence.
-_REACH, _WIDE, _MIN_COSINE = 2, 5, 0.25
-_MAX_MOVES = 100
-# Neighbours on one surface differ by less than this fraction of the period, and more than this
-# fraction of the neighbours do: a random pixel has that many with a probability of 1 % (binomial,
-# 0.2 each).
+_REACH, _WINDOW, _MIN_COSINE = 2, 5, 0.25
+_MAX_ITERATIONS = 100
+# Neighbours on one surface differ by less than this fraction of the period; and the minimum
+# fraction of such neighbours, which a random pixel exceeds with a probability of 1 % (binomial, 0.2
+# each).
 _SAME_SURFACE, _MIN_AGREEING = 0.1, 0.5
 # Smallest number of valid neighbours.
 _MIN_NEIGHBOURS = 3
@@ -98,11 +98,13 @@ def white_amplitude(amplitude: Float32, radial_range: Float32, valid: Bool) -> f
     amplitude, radial_range, valid
         (H, W) raw amplitude, radial range in m, and mask.
     """
-    seen = valid & (amplitude > 0)
-    if not seen.any():
+    valid_amplitude = valid & (amplitude > 0)
+    if not valid_amplitude.any():
         return 0.0
-    at_1_m = amplitude[seen].astype(float) * radial_range[seen].astype(float) ** 2
-    return float(np.quantile(at_1_m, 1 - _GLOSSY))
+    at_1_m = (
+        amplitude[valid_amplitude].astype(float) * radial_range[valid_amplitude].astype(float) ** 2
+    )
+    return float(np.quantile(at_1_m, 1 - _GLOSSY_FRACTION))
 
 
 def on_surface(radial_range: Float32, period_m: float) -> Bool:
@@ -118,22 +120,22 @@ def on_surface(radial_range: Float32, period_m: float) -> Bool:
     period_m
         Ambiguity range.
     """
-    seen = radial_range > 0
-    ranges, known = np.pad(radial_range, 1), np.pad(seen, 1)
-    height, width = seen.shape
-    alike = np.zeros(seen.shape, np.int32)
-    beside = np.zeros(seen.shape, np.int32)
+    valid = radial_range > 0
+    ranges, padded_valid = np.pad(radial_range, 1), np.pad(valid, 1)
+    height, width = valid.shape
+    similar = np.zeros(valid.shape, np.int32)
+    neighbours = np.zeros(valid.shape, np.int32)
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             if not (down or right):
                 continue
-            at = np.s_[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-            away = ranges[at] - radial_range
-            away -= period_m * np.rint(away / period_m)
-            beside += known[at]
-            alike += known[at] & (np.abs(away) < _SAME_SURFACE * period_m)
+            window = np.s_[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+            difference = ranges[window] - radial_range
+            difference -= period_m * np.rint(difference / period_m)
+            neighbours += padded_valid[window]
+            similar += padded_valid[window] & (np.abs(difference) < _SAME_SURFACE * period_m)
     return np.asarray(
-        seen & (beside >= _MIN_NEIGHBOURS) & (alike > _MIN_AGREEING * beside), np.bool_
+        valid & (neighbours >= _MIN_NEIGHBOURS) & (similar > _MIN_AGREEING * neighbours), np.bool_
     )
 
 
@@ -160,7 +162,7 @@ def count_periods(
     pitch
         Angle between neighbouring pixels, rad.
     options
-        See there.
+        See `UnwrapOptions`.
     """
     out = np.zeros(radial_range.shape, np.int32)
     if white <= 0 or not (radial_range > 0).any():
@@ -171,17 +173,17 @@ def count_periods(
     unary = _albedo_cost(blocks, period_m, white, pitch * side, options)
     messages = np.zeros((4, *unary.shape), np.float32)
 
-    def renew(start: int, stop: int, parity: int) -> None:
+    def update(start: int, stop: int, parity: int) -> None:
         pass_messages(
             blocks.range_m, blocks.valid, unary, period_m, options.scale * period_m,
             options.max_difference_cost, 1.0, start, stop, parity, messages,
         )  # fmt: skip
 
     for step in range(2 * options.iterations):
-        run_chunks(partial(renew, parity=step % 2), len(unary))
+        run_chunks(partial(update, parity=step % 2), len(unary))
     best = np.argmin(unary + messages.sum(0), axis=2)
-    best = _with_surfaces_moved(blocks, unary, best, period_m, options)
-    best = _without_unentered(blocks, best, period_m, options)
+    best = _shift_surfaces(blocks, unary, best, period_m, options)
+    best = _reset_isolated(blocks, best, period_m, options)
     return _upsample(surfaces, blocks, best, period_m, side, options.periods)
 
 
@@ -197,21 +199,19 @@ class _Blocks:
     def of(cls, radial_range: Float32, amplitude: Float32, period: float, side: int) -> Self:
         height, width = radial_range.shape
         rows, columns = -(-height // side), -(-width // side)
-        spare = ((0, rows * side - height), (0, columns * side - width))
+        padding = ((0, rows * side - height), (0, columns * side - width))
 
         def summed(image: NDArray[np.floating]) -> Float64:
-            whole = np.pad(image.astype(float), spare)
-            return whole.reshape(rows, side, columns, side).sum((1, 3))
+            padded = np.pad(image.astype(float), padding)
+            return padded.reshape(rows, side, columns, side).sum((1, 3))
 
-        seen = radial_range > 0
+        valid = radial_range > 0
         # Weighted by the root of the amplitude, so that bright surfaces don't dominate dark ones.
-        strength = np.where(seen, np.sqrt(np.maximum(amplitude, 0)) + 1e-3, 0)
+        weight = np.where(valid, np.sqrt(np.maximum(amplitude, 0)) + 1e-3, 0)
         phase = 2 * np.pi * radial_range.astype(float) / period
-        range_m = _range_of(
-            summed(strength * np.cos(phase)), summed(strength * np.sin(phase)), period
-        )
-        count = summed(seen.astype(float))
-        mean = summed(np.where(seen, amplitude, 0)) / np.maximum(count, 1)
+        range_m = _range_of(summed(weight * np.cos(phase)), summed(weight * np.sin(phase)), period)
+        count = summed(valid.astype(float))
+        mean = summed(np.where(valid, amplitude, 0)) / np.maximum(count, 1)
         return cls(range_m, mean.astype(np.float32), count >= 0.5 * side * side)
 
 
@@ -225,17 +225,17 @@ def _albedo_cost(
 ) -> Float32:
     """Return the cost (h, w, K) of each wrap count by the albedo that it implies."""
     phase = 2 * np.pi * blocks.range_m.astype(float) / period
-    real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WIDE)
-    imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WIDE)
+    real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WINDOW)
+    imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WINDOW)
     slope = _slope(_range_of(real, imaginary, period), period) / pitch
     cost = np.empty((*blocks.range_m.shape, options.periods + 1), np.float32)
     for k in range(options.periods + 1):
-        beyond = np.maximum(blocks.range_m + k * period, 1e-6)
+        unwrapped = np.maximum(blocks.range_m + k * period, 1e-6)
         # The slope implied by neighbouring ranges depends on the size of a pixel at that range.
-        cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _MIN_COSINE)
-        albedo = np.maximum(blocks.amplitude * beyond**2 / (white * cosine), 1e-6)
-        unlikely = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
-        cost[..., k] = np.minimum(unlikely, options.max_albedo_cost) + options.wrap_cost * k
+        cosine = np.maximum(1 / np.sqrt(1 + (slope / unwrapped) ** 2), _MIN_COSINE)
+        albedo = np.maximum(blocks.amplitude * unwrapped**2 / (white * cosine), 1e-6)
+        prior_cost = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
+        cost[..., k] = np.minimum(prior_cost, options.max_albedo_cost) + options.wrap_cost * k
     return np.float32(options.albedo_weight) * cost
 
 
@@ -243,8 +243,8 @@ def _slope(range_m: Float32, period: float) -> Float32:
     """Return the gradient magnitude (h, w) of the range per block, modulo the period."""
     squares = np.zeros(range_m.shape, np.float32)
     for axis in (0, 1):
-        wide = [(_REACH, _REACH) if a == axis else (0, 0) for a in (0, 1)]
-        padded = np.pad(range_m, wide, "edge")
+        padding = [(_REACH, _REACH) if a == axis else (0, 0) for a in (0, 1)]
+        padded = np.pad(range_m, padding, "edge")
         count = padded.shape[axis]
         ahead = np.take(padded, np.arange(2 * _REACH, count), axis)
         difference = ahead - np.take(padded, np.arange(count - 2 * _REACH), axis)
@@ -253,81 +253,96 @@ def _slope(range_m: Float32, period: float) -> Float32:
     return np.sqrt(squares)
 
 
-def _with_surfaces_moved(
+def _shift_surfaces(
     blocks: _Blocks, unary: Float32, best: Intp, period: float, options: UnwrapOptions
 ) -> Intp:
-    """Shift whole surfaces by periods while that decreases the cost.
+    """Shift entire surfaces by periods while that decreases the cost.
 
-    Loopy belief propagation may converge with a part of a surface a period off. Surfaces are the
-    components connected without jumps. Those with the largest gain are shifted first, and none that
-    is adjacent to one shifted in the same iteration.
+    Loopy belief propagation may converge with part of a surface wrong by a period. Surfaces are the
+    components connected without jumps. Those with the largest gain are shifted first, and adjacent
+    ones never in the same iteration.
     """
     height, width = best.shape
     index = np.arange(height * width).reshape(height, width)
-    beside = ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:]))
-    a, b = (np.concatenate([pair[side].ravel() for pair in beside]) for side in (0, 1))
-    known = blocks.valid.ravel()
-    a, b = a[known[a] & known[b]], b[known[a] & known[b]]
+    adjacent = ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:]))
+    a, b = (np.concatenate([pair[side].ravel() for pair in adjacent]) for side in (0, 1))
+    valid = blocks.valid.ravel()
+    a, b = a[valid[a] & valid[b]], b[valid[a] & valid[b]]
     range_m, costs = blocks.range_m.ravel().astype(float), unary.reshape(-1, unary.shape[2])
     periods = best.ravel().copy()
-    most = unary.shape[2] - 1
-    shifts = [s for s in range(-most, most + 1) if s]
+    max_periods = unary.shape[2] - 1
+    shifts = [s for s in range(-max_periods, max_periods + 1) if s]
 
-    def jump(difference: Float64) -> Float64:
-        away = np.abs(difference) / (options.scale * period)
-        return np.minimum(away, options.max_difference_cost)
+    def difference_cost(difference: Float64) -> Float64:
+        scaled = np.abs(difference) / (options.scale * period)
+        return np.minimum(scaled, options.max_difference_cost)
 
-    for _ in range(_MAX_MOVES):
-        at = range_m + periods * period
-        difference = at[b] - at[a]
-        now = jump(difference)
-        joined = now < options.max_difference_cost
-        graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), (index.size, index.size))
-        count, piece = connected_components(graph, directed=False)
-        cut = piece[a] != piece[b]
-        pa, pb, gap, paid = piece[a][cut], piece[b][cut], difference[cut], now[cut]
-        gain, move = np.zeros(count), np.zeros(count, np.intp)
+    for _ in range(_MAX_ITERATIONS):
+        unwrapped = range_m + periods * period
+        difference = unwrapped[b] - unwrapped[a]
+        edge_cost = difference_cost(difference)
+        connected = edge_cost < options.max_difference_cost
+        graph = coo_array(
+            (np.ones(connected.sum()), (a[connected], b[connected])), (index.size, index.size)
+        )
+        count, surface = connected_components(graph, directed=False)
+        crossing = surface[a] != surface[b]
+        surface_a, surface_b, boundary_difference, boundary_cost = (
+            surface[a][crossing],
+            surface[b][crossing],
+            difference[crossing],
+            edge_cost[crossing],
+        )
+        gain, moves = np.zeros(count), np.zeros(count, np.intp)
         for shift in shifts:
-            to = periods + shift
-            inside = (to >= 0) & (to <= most)
-            change = costs[np.arange(index.size), np.clip(to, 0, most)]
+            shifted = periods + shift
+            allowed = (shifted >= 0) & (shifted <= max_periods)
+            change = costs[np.arange(index.size), np.clip(shifted, 0, max_periods)]
             change = change - costs[np.arange(index.size), periods]
-            total = np.bincount(piece, np.where(known, change, 0), count)
-            total += np.bincount(pa, jump(gap - shift * period) - paid, count)
-            total += np.bincount(pb, jump(gap + shift * period) - paid, count)
-            total[piece[known & ~inside]] = np.inf
+            total = np.bincount(surface, np.where(valid, change, 0), count)
+            total += np.bincount(
+                surface_a,
+                difference_cost(boundary_difference - shift * period) - boundary_cost,
+                count,
+            )
+            total += np.bincount(
+                surface_b,
+                difference_cost(boundary_difference + shift * period) - boundary_cost,
+                count,
+            )
+            total[surface[valid & ~allowed]] = np.inf
             better = -total > gain + 1e-6
-            gain[better], move[better] = -total[better], shift
-        if not move.any():
+            gain[better], moves[better] = -total[better], shift
+        if not moves.any():
             break
         # Only those with a larger gain than their neighbours; ties go to the first.
         order = np.lexsort((np.arange(count), -gain))
         rank = np.empty(count, np.intp)
         rank[order] = np.arange(count)
         first = rank.copy()
-        np.minimum.at(first, pa, rank[pb])
-        np.minimum.at(first, pb, rank[pa])
-        move[first < rank] = 0
-        periods = np.where(known, periods + move[piece], periods)
+        np.minimum.at(first, surface_a, rank[surface_b])
+        np.minimum.at(first, surface_b, rank[surface_a])
+        moves[first < rank] = 0
+        periods = np.where(valid, periods + moves[surface], periods)
     return periods.reshape(best.shape)
 
 
-def _without_unentered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
-    """Reset wrapped components that no surface continues into across the period."""
-    moved = (best > 0) & blocks.valid
-    pieces, count = label(moved)
-    rim = np.zeros(count + 1)
+def _reset_isolated(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
+    """Reset wrapped components that continue no unwrapped surface across the period."""
+    wrapped = (best > 0) & blocks.valid
+    components, count = label(wrapped)
+    boundary = np.zeros(count + 1)
     entries = np.zeros(count + 1)
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         for inside, outside in ((a, b), (b, a)):
-            edge = moved[inside] & ~moved[outside] & blocks.valid[outside]
-            far = blocks.range_m[inside] + best[inside] * period
-            near = blocks.range_m[outside] + best[outside] * period
-            goes_on = edge & (np.abs(far - near) < options.scale * period)
-            rim += np.bincount(pieces[inside][edge], minlength=count + 1)
-            entries += np.bincount(pieces[inside][goes_on], minlength=count + 1)
-    kept = entries > np.maximum(options.min_entry * rim, 2)
-    return np.where(kept[pieces], best, 0)
+            border = wrapped[inside] & ~wrapped[outside] & blocks.valid[outside]
+            range_inside = blocks.range_m[inside] + best[inside] * period
+            range_outside = blocks.range_m[outside] + best[outside] * period
+            continues = border & (np.abs(range_inside - range_outside) < options.scale * period)
+            boundary += np.bincount(components[inside][border], minlength=count + 1)
+            entries += np.bincount(components[inside][continues], minlength=count + 1)
+    kept = entries > np.maximum(options.min_entry * boundary, 2)
+    return np.where(kept[components], best, 0)
 
 
 def _upsample(
@@ -336,9 +351,9 @@ def _upsample(
     best: Intp,
     period: float,
     side: int,
-    most: int,
+    max_periods: int,
 ) -> Int32:
-    """Return the wrap count (H, W) of pixels: that of the nearest block in range around them."""
+    """Return the wrap count (H, W) of pixels: that of the adjacent block closest in range."""
     height, width = radial_range.shape
     rows, columns = best.shape
     out = np.zeros((height, width), np.int64)
@@ -346,14 +361,16 @@ def _upsample(
     at_row, at_column = np.arange(height) // side, np.arange(width) // side
     for down in (0, -1, 1):
         for right in (0, -1, 1):
-            here = np.ix_(
+            block = np.ix_(
                 np.clip(at_row + down, 0, rows - 1), np.clip(at_column + right, 0, columns - 1)
             )
-            difference = blocks.range_m[here] - radial_range
-            across = np.rint(difference / period)
+            difference = blocks.range_m[block] - radial_range
+            periods = np.rint(difference / period)
             # A pixel's own block is preferred unless another one is clearly nearer.
-            off = np.abs(difference - across * period) + (0.02 * period if down or right else 0)
-            better = blocks.valid[here] & (off < nearest)
-            out[better] = (best[here] + across.astype(np.int64))[better]
-            nearest[better] = off[better]
-    return np.where(radial_range > 0, np.clip(out, 0, most), 0).astype(np.int32)
+            distance = np.abs(difference - periods * period) + (
+                0.02 * period if down or right else 0
+            )
+            better = blocks.valid[block] & (distance < nearest)
+            out[better] = (best[block] + periods.astype(np.int64))[better]
+            nearest[better] = distance[better]
+    return np.where(radial_range > 0, np.clip(out, 0, max_periods), 0).astype(np.int32)

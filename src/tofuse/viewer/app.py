@@ -40,7 +40,7 @@ BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (
 FOV = 2 * float(np.arctan(0.5))  # of camera frusta as drawn
 _TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 _REASONS = 4
-_FAR = 1.8  # cameras are not framed if that enlarges the model's box by more
+_MAX_EXTENT_RATIO = 1.8  # cameras are not framed if that enlarges the model's box more
 
 
 class ResultView:
@@ -65,7 +65,7 @@ class ResultView:
         self._measuring = False
         layers = [la for la in (result.mesh, result.cloud) if la is not None]
         self._scale = _place_camera(server, result)
-        self._by = (colorings(layers) or ["height"])[0]
+        self._coloring = (colorings(layers) or ["height"])[0]
         self._model: dict[str, Any] = {}
         server.gui.main_panel.dock_right()
         with server.atomic():
@@ -101,10 +101,10 @@ class ResultView:
             models |= {p.name: p for p in sorted(main.glob("component-*")) if is_result(p)}
         if len(models) < 2:
             return
-        here = next(name for name, path in models.items() if path == folder)
-        choice = gui.add_dropdown("Model", tuple(models), initial_value=here)
+        current = next(name for name, path in models.items() if path == folder)
+        choice = gui.add_dropdown("Model", tuple(models), initial_value=current)
         frames = [f["index"] for f in self._result.frames]
-        if frames and here != "main model":
+        if frames and current != "main model":
             gui.add_markdown(f"Its frames: {frame_range(min(frames), max(frames))}.")
 
         @choice.on_update
@@ -151,15 +151,17 @@ class ResultView:
     def _add_toggles(self, choices: list[str]) -> None:
         gui, result = self._server.gui, self._result
         with gui.add_folder("Show"):
-            self._shown = {}
-            self._drawn: dict[str, Any] = {}
-            surface = result.mesh is not None and len(result.mesh.points) > 0
-            if surface:
-                self._shown["surface"] = gui.add_checkbox("Surface", True)
-            self._shown["points"] = gui.add_checkbox("Points", not surface)
+            self._layer_toggles = {}
+            self._line_toggles: dict[str, Any] = {}
+            has_surface = result.mesh is not None and len(result.mesh.points) > 0
+            if has_surface:
+                self._layer_toggles["surface"] = gui.add_checkbox("Surface", True)
+            self._layer_toggles["points"] = gui.add_checkbox("Points", not has_surface)
             if result.model_before is not None:
-                self._shown["model before"] = gui.add_checkbox("Points before optimisation", False)
-            for handle in self._shown.values():
+                self._layer_toggles["model before"] = gui.add_checkbox(
+                    "Points before optimisation", False
+                )
+            for handle in self._layer_toggles.values():
                 handle.on_update(self._repaint)
             for name, label in (
                 ("after", "Cameras"),
@@ -167,18 +169,18 @@ class ResultView:
                 ("loops", "Loop closures"),
             ):
                 if name in self._lines:
-                    box = gui.add_checkbox(label, name == "after" or name == "loops")
-                    box.on_update(self._toggle(name))
-                    self._drawn[name] = box
+                    checkbox = gui.add_checkbox(label, name == "after" or name == "loops")
+                    checkbox.on_update(self._toggle_lines(name))
+                    self._line_toggles[name] = checkbox
             rig = result.rig
             if rig is not None:
                 gui.add_html(_rig_legend(rig))
             if len(choices) > 1:
-                self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._by)
+                self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._coloring)
                 self._choice.on_update(self._recolor)
             self._legend = gui.add_html("")
 
-    def _toggle(self, name: str) -> Any:
+    def _toggle_lines(self, name: str) -> Any:
         def toggle(event: GuiEvent[Any]) -> None:
             self._lines[name].visible = bool(event.target.value)
 
@@ -190,13 +192,13 @@ class ResultView:
 
     def _recolor(self, event: GuiEvent[Any]) -> None:
         with self._lock:
-            self._by = str(event.target.value)
+            self._coloring = str(event.target.value)
             for handle in self._model.values():
                 handle.remove()
             self._model.clear()
             self._paint()
 
-    def _visible(self) -> dict[str, Layer]:
+    def _visible_layers(self) -> dict[str, Layer]:
         """The visible layers of the model, by name."""
         layers = {
             "surface": self._result.mesh,
@@ -206,18 +208,18 @@ class ResultView:
         return {
             name: layer
             for name, layer in layers.items()
-            if layer is not None and name in self._shown and self._shown[name].value
+            if layer is not None and name in self._layer_toggles and self._layer_toggles[name].value
         }
 
     def _paint(self) -> None:
-        """Show the chosen layers; those that clients already have are not sent again."""
-        visible = self._visible()
+        """Show the visible layers; those that clients already have are not sent again."""
+        visible = self._visible_layers()
         for name, handle in self._model.items():
             handle.visible = name in visible
         scale: ColorBar | None = None
         for name, layer in visible.items():
-            by = "colour" if name == "model before" else self._by
-            colors, bar = layer_colors(layer, by, self._result.up)
+            coloring = "colour" if name == "model before" else self._coloring
+            colors, bar = layer_colors(layer, coloring, self._result.up)
             scale = bar or scale
             if name not in self._model and len(layer.points):
                 self._model[name] = self._add_layer(name, layer, colors)
@@ -226,9 +228,11 @@ class ResultView:
     def _add_layer(self, name: str, layer: Layer, colors: UInt8) -> Any:
         scene = self._server.scene
         if name == "surface" and self._result.tiles is not None:
-            by, up = self._by, self._result.up
+            coloring, up = self._coloring, self._result.up
             return TiledSurface(
-                self._server, self._result.tiles, lambda part: layer_colors(part, by, up, layer)[0]
+                self._server,
+                self._result.tiles,
+                lambda part: layer_colors(part, coloring, up, layer)[0],
             )
         if layer.faces is None:
             return scene.add_point_cloud(
@@ -307,8 +311,8 @@ class ResultView:
         # Camera frusta would occlude the model.
         if self._camera is not None:
             self._camera.visible = False
-        for box in self._drawn.values():
-            box.value = False
+        for checkbox in self._line_toggles.values():
+            checkbox.value = False
         event.client.camera.wxyz = wxyz(T)
         event.client.camera.position = T[:3, 3]
 
@@ -334,15 +338,15 @@ class ResultView:
         with self._lock:
             if not self._measuring:
                 return
-            layers = self._visible()
+            layers = self._visible_layers()
             tiled = self._model.get("surface")
             if "surface" in layers and isinstance(tiled, TiledSurface):
                 layers["surface"] = tiled.layer_along(event.ray_origin, event.ray_direction)
-            found = pick(list(layers.values()), event.ray_origin, event.ray_direction)
-            if found is None:
+            picked = pick(list(layers.values()), event.ray_origin, event.ray_direction)
+            if picked is None:
                 self._measured.content = "No surface there: click the model."
                 return
-            point = found.point
+            point = picked.point
             scene = self._server.scene
             scene.add_icosphere(
                 f"/distance/{len(self.ends)}",
@@ -353,7 +357,7 @@ class ResultView:
                 receive_shadow=False,
             )
             self.ends.append(point)
-            self._sigmas.append(found.sigma)
+            self._sigmas.append(picked.sigma)
             if len(self.ends) == 1:
                 self._measured.content = "Click the second point."
                 return
@@ -374,26 +378,26 @@ class ResultView:
 
 
 def _camera_segments(
-    poses: dict[int, Float64], edge: float, color: tuple[int, int, int], of: ViewContent | None
+    poses: dict[int, Float64], edge: float, color: tuple[int, int, int], content: ViewContent | None
 ) -> tuple[Float32, Any]:
     """Line segments (L, 2, 3) of camera frusta, and their colours; for a rig, one per camera."""
-    rig = None if of is None else of.rig
-    if of is None or rig is None:
-        stack = np.stack([poses[k] for k in sorted(poses)])
-        step = -(-len(stack) // MAX_CAMERAS)
-        return camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32), color
-    camera = dict(zip((f["index"] for f in of.frames), rig.of_frames.tolist(), strict=True))
+    rig = None if content is None else content.rig
+    if content is None or rig is None:
+        all_poses = np.stack([poses[k] for k in sorted(poses)])
+        step = -(-len(all_poses) // MAX_CAMERAS)
+        return camera_lines(all_poses, edge, step).reshape(-1, 2, 3).astype(np.float32), color
+    camera = dict(zip((f["index"] for f in content.frames), rig.of_frames.tolist(), strict=True))
     # viser expects linear colours per vertex, but sRGB for a single colour.
-    light = (linear(np.array(rig.colors, np.uint8))[:, :3] // 257).astype(np.uint8)
+    linear_colors = (linear(np.array(rig.colors, np.uint8))[:, :3] // 257).astype(np.uint8)
     ends, colors = [], []
     for number in range(len(rig.names)):
-        mine = [poses[k] for k in sorted(poses) if camera[k] == number]
-        if not mine:
+        camera_poses = [poses[k] for k in sorted(poses) if camera[k] == number]
+        if not camera_poses:
             continue
-        step = -(-len(mine) * len(rig.names) // MAX_CAMERAS)
-        lines = camera_lines(np.stack(mine), edge, step).reshape(-1, 2, 3)
+        step = -(-len(camera_poses) * len(rig.names) // MAX_CAMERAS)
+        lines = camera_lines(np.stack(camera_poses), edge, step).reshape(-1, 2, 3)
         ends.append(lines)
-        colors.append(np.broadcast_to(light[number], lines.shape))
+        colors.append(np.broadcast_to(linear_colors[number], lines.shape))
     return np.concatenate(ends).astype(np.float32), np.concatenate(colors)
 
 
@@ -415,10 +419,12 @@ def _place_camera(server: ViserServer, result: ViewContent) -> float:
     low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
     if result.after:
         centers = np.stack([T[:3, 3] for T in result.after.values()])
-        wide = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
-        # Cameras far around an object would make it small.
-        if np.linalg.norm(wide[1] - wide[0]) <= _FAR * np.linalg.norm(high - low):
-            low, high = wide
+        extended = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+        # Distant cameras around an object would make it small.
+        if np.linalg.norm(extended[1] - extended[0]) <= _MAX_EXTENT_RATIO * np.linalg.norm(
+            high - low
+        ):
+            low, high = extended
     size = max(float(np.linalg.norm(high - low)), 1e-2)
     forward = np.array([0.0, 0.0, 1.0])
     forward -= result.up * (forward @ result.up)
@@ -426,15 +432,15 @@ def _place_camera(server: ViserServer, result: ViewContent) -> float:
         forward = np.cross(result.up, [1.0, 0.0, 0.0])
     forward /= np.linalg.norm(forward)
     side = np.cross(forward, result.up)
-    middle = (low + high) / 2
-    place = middle + size * (0.6 * result.up - 0.6 * forward + 0.3 * side)
+    centre = (low + high) / 2
+    position = centre + size * (0.6 * result.up - 0.6 * forward + 0.3 * side)
     server.scene.set_up_direction(result.up)
-    server.initial_camera.look_at = middle
-    server.initial_camera.position = place
+    server.initial_camera.look_at = centre
+    server.initial_camera.position = position
     for client in server.get_clients().values():  # those that watched the run
         client.camera.up_direction = result.up
-        client.camera.position = place
-        client.camera.look_at = middle
+        client.camera.position = position
+        client.camera.look_at = centre
     return size
 
 
@@ -443,9 +449,9 @@ def _point_size(points: Float32) -> float:
 
     if len(points) < 2:
         return 0.01
-    sample = points[:: max(1, len(points) // 2000)]
-    near, _ = cKDTree(points).query(sample, k=2)
-    return float(max(1.3 * np.median(near[:, 1]), 1e-4))
+    sampled = points[:: max(1, len(points) // 2000)]
+    distances, _ = cKDTree(points).query(sampled, k=2)
+    return float(max(1.3 * np.median(distances[:, 1]), 1e-4))
 
 
 def _nearest(pictures: tuple[Pictures, ...], index: int) -> Pictures | None:

@@ -38,7 +38,7 @@ MAX_FACES = 500_000  # that a browser renders smoothly
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Points, or a surface, with the values that they can be coloured by.
+    """Points, or a surface, with the values by which they can be coloured.
 
     Attributes
     ----------
@@ -84,17 +84,17 @@ class Layer:
         color = None if self.color is None else seen_colors(self.color)
         sigma = np.zeros(n) if self.sigma is None else self.sigma
         views = np.zeros(n) if self.views is None else self.views
-        small = Mesh(
+        simplified = Mesh(
             self.points, self.faces, self.normals, color, sigma.astype(np.float32),
             views.astype(np.int32), np.zeros(3),
         ).clustered(faces)  # fmt: skip
         return Layer(
-            small.vertices,
-            small.normals,
-            small.faces,
-            small.color,
-            None if self.sigma is None else small.sigma.astype(float),
-            None if self.views is None else small.views.astype(float),
+            simplified.vertices,
+            simplified.normals,
+            simplified.faces,
+            simplified.color,
+            None if self.sigma is None else simplified.sigma.astype(float),
+            None if self.views is None else simplified.views.astype(float),
         )
 
 
@@ -126,18 +126,18 @@ class TiledLayer:
         assert tile.content is not None
         glb = read_glb(self.folder / tile.content)
         R = self.R_up_world.astype(np.float32)
-        known = {name: glb.scalars[name].astype(float) for name in glb.scalars}
+        scalars = {name: glb.scalars[name].astype(float) for name in glb.scalars}
         return Layer(
             glb.points.astype(np.float32) @ R,
             None if glb.normals is None else glb.normals.astype(np.float32) @ R,
             glb.faces,
             glb.color,
-            known.get("sigma"),
-            known.get("views"),
+            scalars.get("sigma"),
+            scalars.get("views"),
         )
 
     def overview(self) -> Layer:
-        """The whole surface with few triangles; InputError if tiles are missing or damaged."""
+        """The full surface with few triangles; InputError if tiles are missing or damaged."""
         layers = [self.layer(tile) for tile in select_tiles(self.root, None, OVERVIEW_FACES)]
         if not layers:
             raise InputError(
@@ -149,29 +149,29 @@ class TiledLayer:
 def merge_layers(layers: Sequence[Layer]) -> Layer:
     """Merge layers with faces; the result has the values that all of them have."""
 
-    def column(values: list[NDArray[Any] | None]) -> Any:
-        known = [each for each in values if each is not None]
-        return np.concatenate(known) if len(known) == len(layers) else None
+    def concatenated(values: list[NDArray[Any] | None]) -> Any:
+        present = [item for item in values if item is not None]
+        return np.concatenate(present) if len(present) == len(layers) else None
 
-    firsts = np.cumsum([0] + [len(layer.points) for layer in layers])
+    offsets = np.cumsum([0] + [len(layer.points) for layer in layers])
     faces = [
-        layer.faces + np.int32(first)
-        for layer, first in zip(layers, firsts, strict=False)
+        layer.faces + np.int32(offset)
+        for layer, offset in zip(layers, offsets, strict=False)
         if layer.faces is not None
     ]
     return Layer(
         np.concatenate([layer.points for layer in layers]),
-        column([layer.normals for layer in layers]),
+        concatenated([layer.normals for layer in layers]),
         np.concatenate(faces),
-        column([layer.color for layer in layers]),
-        column([layer.sigma for layer in layers]),
-        column([layer.views for layer in layers]),
+        concatenated([layer.color for layer in layers]),
+        concatenated([layer.sigma for layer in layers]),
+        concatenated([layer.views for layer in layers]),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class ViewContent:
-    """A result as the viewer shows it.
+    """The content of a result in the viewer.
 
     Attributes
     ----------
@@ -253,19 +253,19 @@ def read_content(folder: Path) -> ViewContent:
         mesh = None
         if (folder / "mesh.ply").is_file():
             mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
-    kept = read_view_file(folder)
+    view_file = read_view_file(folder)
     model_before = None
-    if kept is not None and len(kept.points):
-        model_before = Layer(kept.points, None, None, kept.color, None, None)
+    if view_file is not None and len(view_file.points):
+        model_before = Layer(view_file.points, None, None, view_file.color, None, None)
     content = ViewContent(
         folder,
         run,
         cloud,
         mesh,
         after,
-        {} if kept is None else kept.before,
+        {} if view_file is None else view_file.before,
         model_before,
-        () if kept is None else kept.pictures,
+        () if view_file is None else view_file.pictures,
         rotation_up_world(run, folder / "run.json")[1],
         tiled,
     )
@@ -275,7 +275,7 @@ def read_content(folder: Path) -> ViewContent:
 
 
 def _check_fields(content: ViewContent) -> None:
-    """Read the fields that the viewer shows; KeyError, TypeError or the like if one is damaged."""
+    """Read the fields that the viewer shows; KeyError, TypeError or similar if one is damaged."""
     for frame in content.frames:
         int(frame["index"]), str(frame["status"]), str(frame["reason"])
     for reason in content.run["reasons"]:
@@ -283,19 +283,19 @@ def _check_fields(content: ViewContent) -> None:
     len(content.run["components"]), str(content.run["verdict"]), content.loops, content.rig
 
 
-# What the model can be coloured by.
+# Values by which the model can be coloured.
 COLORINGS = ("colour", "height", "accuracy", "view count")
 
 
 def colorings(layers: Sequence[Layer]) -> list[str]:
     """Return the colourings that at least one of the layers has values for."""
-    needs: dict[str, list[NDArray[Any] | None]] = {
+    values: dict[str, list[NDArray[Any] | None]] = {
         "colour": [la.color for la in layers],
         "height": [la.points for la in layers],
         "accuracy": [la.sigma for la in layers],
         "view count": [la.views for la in layers],
     }
-    return [name for name in COLORINGS if any(value is not None for value in needs[name])]
+    return [name for name in COLORINGS if any(value is not None for value in values[name])]
 
 
 @dataclass(frozen=True)
@@ -307,40 +307,40 @@ class ColorBar:
 
 
 def layer_colors(
-    layer: Layer, by: str, up: Float64, scale_of: Layer | None = None
+    layer: Layer, coloring: str, up: Float64, scale_of: Layer | None = None
 ) -> tuple[UInt8, ColorBar | None]:
     """Return colours (N, 3) of a layer, and their colour bar; grey if it has no such values.
 
-    Colours of values are exactly those of the bar. The layer's own colours are shaded by a fixed
-    light from above and from one side, since the page is unlit.
+    Colours of values are exactly those of the bar. The layer's original colours are shaded by a
+    fixed light from above and from one side, since the page is unlit.
 
     Parameters
     ----------
     layer
         The layer.
-    by
+    coloring
         One of `COLORINGS`.
     up
         (3,) unit vector in the world frame.
     scale_of
         The layer whose range of values defines the scale; by default the same layer.
     """
-    if by == "colour" and layer.color is not None:
+    if coloring == "colour" and layer.color is not None:
         return _shaded(seen_colors(layer.color), layer, up), None
-    values = _values(layer, by, up)
+    values = _values(layer, coloring, up)
     if values is not None:
-        known = None if scale_of is None else _values(scale_of, by, up)
-        return _map_colors(values, values if known is None else known, by)
+        scale_values = None if scale_of is None else _values(scale_of, coloring, up)
+        return _map_colors(values, values if scale_values is None else scale_values, coloring)
     return np.full((len(layer.points), 3), 170, np.uint8), None
 
 
-def _values(layer: Layer, by: str, up: Float64) -> Float64 | None:
+def _values(layer: Layer, coloring: str, up: Float64) -> Float64 | None:
     """The values of a layer for a colouring; None if it has none."""
-    if by == "height":
+    if coloring == "height":
         return np.asarray(layer.points @ up, np.float64)
-    if by == "accuracy" and layer.sigma is not None:
+    if coloring == "accuracy" and layer.sigma is not None:
         return np.asarray(OF_95_PERCENT * layer.sigma, np.float64)
-    return layer.views if by == "view count" else None
+    return layer.views if coloring == "view count" else None
 
 
 _LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
@@ -350,17 +350,19 @@ _LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
 }
 
 
-def _map_colors(values: Float64, scale: Float64, by: str) -> tuple[UInt8, ColorBar]:
+def _map_colors(values: Float64, scale: Float64, coloring: str) -> tuple[UInt8, ColorBar]:
     """Colours of values on the scale of others, and the bar; accuracies on a logarithmic scale."""
-    label, text = _LABELS[by]
-    ratio = by == "accuracy"
-    shown, known = (np.log(np.maximum(v, 1e-6)) if ratio else v for v in (values, scale))
-    good = known[np.isfinite(known)]
-    low, high = np.percentile(good, [2, 98]).tolist() if len(good) else (0.0, 1.0)
-    back: Callable[[float], float] = (lambda v: float(np.exp(v))) if ratio else float
-    zero = low if by == "height" else 0.0
-    ticks = tuple(text(back(v) - zero) for v in (low, (low + high) / 2, high))
-    colors = viridis((np.nan_to_num(shown, nan=high) - low) / max(high - low, 1e-9))
+    label, text = _LABELS[coloring]
+    logarithmic = coloring == "accuracy"
+    mapped, mapped_scale = (
+        np.log(np.maximum(v, 1e-6)) if logarithmic else v for v in (values, scale)
+    )
+    finite = mapped_scale[np.isfinite(mapped_scale)]
+    low, high = np.percentile(finite, [2, 98]).tolist() if len(finite) else (0.0, 1.0)
+    inverse: Callable[[float], float] = (lambda v: float(np.exp(v))) if logarithmic else float
+    origin = low if coloring == "height" else 0.0
+    ticks = tuple(text(inverse(v) - origin) for v in (low, (low + high) / 2, high))
+    colors = viridis((np.nan_to_num(mapped, nan=high) - low) / max(high - low, 1e-9))
     return colors, ColorBar(label, (ticks[0], ticks[1], ticks[2]))
 
 

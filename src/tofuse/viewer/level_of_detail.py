@@ -1,4 +1,4 @@
-"""Selection of tiles for a view: fine ones near the camera, coarse ones far away."""
+"""Selection of tiles for a view: fine ones near the camera, coarse ones at a distance."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ class Eye:
 
     def pixels(self, tile: Tile) -> float:
         """Return the geometric error of a tile on the screen in pixels; 0 outside the view."""
-        if not self._sees(tile):
+        if not self._in_view(tile):
             return 0.0
-        off = np.maximum(np.maximum(tile.low - self.position, self.position - tile.high), 0)
-        distance = max(float(np.linalg.norm(off)), _MIN_DISTANCE_M)
+        offset = np.maximum(np.maximum(tile.low - self.position, self.position - tile.high), 0)
+        distance = max(float(np.linalg.norm(offset)), _MIN_DISTANCE_M)
         return float(tile.error_m * self.height / (2 * np.tan(self.fov / 2) * distance))
 
-    def _sees(self, tile: Tile) -> bool:
+    def _in_view(self, tile: Tile) -> bool:
         """Whether the bounding sphere of a tile intersects the cone around the view frustum."""
-        middle, radius = (tile.low + tile.high) / 2, float(np.linalg.norm(tile.high - tile.low)) / 2
-        to = middle - self.position
-        distance = float(np.linalg.norm(to))
+        centre, radius = (tile.low + tile.high) / 2, float(np.linalg.norm(tile.high - tile.low)) / 2
+        ray = centre - self.position
+        distance = float(np.linalg.norm(ray))
         if distance <= radius:
             return True
-        half = np.arctan(np.tan(self.fov / 2) * np.hypot(1, self.aspect))
-        angle = np.arccos(np.clip(to @ self.forward / distance, -1, 1))
-        return bool(angle <= half + np.arcsin(radius / distance))
+        half_angle = np.arctan(np.tan(self.fov / 2) * np.hypot(1, self.aspect))
+        angle = np.arccos(np.clip(ray @ self.forward / distance, -1, 1))
+        return bool(angle <= half_angle + np.arcsin(radius / distance))
 
 
 def select_tiles(root: Tile, eye: Eye | None, max_faces: int) -> list[Tile]:
@@ -72,21 +72,21 @@ def select_tiles(root: Tile, eye: Eye | None, max_faces: int) -> list[Tile]:
     max_faces
         Maximum number of triangles.
     """
-    shown: list[Tile] = []
+    selected: list[Tile] = []
     faces = root.faces
-    waiting = [(-_urgency(root, eye), 0, root)]
-    number = 0  # breaks ties in the order of insertion
-    while waiting:
-        urgency, _, tile = heapq.heappop(waiting)
-        more = sum(child.faces for child in tile.children) - tile.faces
-        if tile.content is None or (urgency < 0 and faces + more <= max_faces):
-            faces += more
+    queue = [(-_urgency(root, eye), 0, root)]
+    order = 0  # breaks ties in the order of insertion
+    while queue:
+        urgency, _, tile = heapq.heappop(queue)
+        added = sum(child.faces for child in tile.children) - tile.faces
+        if tile.content is None or (urgency < 0 and faces + added <= max_faces):
+            faces += added
             for child in tile.children:
-                number += 1
-                heapq.heappush(waiting, (-_urgency(child, eye), number, child))
+                order += 1
+                heapq.heappush(queue, (-_urgency(child, eye), order, child))
         else:
-            shown.append(tile)
-    return shown
+            selected.append(tile)
+    return selected
 
 
 def _urgency(tile: Tile, eye: Eye | None) -> float:

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; beyond, every second one is removed
 _MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
-_PERIOD = 0.3  # s between updates of the current frame
-_WIDTH = 240  # px
+_UPDATE_PERIOD = 0.3  # s between updates of the current frame
+_IMAGE_WIDTH = 240  # px
 _RECOLOR_PERIOD = 2.0  # s between updates of all colours
-_CELL = 0.015  # edge of a coverage cell, as a fraction of the first view's distance
-_SPREAD = 10.0  # ratio of the colour bar's ends to its middle, the median
+_CELL_FRACTION = 0.015  # edge of a coverage cell, as a fraction of the first view's distance
+_COLOR_RATIO = 10.0  # ratio of the colour bar's ends to its middle, the median
 
 
 class LiveView:
@@ -50,23 +50,24 @@ class LiveView:
     def __init__(self, server: ViserServer) -> None:
         self._server = server
         self._shown: list[tuple[Float64, Any]] = []
-        self._seen: dict[str, tuple[Float32, UInt8]] = {}  # points and colours of what is shown
+        # Points and colours of the shown views.
+        self._cloud_data: dict[str, tuple[Float32, UInt8]] = {}
         self._coverage: Coverage | None = None
         self._recolored = 0.0
         self._path: list[Float64] = []
         self._lock = threading.Lock()
         self._stage, self._done, self._total = "opening", 0, 0
-        self._last = -1.0
+        self._last_update = -1.0
         self.first_seconds: float | None = None
-        self._began = perf_counter()
+        self._start = perf_counter()
         self._spacing = (_MIN_DISTANCE, _MIN_ANGLE)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
         server.initial_camera.position = (0.6, -1.2, -2.2)
         server.initial_camera.look_at = (0.0, 0.0, 1.5)
-        self._words = server.gui.add_markdown("Opening the recording.")
-        self._by = server.gui.add_dropdown("Colour by", ("colour", "accuracy"))
-        self._by.on_update(lambda _: self._recolor_now())
+        self._status = server.gui.add_markdown("Opening the recording.")
+        self._coloring = server.gui.add_dropdown("Colour by", ("colour", "accuracy"))
+        self._coloring.on_update(lambda _: self._recolor_now())
         self._legend = server.gui.add_html("")
         self._image = server.gui.add_html("")
 
@@ -91,14 +92,14 @@ class LiveView:
         with self._lock:
             T = np.array(T_world_camera, float)
             self._path.append(T[:3, 3])
-            seen = {handle.name for _, handle in self._shown}
-            if f"/live/{frame.index}" in seen or self._is_far(T):
+            shown_names = {handle.name for _, handle in self._shown}
+            if f"/live/{frame.index}" in shown_names or self._is_new_view(T):
                 self._add(frame, T)
             now = perf_counter()
-            if self._by.value == "accuracy" and now - self._recolored > _RECOLOR_PERIOD:
+            if self._coloring.value == "accuracy" and now - self._recolored > _RECOLOR_PERIOD:
                 self._recolor()
-            if now - self._last > _PERIOD:
-                self._last = now
+            if now - self._last_update > _UPDATE_PERIOD:
+                self._last_update = now
                 self._show_current(frame, T)
                 self._show_status()
 
@@ -109,68 +110,68 @@ class LiveView:
             self._server.scene.reset()
             self._server.gui.reset()
             self._shown.clear()
-            self._seen.clear()
+            self._cloud_data.clear()
             return ResultView(self._server, result)
 
-    def _show_status(self, more: str = "") -> None:
+    def _show_status(self, detail: str = "") -> None:
         words = f"**{self._stage}**"
         if self._total:
             words += f" {self._done} of {self._total}"
-        self._words.content = f"{words}\n\n{more}" if more else words
+        self._status.content = f"{words}\n\n{detail}" if detail else words
 
-    def _is_far(self, T: Float64) -> bool:
+    def _is_new_view(self, T: Float64) -> bool:
         if not self._shown:
             return True
-        moves = se3.inverse(T) @ np.stack([known for known, _ in self._shown])
-        far = np.linalg.norm(moves[:, :3, 3], axis=1) > self._spacing[0]
-        return bool((far | (se3.angle(moves) > self._spacing[1])).all())
+        motions = se3.inverse(T) @ np.stack([pose for pose, _ in self._shown])
+        distant = np.linalg.norm(motions[:, :3, 3], axis=1) > self._spacing[0]
+        return bool((distant | (se3.angle(motions) > self._spacing[1])).all())
 
     def _add(self, frame: Frame, T: Float64) -> None:
         points = frame.points
         if len(points) == 0:
             return
-        chosen = slice(None, None, -(-len(points) // _POINTS))
-        world = se3.transform(T, points[chosen].astype(float)).astype(np.float32)
-        colors = frame.color
-        if colors is not None:
-            tint = colors[chosen]
+        sampled = slice(None, None, -(-len(points) // _POINTS))
+        world = se3.transform(T, points[sampled].astype(float)).astype(np.float32)
+        frame_colors = frame.color
+        if frame_colors is not None:
+            colors = frame_colors[sampled]
         elif frame.amplitude is not None:
-            level = frame.amplitude[chosen].astype(float)
-            bright = max(float(np.percentile(level, 98)), 1e-9)
-            grey = 255 * (level / bright).clip(0.02, 1) ** (1 / 2.2)
-            tint = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
+            amplitude = frame.amplitude[sampled].astype(float)
+            white_level = max(float(np.percentile(amplitude, 98)), 1e-9)
+            grey = 255 * (amplitude / white_level).clip(0.02, 1) ** (1 / 2.2)
+            colors = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
         else:
             low, high = np.percentile(world[:, 1], [2, 98])
-            tint = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
-        self._add_coverage(frame, world, chosen)
+            colors = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
+        self._add_coverage(frame, world, sampled)
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
             world,
-            tint,
+            colors,
             point_size=0.012,
             point_shading="flat",
             precision="float16",
         )
         if self.first_seconds is None:
-            self.first_seconds = perf_counter() - self._began
-        self._seen[handle.name] = (world, tint)
+            self.first_seconds = perf_counter() - self._start
+        self._cloud_data[handle.name] = (world, colors)
         self._shown = [item for item in self._shown if item[1].name != handle.name]
         self._shown.append((T, handle))
         if len(self._shown) > _CLOUDS:
-            for _, old in self._shown[1::2]:
-                del self._seen[old.name]
-                old.remove()
+            for _, removed in self._shown[1::2]:
+                del self._cloud_data[removed.name]
+                removed.remove()
             del self._shown[1::2]
             self._spacing = (1.5 * self._spacing[0], 1.5 * self._spacing[1])
 
-    def _add_coverage(self, frame: Frame, world: Float32, chosen: slice) -> None:
+    def _add_coverage(self, frame: Frame, world: Float32, sampled: slice) -> None:
         """Add a view to the coverage."""
-        far = np.linalg.norm(frame.points[chosen], axis=1)
+        distance = np.linalg.norm(frame.points[sampled], axis=1)
         if self._coverage is None:
-            self._coverage = Coverage(max(_CELL * float(np.median(far)), 1e-4))
-        known = frame.sigma
-        # Without a noise model: noise grows with the square of the distance.
-        sigma = 0.001 * far**2 if known is None else known[chosen].astype(float)
+            self._coverage = Coverage(max(_CELL_FRACTION * float(np.median(distance)), 1e-4))
+        frame_sigma = frame.sigma
+        # Without a noise model, noise is assumed to grow with the squared distance.
+        sigma = 0.001 * distance**2 if frame_sigma is None else frame_sigma[sampled].astype(float)
         self._coverage.add(world, sigma)
 
     def _recolor_now(self) -> None:
@@ -181,17 +182,19 @@ class LiveView:
         """Update the colours of all views."""
         self._recolored = perf_counter()
         coverage = self._coverage
-        if self._by.value == "colour" or coverage is None:
+        if self._coloring.value == "colour" or coverage is None:
             self._legend.content = ""
             for _, handle in self._shown:
-                handle.colors = self._seen[handle.name][1]
+                handle.colors = self._cloud_data[handle.name][1]
             return
         median = OF_95_PERCENT * float(np.median(coverage.sigmas))
         for _, handle in self._shown:
-            ratio = OF_95_PERCENT * coverage.sigma(self._seen[handle.name][0]) / median
-            level = 0.5 + 0.5 * np.log(np.minimum(ratio, _SPREAD)) / np.log(_SPREAD)
+            ratio = OF_95_PERCENT * coverage.sigma(self._cloud_data[handle.name][0]) / median
+            level = 0.5 + 0.5 * np.log(np.minimum(ratio, _COLOR_RATIO)) / np.log(_COLOR_RATIO)
             handle.colors = viridis(level)
-        ticks = tuple(f"±{length(median * times)}" for times in (1 / _SPREAD, 1.0, _SPREAD))
+        ticks = tuple(
+            f"±{length(median * factor)}" for factor in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)
+        )
         bar = ColorBar("Accuracy so far (95 %), noise only", (ticks[0], ticks[1], ticks[2]))
         self._legend.content = color_bar(bar) + (
             '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
@@ -202,10 +205,10 @@ class LiveView:
         scene = self._server.scene
         image = None
         if isinstance(frame, RangeFrame):
-            drawn = frame.color_image
-            if drawn is None:
-                drawn = depth_image(frame, depth_limits(frame), None)
-            image = subsample(drawn, _WIDTH)
+            frame_image = frame.color_image
+            if frame_image is None:
+                frame_image = depth_image(frame, depth_limits(frame), None)
+            image = subsample(frame_image, _IMAGE_WIDTH)
             source = data_uri(image, jpeg=True)
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'

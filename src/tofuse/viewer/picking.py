@@ -1,4 +1,4 @@
-"""The point of the model that a click refers to."""
+"""The point of the model that is clicked."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float64
 from tofuse.viewer.content import Layer
 
-_NEAR, _FAR = 0.006, 0.02  # angle to the ray in rad: as good as on it, and too far
+_ON_RAY_ANGLE, _MAX_ANGLE = 0.006, 0.02  # rad, between a point's direction and the ray
 
 
 @dataclass(frozen=True, eq=False)
 class PickedPoint:
-    """A point (3,) of the model, and its standard deviation in m, NaN where it is not known."""
+    """A point (3,) of the model, and its standard deviation in m, NaN if unknown."""
 
     point: Float64
     sigma: float
@@ -25,7 +25,7 @@ class PickedPoint:
 def pick(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> PickedPoint | None:
     """Return the point of the layers on a ray, or None.
 
-    The closest of the points that are as good as on the ray; without any, that with the smallest
+    The closest of the points that are practically on the ray; without any, that with the smallest
     angle to it. Back faces are not drawn, and so not picked.
 
     Parameters
@@ -38,22 +38,22 @@ def pick(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Pi
     o, d = np.asarray(origin, float), np.asarray(direction, float)
     d = d / np.linalg.norm(d)
     best: tuple[float, float] | None = None
-    found = None
+    picked = None
     for layer in layers:
         v = layer.points - o
-        along = v @ d
-        ahead = along > 1e-6
+        depth = v @ d
+        pickable = depth > 1e-6
         if layer.faces is not None and layer.normals is not None:
-            ahead &= (layer.normals * v).sum(1) < 0
-        rows = np.flatnonzero(ahead)
+            pickable &= (layer.normals * v).sum(1) < 0
+        rows = np.flatnonzero(pickable)
         if len(rows) == 0:
             continue
-        off = np.linalg.norm(v[rows] - along[rows, None] * d, axis=1) / along[rows]
-        on = np.flatnonzero(off < _NEAR)
-        k = on[np.argmin(along[rows[on]])] if len(on) else int(np.argmin(off))
-        rank = (0.0, float(along[rows[k]])) if len(on) else (float(off[k]), 0.0)
-        if off[k] < _FAR and (best is None or rank < best):
+        angle = np.linalg.norm(v[rows] - depth[rows, None] * d, axis=1) / depth[rows]
+        on_ray = np.flatnonzero(angle < _ON_RAY_ANGLE)
+        k = on_ray[np.argmin(depth[rows[on_ray]])] if len(on_ray) else int(np.argmin(angle))
+        rank = (0.0, float(depth[rows[k]])) if len(on_ray) else (float(angle[k]), 0.0)
+        if angle[k] < _MAX_ANGLE and (best is None or rank < best):
             row = rows[k]
             sigma = float("nan") if layer.sigma is None else float(layer.sigma[row])
-            best, found = rank, PickedPoint(layer.points[row].astype(float), sigma)
-    return found
+            best, picked = rank, PickedPoint(layer.points[row].astype(float), sigma)
+    return picked

@@ -1,7 +1,7 @@
 """The server of the page, reachable from this machine only.
 
-It answers only requests whose Host and Origin are this machine's own names, which excludes pages
-of other sites whose name resolves to this machine (DNS rebinding).
+It answers only requests whose Host and Origin are names of this machine, which excludes pages of
+other sites whose name resolves to this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ def _guarded() -> Iterator[list[int]]:
     from websockets.http11 import Request, Response
 
     guards: list[int] = []
-    real = library.serve
+    original = library.serve
 
-    def serve_guarded(*words: Any, process_request: Any = None, **options: Any) -> Any:
+    def serve_guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
             host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
             if not is_ours(host, origin):
@@ -103,17 +103,17 @@ def _guarded() -> Iterator[list[int]]:
             return response
 
         guards.append(1)
-        return real(*words, process_request=process, **options)
+        return original(*arguments, process_request=process, **options)
 
     library.serve = serve_guarded  # type: ignore[misc,assignment]
     try:
         yield guards
     finally:
-        library.serve = real  # type: ignore[misc]
+        library.serve = original  # type: ignore[misc]
 
 
 def is_ours(hosts: Sequence[str], origins: Sequence[str]) -> bool:
-    """Whether a request came by this machine's own name, and from our own page or no page at all.
+    """Whether a request addresses this machine, and comes from this server's page or no page.
 
     Parameters
     ----------
@@ -130,9 +130,9 @@ def is_ours(hosts: Sequence[str], origins: Sequence[str]) -> bool:
 
 def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
     """Return the headers of a response that keep its page from running foreign scripts."""
-    found = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+    secure_headers = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
     if not headers.get("Content-Type", "").startswith("text/html"):
-        return found
+        return secure_headers
     if headers.get("Content-Encoding") == "gzip":
         body = gzip.decompress(body)
     hashes = script_hashes(body.decode("utf-8", "replace"))
@@ -146,7 +146,7 @@ def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
         "object-src 'none'; base-uri 'none'; form-action 'none'; "
         "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks
     )
-    return {**found, "Content-Security-Policy": policy}
+    return {**secure_headers, "Content-Security-Policy": policy}
 
 
 def stop(server: ViserServer) -> None:

@@ -1,4 +1,4 @@
-"""A tiled surface on the page: each client gets the tiles for its own view."""
+"""A tiled surface on the page: each client gets the tiles for its view."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class TiledSurface:
     @visible.setter
     def visible(self, value: bool) -> None:
         self._visible = value
-        for client in self._now():
+        for client in self._current_clients():
             client.show(value)
 
     def remove(self) -> None:
@@ -82,7 +82,7 @@ class TiledSurface:
 
     def shown(self) -> list[list[Tile]]:
         """The tiles that each client shows."""
-        return [client.tiles() for client in self._now()]
+        return [client.tiles() for client in self._current_clients()]
 
     def layer_along(self, origin: ArrayLike, direction: ArrayLike) -> Layer:
         """Return the shown tiles that a ray hits, in the world frame."""
@@ -90,11 +90,11 @@ class TiledSurface:
         o, d = R @ np.asarray(origin, float), R @ np.asarray(direction, float)
         hit = {t.content: t for tiles in self.shown() for t in tiles if _hits(t, o, d)}
         if not hit:
-            nothing = np.zeros((0, 3), np.float32)
-            return Layer(nothing, None, np.zeros((0, 3), np.int32), None, None, None)
+            no_points = np.zeros((0, 3), np.float32)
+            return Layer(no_points, None, np.zeros((0, 3), np.int32), None, None, None)
         return merge_layers([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
 
-    def _now(self) -> list[_Client]:
+    def _current_clients(self) -> list[_Client]:
         with self._lock:
             return list(self._clients.values())
 
@@ -108,9 +108,9 @@ class TiledSurface:
 
     def _leave(self, client: ClientHandle) -> None:
         with self._lock:
-            gone = self._clients.pop(client.client_id, None)
-        if gone is not None:
-            gone.stop(remove=False)
+            state = self._clients.pop(client.client_id, None)
+        if state is not None:
+            state.stop(remove=False)
 
 
 class _Client:
@@ -129,7 +129,7 @@ class _Client:
     ) -> None:
         self._client, self._layer, self._paint = client, layer, paint
         self._visible = visible
-        self._nodes: dict[str, tuple[Tile, Any]] = {}  # the longest unused first
+        self._nodes: dict[str, tuple[Tile, Any]] = {}  # the least recently used first
         self._shown: frozenset[str] = frozenset()
         self._budget = FrameBudget(layer.root.faces)
         self._last_move = -np.inf
@@ -187,34 +187,34 @@ class _Client:
         eye = self._eye()
         final = select_tiles(self._layer.root, eye, max_faces)
         if all(str(tile.content) in self._nodes for tile in final):
-            self._exchange(final)
+            self._show_tiles(final)
             return
         for fraction in _FRACTIONS:
-            self._exchange(select_tiles(self._layer.root, eye, int(fraction * max_faces)))
+            self._show_tiles(select_tiles(self._layer.root, eye, int(fraction * max_faces)))
             if self._stopped or self._moved.is_set():
                 return
 
     def _eye(self) -> Eye:
         camera = self._client.camera
         R = self._layer.R_up_world
-        turned = R @ to_matrix(np.roll(camera.wxyz, -1))
+        R_up_camera = R @ to_matrix(np.roll(camera.wxyz, -1))
         return Eye(
             R @ camera.position,
-            turned[:, 2],
+            R_up_camera[:, 2],
             float(camera.fov),
             float(camera.aspect),
             int(camera.image_height),
         )
 
-    def _exchange(self, wanted: list[Tile]) -> None:
+    def _show_tiles(self, tiles: list[Tile]) -> None:
         """Show these tiles and no others; new ones are added before old ones are hidden."""
-        names = frozenset(str(tile.content) for tile in wanted)
-        new = [tile for tile in wanted if str(tile.content) not in self._nodes]
-        ready = [(tile, self._packed(tile)) for tile in new]
+        names = frozenset(str(tile.content) for tile in tiles)
+        new = [tile for tile in tiles if str(tile.content) not in self._nodes]
+        packed = [(tile, self._packed(tile)) for tile in new]
         with self._lock, self._client.atomic():
             if self._stopped:
                 return
-            for tile, data in ready:
+            for tile, data in packed:
                 node = self._client.scene.add_glb(
                     f"/model/tiles/{tile.content}",
                     data,
@@ -224,7 +224,7 @@ class _Client:
                 )
                 self._nodes[str(tile.content)] = tile, node
             for name in names - self._shown:
-                self._nodes[name] = self._nodes.pop(name)  # the last used
+                self._nodes[name] = self._nodes.pop(name)  # as the most recently used
                 self._nodes[name][1].visible = self._visible
             for name in self._shown - names:
                 self._nodes[name][1].visible = False
@@ -249,8 +249,8 @@ class _Client:
 
 def _hits(tile: Tile, origin: Float64, direction: Float64) -> bool:
     """Whether a ray hits the box of a tile."""
-    slack = _MARGIN * float(np.linalg.norm(tile.high - tile.low))
+    margin = _MARGIN * float(np.linalg.norm(tile.high - tile.low))
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = (np.stack([tile.low - slack, tile.high + slack]) - origin) / direction
-    near, far = np.nanmin(ends, 0).max(), np.nanmax(ends, 0).min()
-    return bool(far >= max(near, 0))
+        t = (np.stack([tile.low - margin, tile.high + margin]) - origin) / direction
+    t_near, t_far = np.nanmin(t, 0).max(), np.nanmax(t, 0).min()
+    return bool(t_far >= max(t_near, 0))

@@ -51,7 +51,7 @@ def write_report_and_view(result: Reconstruction, folder: Path, extras: ReportEx
     result
         The result.
     folder
-        Where to.
+        Output folder.
     extras
         Further content of the report; the images of the result's samples are added to it.
 
@@ -85,11 +85,11 @@ def write_view_file(result: Reconstruction, pictures: Sequence[Pictures], path: 
     """
     d = result.diagnostics
     index = np.array([r.index for r in d.frames], np.int64)
-    known = np.isfinite(d.sequential).all((1, 2)) if len(index) == len(d.sequential) else None
+    posed = np.isfinite(d.sequential).all((1, 2)) if len(index) == len(d.sequential) else None
     points, color = _model_before(result)
     arrays: dict[str, NDArray[np.generic]] = {
-        "index": index[:0] if known is None else index[known],
-        "before": d.sequential[:0] if known is None else d.sequential[known],
+        "index": index[:0] if posed is None else index[posed],
+        "before": d.sequential[:0] if posed is None else d.sequential[posed],
         "points": points,
         "color": color,
         "picture": np.array([p.index for p in pictures], np.int64),
@@ -108,9 +108,9 @@ def _model_before(result: Reconstruction) -> tuple[Float32, UInt8]:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     step = -(-len(cloud) // _POINTS)
     points = (cloud.points[::step] + cloud.offset).astype(np.float32)
-    good = np.isfinite(points).all(1)
+    finite = np.isfinite(points).all(1)
     grey = np.full((len(points), 3), 170, np.uint8)
-    return points[good], (grey if cloud.color is None else cloud.color[::step])[good]
+    return points[finite], (grey if cloud.color is None else cloud.color[::step])[finite]
 
 
 def read_view_file(folder: Path) -> ViewFile | None:
@@ -131,10 +131,10 @@ def read_view_file(folder: Path) -> ViewFile | None:
         frames = data["picture"].tolist()
         images: list[dict[str, bytes]] = [{} for _ in frames]
         for kind in KINDS:
-            whole, start = data[f"{kind}_image"].tobytes(), 0
+            joined, start = data[f"{kind}_image"].tobytes(), 0
             for k, size in enumerate(data[f"{kind}_size"].tolist()):
                 if size:
-                    images[k][kind] = whole[start : start + size]
+                    images[k][kind] = joined[start : start + size]
                 start += size
         if before.shape != (len(index), 4, 4) or points.shape != color.shape:
             raise ValueError("its arrays have inconsistent shapes")
@@ -144,5 +144,7 @@ def read_view_file(folder: Path) -> ViewFile | None:
         raise InputError(
             f"can't be read ({error})", where=path, remedy="remove it, or run again"
         ) from error
-    pictures = tuple(Pictures(k, found) for k, found in zip(frames, images, strict=True))
+    pictures = tuple(
+        Pictures(k, frame_images) for k, frame_images in zip(frames, images, strict=True)
+    )
     return ViewFile(dict(zip(index, before, strict=True)), points, color, pictures)

@@ -53,7 +53,7 @@ class OrbbecStream(Stream):
         try:
             self._pipeline = ob.Pipeline()
             config = ob.Config()
-            profile = _default(self._pipeline, ob.OBSensorType.DEPTH_SENSOR)
+            profile = _default_profile(self._pipeline, ob.OBSensorType.DEPTH_SENSOR)
             config.enable_stream(profile)
             size = (int(profile.get_width()), int(profile.get_height()))
             self._infrared = options.infrared and _add_infrared(ob, self._pipeline, config, size)
@@ -111,14 +111,14 @@ class OrbbecStream(Stream):
         raise no_frame("Orbbec")
 
 
-def _default(pipeline: Any, sensor: Any) -> Any:
+def _default_profile(pipeline: Any, sensor: Any) -> Any:
     return pipeline.get_stream_profile_list(sensor).get_default_video_stream_profile()
 
 
 def _add_infrared(ob: Any, pipeline: Any, config: Any, size: tuple[int, int]) -> bool:
     """Enable the infrared image, if the camera has one with the pixels of depth."""
     try:
-        profile = _default(pipeline, ob.OBSensorType.IR_SENSOR)
+        profile = _default_profile(pipeline, ob.OBSensorType.IR_SENSOR)
     except ob.OBError:
         return False
     if (profile.get_width(), profile.get_height()) != size:
@@ -142,6 +142,6 @@ def _image(frame: Any) -> Float32:
 
 
 def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
-    values = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
-    k = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
-    return simplest_lens(size, values, k, "Orbbec")
+    intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
+    coefficients = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
+    return simplest_lens(size, intrinsics, coefficients, "Orbbec")

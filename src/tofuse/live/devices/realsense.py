@@ -125,14 +125,14 @@ def _is_tof(rs: Any, serial: str) -> bool:
 
 def _camera(rs: Any, lens: Any) -> Camera:
     size = (int(lens.width), int(lens.height))
-    focal = (float(lens.fx), float(lens.fy), float(lens.ppx), float(lens.ppy))
-    k = [float(c) for c in lens.coeffs]
-    if lens.model == rs.distortion.none or not any(k):
-        return Pinhole(*size, *focal)
+    intrinsics = (float(lens.fx), float(lens.fy), float(lens.ppx), float(lens.ppy))
+    coefficients = [float(c) for c in lens.coeffs]
+    if lens.model == rs.distortion.none or not any(coefficients):
+        return Pinhole(*size, *intrinsics)
     if lens.model == rs.distortion.brown_conrady:
-        return BrownConrady(*size, *focal, *k)
+        return BrownConrady(*size, *intrinsics, *coefficients)
     if lens.model == rs.distortion.inverse_brown_conrady:
-        return inverse_brown(BrownConrady(*size, *focal, *k))
+        return inverse_brown(BrownConrady(*size, *intrinsics, *coefficients))
     raise DeviceError(
         f"has a lens of the model {lens.model}",
         where="RealSense",

@@ -34,7 +34,7 @@ SENSOR = "Analog Devices (ToF)"
 # the pixel's position that is fitted to them: it smooths the rounding of the points to whole mm.
 _SAMPLES = 16
 _DEGREE = 7
-_FITTED = 20_000  # pixels
+_MAX_FITTED_PIXELS = 20_000  # pixels
 _ROUNDING_MM = 0.5  # the largest error of a coordinate from rounding
 _REMEDY = "pass the lens with --camera camera.json, or save frames with XYZ"
 
@@ -66,8 +66,8 @@ class Layout:
         if len(data) < HEADER_BYTES:
             return None
         width, height, _, depth, brightness, confidence, points, *clocks = _HEADER.unpack_from(data)
-        good = width in _SIDES and height in _SIDES and 0 < depth <= 16 and points in (0, 1)
-        if not good or max(brightness, confidence) > _MAX_BITS:
+        plausible = width in _SIDES and height in _SIDES and 0 < depth <= 16 and points in (0, 1)
+        if not plausible or max(brightness, confidence) > _MAX_BITS:
             return None
         times = [s + us / 1e6 for s, us in (clocks[2:], clocks[:2]) if 0 < s < 1 << 40]
         return cls(
@@ -81,8 +81,8 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where a frame is stored."""
+class _FrameLocation:
+    """Location of a frame in a file."""
 
     path: Path
     offset: int
@@ -109,10 +109,10 @@ class AdiTof:
         """See `Reader.sniff`."""
         try:
             files = _files(path)
-            places, whole = _places(files[0]) if files else ([], False)
+            frames, complete = _frames_in(files[0]) if files else ([], False)
         except InputError:
             return None
-        if len(places) > 1 or (places and whole):
+        if len(frames) > 1 or (frames and complete):
             return Sniff(1.0, "frames of Analog Devices' ToF SDK")
         return None
 
@@ -127,30 +127,30 @@ class AdiTofSource(FileSource):
     concurrent = True
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
-        self.places: list[_Place] = []
-        cut = []
+        self.locations: list[_FrameLocation] = []
+        truncated = []
         for file in _files(path):
-            places, whole = _places(file)
-            self.places += places
-            cut += [] if whole else [file]
-        if not self.places:
+            frames, complete = _frames_in(file)
+            self.locations += frames
+            truncated += [] if complete else [file]
+        if not self.locations:
             raise InputError(
                 "contains no whole frame of Analog Devices' ToF SDK",
                 where=path,
                 remedy="pass a .bin file that data_collect or FrameHandler saved",
             )
-        first = self.places[0].layout
+        first = self.locations[0].layout
         self.size = first.width, first.height
         self.kind: DepthKind = "range"
         self.unit, sensor, rate = DEPTH_UNIT_M, SENSOR, 1.0
         self.camera: Camera
         if options.camera is not None:
-            about, self.camera = load_camera(options.camera, self.size)
-            self.kind, self.unit = about.depth_kind, about.depth_unit_m
-            sensor, rate = about.sensor or sensor, about.frame_rate_hz or rate
+            description, self.camera = load_camera(options.camera, self.size)
+            self.kind, self.unit = description.depth_kind, description.depth_unit_m
+            sensor, rate = description.sensor or sensor, description.frame_rate_hz or rate
         else:
-            self.camera = self._own_camera(path)
-        times = np.array([place.layout.time for place in self.places])
+            self.camera = self._camera_of_points(path)
+        times = np.array([place.layout.time for place in self.locations])
         super().__init__(times if times.all() else np.arange(len(times)) / rate)
         self.metadata |= {
             "sensor": sensor,
@@ -158,7 +158,9 @@ class AdiTofSource(FileSource):
             "depth_unit_m": self.unit,
             "amplitude_kind": "ir",
         }
-        self.warnings += [f"{file} is cut off or damaged: its end is left out" for file in cut]
+        self.warnings += [
+            f"{file} is cut off or damaged: its end is left out" for file in truncated
+        ]
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -174,7 +176,7 @@ class AdiTofSource(FileSource):
         )
 
     def _images(self, index: int) -> _Images:
-        place = self.places[index]
+        place = self.locations[index]
         layout = place.layout
         if (layout.width, layout.height) != self.size:
             raise InputError(
@@ -192,20 +194,20 @@ class AdiTofSource(FileSource):
         if len(data) < layout.length - HEADER_BYTES:
             raise InputError("is cut off", where=f"{place.path}: frame {index}")
         shape, count = (layout.height, layout.width), layout.width * layout.height
-        at = 2 * count
+        offset = 2 * count
         depth = np.frombuffer(data, "<u2", count).reshape(shape)
         brightness = points = None
         if layout.brightness:
-            brightness = np.frombuffer(data, "<u2", count, at).reshape(shape)
+            brightness = np.frombuffer(data, "<u2", count, offset).reshape(shape)
         if layout.points:
-            at += (layout.brightness + layout.confidence) * count
-            points = np.frombuffer(data, "<i2", 3 * count, at).reshape(*shape, 3)
+            offset += (layout.brightness + layout.confidence) * count
+            points = np.frombuffer(data, "<i2", 3 * count, offset).reshape(*shape, 3)
         return _Images(depth, brightness, points)
 
-    def _own_camera(self, path: Path) -> RayTable:
+    def _camera_of_points(self, path: Path) -> RayTable:
         """The camera of the points in evenly spaced frames."""
         samples = []
-        for k in np.unique(np.linspace(0, len(self.places) - 1, _SAMPLES).round()).astype(int):
+        for k in np.unique(np.linspace(0, len(self.locations) - 1, _SAMPLES).round()).astype(int):
             try:
                 images = self._images(int(k))
             except InputError:
@@ -233,42 +235,45 @@ def _files(path: Path) -> list[Path]:
     return [path] if is_file(path) and path.suffix.lower() == ".bin" else []
 
 
-def _places(path: Path) -> tuple[list[_Place], bool]:
-    """The whole frames of a file, and whether it contains nothing else."""
-    places: list[_Place] = []
+def _frames_in(path: Path) -> tuple[list[_FrameLocation], bool]:
+    """The complete frames of a file, and whether it contains nothing else."""
+    frames: list[_FrameLocation] = []
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
-            at = 0
-            while layout := _layout_at(file, at, size):
-                places.append(_Place(path, at, layout))
-                at += layout.length
+            offset = 0
+            while layout := _layout_at(file, offset, size):
+                frames.append(_FrameLocation(path, offset, layout))
+                offset += layout.length
     except OSError as error:
         raise input_error(error, path) from error
-    return places, at == size
+    return frames, offset == size
 
 
-def _layout_at(file: BinaryIO, at: int, size: int) -> Layout | None:
-    """The layout of the frame at an offset of a file of `size` bytes; None if it is not whole.
+def _layout_at(file: BinaryIO, offset: int, size: int) -> Layout | None:
+    """The layout of the frame at an offset of a file of `size` bytes; None if it is incomplete.
 
-    SDKs before 6 store points without stating it: whether they do follows from where the next frame
-    begins.
+    SDKs before 6 store points without declaring them: the start of the next frame shows whether
+    they are present.
     """
 
-    def ends(layout: Layout) -> bool:
-        file.seek(at + layout.length)
-        after = Layout.of(file.read(HEADER_BYTES))
-        same = after is not None and (after.width, after.height) == (layout.width, layout.height)
-        return same or at + layout.length == size
+    def is_complete(layout: Layout) -> bool:
+        file.seek(offset + layout.length)
+        following = Layout.of(file.read(HEADER_BYTES))
+        same_size = following is not None and (following.width, following.height) == (
+            layout.width,
+            layout.height,
+        )
+        return same_size or offset + layout.length == size
 
-    file.seek(at)
+    file.seek(offset)
     layout = Layout.of(file.read(HEADER_BYTES))
     if layout is None:
         return None
     with_points = replace(layout, points=6)
-    if not layout.points and ends(with_points) and not ends(layout):
+    if not layout.points and is_complete(with_points) and not is_complete(layout):
         layout = with_points
-    return layout if at + layout.length <= size else None
+    return layout if offset + layout.length <= size else None
 
 
 def _rays(samples: Sequence[tuple[Float64, Float64]]) -> Float32 | None:
@@ -281,33 +286,33 @@ def _rays(samples: Sequence[tuple[Float64, Float64]]) -> Float32 | None:
     masks = []
     for depth, points in samples:
         measured = (depth > 0) & (points[..., 2] > 0)
-        off = np.abs(np.linalg.norm(points, axis=-1) - depth)
-        consistent = measured & (off <= _ROUNDING_MM * np.sqrt(3))
+        error = np.abs(np.linalg.norm(points, axis=-1) - depth)
+        consistent = measured & (error <= _ROUNDING_MM * np.sqrt(3))
         if consistent.sum() < 0.5 * measured.sum():
             return None
         masks.append(consistent)
         z = np.where(consistent, points[..., 2], 0.0)
         weight += z**2
         slopes += points[..., :2] * z[..., None]
-    known = weight > 0
-    row, column = np.nonzero(known)
-    few = slice(None, None, 1 + len(row) // _FITTED)
-    row, column = row[few], column[few]
+    has_ray = weight > 0
+    row, column = np.nonzero(has_ray)
+    subset = slice(None, None, 1 + len(row) // _MAX_FITTED_PIXELS)
+    row, column = row[subset], column[subset]
     y, x = (np.linspace(-1, 1, side) for side in shape)
-    terms = np.polynomial.legendre.legvander2d(y[row], x[column], [_DEGREE, _DEGREE])
-    if len(row) < 4 * terms.shape[-1]:
+    basis = np.polynomial.legendre.legvander2d(y[row], x[column], [_DEGREE, _DEGREE])
+    if len(row) < 4 * basis.shape[-1]:
         return None
-    root = np.sqrt(weight[row, column])[:, None]
-    fit = np.linalg.lstsq(root * terms, slopes[row, column] / root, rcond=None)[0]
+    sqrt_weight = np.sqrt(weight[row, column])[:, None]
+    fit = np.linalg.lstsq(sqrt_weight * basis, slopes[row, column] / sqrt_weight, rcond=None)[0]
     coefficients = fit.reshape(_DEGREE + 1, _DEGREE + 1, 2)
     rays = np.moveaxis(np.polynomial.legendre.leggrid2d(y, x, coefficients), 0, -1)
-    rays[~known] = np.nan
+    rays[~has_ray] = np.nan
     directions = np.concatenate([rays, np.ones((*shape, 1))], axis=-1)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    off = [
+    error = [
         (points - directions * depth[..., None])[mask]
         for (depth, points), mask in zip(samples, masks, strict=True)
     ]
-    if np.sqrt(np.mean(np.concatenate(off) ** 2)) > _ROUNDING_MM:
+    if np.sqrt(np.mean(np.concatenate(error) ** 2)) > _ROUNDING_MM:
         return None
     return rays.astype(np.float32)

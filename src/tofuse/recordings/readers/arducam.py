@@ -61,7 +61,7 @@ class _Image:
 
 
 class ArducamSource(FileSource):
-    """Depth, each with the confidence that was saved next, before the next depth."""
+    """Depth images, each with the confidence image that was saved before the next depth image."""
 
     concurrent = True
 
@@ -70,11 +70,11 @@ class ArducamSource(FileSource):
         self.description, self.camera = load_camera(camera)
         self.depth = _images(path, "depth")
         super().__init__(np.array([image.time_ms for image in self.depth]) / 1000)
-        self.confidence = _next(self.depth, _images(path, "confidence"))
+        self.confidence = _next_image(self.depth, _images(path, "confidence"))
         self.metadata |= {**self.description.metadata, "confidence_max": CONFIDENCE_MAX}
-        without = sum(image is None for image in self.confidence)
-        if without > 0:
-            self.warnings.append(f"{without} of {len(self.depth)} frames have no confidence")
+        missing = sum(image is None for image in self.confidence)
+        if missing > 0:
+            self.warnings.append(f"{missing} of {len(self.depth)} frames have no confidence")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -117,21 +117,21 @@ class ArducamSource(FileSource):
 
 def _images(path: Path, kind: str) -> list[_Image]:
     """The images of a kind in a folder, in the order of time."""
-    found = []
+    images = []
     for file in files_named(path, _NAME.fullmatch):
         match = _NAME.fullmatch(file.name)
         assert match is not None
         if match[1] == kind:
-            found.append(_Image(file, (int(match[2]), int(match[3])), int(match[4])))
-    return sorted(found, key=lambda image: (image.time_ms, image.path.name))
+            images.append(_Image(file, (int(match[2]), int(match[3])), int(match[4])))
+    return sorted(images, key=lambda image: (image.time_ms, image.path.name))
 
 
-def _next(depth: list[_Image], others: list[_Image]) -> list[_Image | None]:
-    """The first of the others that is not older than each depth image, but than the next one."""
+def _next_image(depth: list[_Image], others: list[_Image]) -> list[_Image | None]:
+    """For each depth image, the first of the others from its time on and before the next one."""
     times = np.array([image.time_ms for image in depth])
-    found: list[_Image | None] = [None] * len(depth)
+    matched: list[_Image | None] = [None] * len(depth)
     for image in reversed(others):
         k = int(np.searchsorted(times, image.time_ms, side="right")) - 1
         if k >= 0:
-            found[k] = image
-    return found
+            matched[k] = image
+    return matched

@@ -37,15 +37,15 @@ class Window:
 
     Attributes
     ----------
-    whole
-        The calibrated image at the mode's resolution.
+    full_size
+        Size of the calibrated image at the mode's resolution.
     corner
         Top left corner of the mode's image in it.
     size
         Size of the mode's image.
     """
 
-    whole: tuple[int, int]
+    full_size: tuple[int, int]
     corner: tuple[int, int]
     size: tuple[int, int]
 
@@ -81,7 +81,7 @@ class KinectLens(Rational):
     """
 
     metric_radius: float = METRIC_RADIUS
-    mixed: float = 2.0
+    tangential_factor: float = 2.0
 
     def project(self, points: ArrayLike) -> Float64:
         """See `Camera.project`; also NaN beyond the radius."""
@@ -92,7 +92,7 @@ class KinectLens(Rational):
         return np.where((radius <= self.metric_radius)[..., None], uv, np.nan)
 
     def _distort(self, xy: Float64) -> Float64:
-        product = (xy[..., :1] * xy[..., 1:]) * (self.mixed - 2.0)
+        product = (xy[..., :1] * xy[..., 1:]) * (self.tangential_factor - 2.0)
         return super()._distort(xy) + product * (self.p1, self.p2)
 
 
@@ -100,10 +100,10 @@ class KinectLens(Rational):
 def depth_camera(lens: KinectLens) -> Camera:
     """Return the depth camera: the lens model if it is OpenCV's, else a ray table."""
     rays = lens.rays()
-    seen = np.hypot(rays[..., 0], rays[..., 1]) <= lens.metric_radius
-    if seen.all() and lens.mixed == 2.0:
+    valid = np.hypot(rays[..., 0], rays[..., 1]) <= lens.metric_radius
+    if valid.all() and lens.tangential_factor == 2.0:
         return Rational(**{f.name: getattr(lens, f.name) for f in fields(Rational)})
-    return RayTable(np.where(seen[..., None], rays, np.float32(np.nan)))
+    return RayTable(np.where(valid[..., None], rays, np.float32(np.nan)))
 
 
 @part("reader", "azure-kinect", label="validated")
@@ -115,8 +115,8 @@ class AzureKinect:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        found = begins_with(file_of(path, ".mkv"), MAGIC)
-        return Sniff(1.0, "a Matroska file") if found else None
+        matches = begins_with(file_of(path, ".mkv"), MAGIC)
+        return Sniff(1.0, "a Matroska file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> AzureKinectSource:
         """See `Reader.open`."""
@@ -146,15 +146,15 @@ class AzureKinectSource(FileSource):
         self.depth = depth.blocks
         self.size = _image_size(depth, path)
         self.mode = _mode(self.file.tags, self.size, path)
-        offset = _whole(self.file.tags.get("K4A_START_OFFSET_NS"))
+        offset = _integer(self.file.tags.get("K4A_START_OFFSET_NS"))
         super().__init__((np.array([b.time_ns for b in self.depth]) + offset) / 1e9)
         if not self.file.complete:
             self.warnings.append(f"{path} is cut off: {len(self.depth)} frames remain")
         limit = (depth.duration_ns or 33_333_333) / 2e9
-        self.infrared = self._beside(tracks.get("IR"), limit, 0)
+        self.infrared = self._matched_blocks(tracks.get("IR"), limit, 0)
         color = tracks.get("COLOR")
-        delay = _whole(self.file.tags.get("K4A_DEPTH_DELAY_NS"))
-        self.color = self._beside(color, limit, delay)
+        delay = _integer(self.file.tags.get("K4A_DEPTH_DELAY_NS"))
+        self.color = self._matched_blocks(color, limit, delay)
         self._read_cameras(options, color)
         self.metadata |= {
             "sensor": self._sensor(),
@@ -205,13 +205,13 @@ class AzureKinectSource(FileSource):
         )
         return sampled_color(frame, image, self.color_camera, where)
 
-    def _beside(self, track: Track | None, limit: float, delay: int) -> list[Block | None]:
+    def _matched_blocks(self, track: Track | None, limit: float, delay: int) -> list[Block | None]:
         """The block of another track at the time of each depth frame, or None."""
         if track is None or not track.blocks:
             return [None] * len(self.depth)
-        own = np.array([b.time_ns - delay for b in self.depth]) / 1e9
+        depth_times = np.array([b.time_ns - delay for b in self.depth]) / 1e9
         times = np.array([b.time_ns for b in track.blocks]) / 1e9
-        pairs = associate(own, times, limit=limit, exclusive=False)
+        pairs = associate(depth_times, times, limit=limit, exclusive=False)
         if (pairs < 0).any():
             self.warnings.append(
                 f"{int((pairs < 0).sum())} of {len(pairs)} frames have no {track.name} image"
@@ -223,17 +223,17 @@ class AzureKinectSource(FileSource):
         self.kind: DepthKind = "z"
         self.color_camera: ColorCamera | None = None
         if options.camera is None:
-            self._read_own_cameras(color)
+            self._read_calibration(color)
         else:
-            with suppress(InputError):  # possibly the reason for a user-given camera
-                self._read_own_cameras(color)
-            about, self.camera = load_camera(options.camera, self.size)
-            self.unit, self.kind = about.depth_unit_m, about.depth_kind
-            self.color_camera = about.color or self.color_camera
+            with suppress(InputError):  # possibly the reason for a camera passed by the user
+                self._read_calibration(color)
+            description, self.camera = load_camera(options.camera, self.size)
+            self.unit, self.kind = description.depth_unit_m, description.depth_kind
+            self.color_camera = description.color or self.color_camera
         if self.color_camera is None:
             self.color = [None] * len(self.depth)
 
-    def _read_own_cameras(self, color: Track | None) -> None:
+    def _read_calibration(self, color: Track | None) -> None:
         name = self.file.tags.get("K4A_CALIBRATION_FILE", "calibration.json")
         where = f"{self.file.path}: {name}"
         self.calibration = _calibration(self.file.attachments.get(name), where)
@@ -261,8 +261,8 @@ class AzureKinectSource(FileSource):
         return ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
 
     def _sensor(self) -> str:
-        about = getattr(self, "calibration", {})
-        name = str(_get(about, "CalibrationInformation", "Metadata", "DeviceName") or "")
+        calibration = getattr(self, "calibration", {})
+        name = str(_get(calibration, "CalibrationInformation", "Metadata", "DeviceName") or "")
         return f"{name[:40]} (ToF)" if "femto" in name.lower() else "Azure Kinect (ToF)"
 
 
@@ -285,9 +285,9 @@ def _image_size(track: Track, path: Path) -> tuple[int, int]:
 
 def _mode(tags: dict[str, str], size: tuple[int, int], path: Path) -> str:
     """The depth mode, identified by its unique image size."""
-    named = tags.get("K4A_DEPTH_MODE", "")
-    if named in DEPTH_MODES and DEPTH_MODES[named].size == size:
-        return named
+    tag = tags.get("K4A_DEPTH_MODE", "")
+    if tag in DEPTH_MODES and DEPTH_MODES[tag].size == size:
+        return tag
     for name, window in DEPTH_MODES.items():
         if window.size == size:
             return name
@@ -304,14 +304,14 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
             "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
     try:
-        found = json.loads(data.rstrip(b"\0"))
+        calibration = json.loads(data.rstrip(b"\0"))
     except (ValueError, RecursionError) as error:
         raise InputError(
             "is invalid JSON", where=where, remedy="pass the depth camera with --camera"
         ) from error
-    if not isinstance(found, dict):
+    if not isinstance(calibration, dict):
         raise InputError("is not a JSON object", where=where, remedy="use --camera")
-    return found
+    return calibration
 
 
 def _lens(
@@ -321,14 +321,14 @@ def _lens(
     where = f"{where}: {camera}"
     remedy = "pass the depth camera with --camera"
     cameras = _get(calibration, "CalibrationInformation", "Cameras")
-    found = [
+    matches = [
         c
         for c in (cameras if isinstance(cameras, list) else [])
         if isinstance(c, dict) and c.get("Location") == _LOCATIONS[camera]
     ]
-    if not found:
+    if not matches:
         raise InputError("there is no such camera", where=where, remedy=remedy)
-    data = found[0]
+    data = matches[0]
     model = str(_get(data, "Intrinsics", "ModelType"))
     if model not in _MODELS:
         raise InputError(f"has the model {model:.60}", where=where, remedy=remedy)
@@ -339,22 +339,22 @@ def _lens(
         radius = float(data.get("MetricRadius") or METRIC_RADIUS)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError("isn't made of numbers", where=where, remedy=remedy) from error
-    good = p.shape == (14,) and np.isfinite(p).all() and (np.abs(p) < 1e4).all()
-    if not good or not (0.01 < p[2] < 100 and 0.01 < p[3] < 100):
+    plausible = p.shape == (14,) and np.isfinite(p).all() and (np.abs(p) < 1e4).all()
+    if not plausible or not (0.01 < p[2] < 100 and 0.01 < p[3] < 100):
         raise InputError("isn't 14 plausible ModelParameters", where=where, remedy=remedy)
     if p[10] or p[11]:
         raise InputError("has a shifted centre of distortion", where=where, remedy=remedy)
-    whole, corner = np.array(window.whole, float), np.array(window.corner, float)
+    full_size, corner = np.array(window.full_size, float), np.array(window.corner, float)
     # Stored relative to the image size, from its corner instead of a pixel's centre.
-    cx, cy = p[:2] * whole - corner - 0.5
-    fx, fy = p[2:4] * whole
+    cx, cy = p[:2] * full_size - corner - 0.5
+    fx, fy = p[2:4] * full_size
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "p1": p[13], "p2": p[12]}
     values |= {f"k{k}": p[3 + k] for k in range(1, 7)}
     lens = KinectLens(
         window.size[0],
         window.size[1],
         metric_radius=radius if 0.01 < radius < 100 else METRIC_RADIUS,
-        mixed=_MODELS[model],
+        tangential_factor=_MODELS[model],
         **{name: float(value) for name, value in values.items()},
     )
     T = np.eye(4)
@@ -368,7 +368,7 @@ def _get(data: Any, *keys: str) -> Any:
     return data
 
 
-def _whole(text: str | None) -> int:
+def _integer(text: str | None) -> int:
     """The integer value of a tag, 0 if it is missing or invalid."""
     try:
         value = int(text or 0)

@@ -18,7 +18,7 @@ from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 
-_ENDS = ("_depth16.bin", ".depth16")
+_SUFFIXES = ("_depth16.bin", ".depth16")
 _BITS = 13
 CONFIDENCE_MAX = 7.0
 
@@ -102,9 +102,9 @@ class Depth16Source(FileSource):
 
 
 def _files(path: Path) -> list[Path]:
-    return files_named(path, lambda name: name.lower().endswith(_ENDS))
+    return files_named(path, lambda name: name.lower().endswith(_SUFFIXES))
 
 
 def _color(file: Path) -> Path | None:
-    end = next(end for end in _ENDS if file.name.lower().endswith(end))
-    return if_file(file.with_name(f"{file.name[: -len(end)]}_image.jpg"))
+    suffix = next(suffix for suffix in _SUFFIXES if file.name.lower().endswith(suffix))
+    return if_file(file.with_name(f"{file.name[: -len(suffix)]}_image.jpg"))

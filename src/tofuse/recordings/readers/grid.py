@@ -26,7 +26,7 @@ from tofuse.recordings.organised import (
     common_camera,
     find_raster,
     organised_frame,
-    origin_behind,
+    ray_origin_offset,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FARTHEST_M, to_float32
@@ -37,7 +37,7 @@ MAX_POINTS = 1 << 22
 # Mean distances of ToF cameras are below 50 m and above 50 mm.
 MM_FROM = 50.0
 # Unorganised points: largest distance from the pixel's ray (px), and min fraction within it.
-_OFF_RAY, _ON_RAYS = 0.3, 0.8
+_MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
@@ -53,13 +53,13 @@ class Grid:
             files = cloud_files(path, *_SUFFIXES)
             if not files or (is_folder(path) and is_file(path / "run.json")):
                 return None
-            now = files[0].stat()
-            found = _first(files[0], now.st_mtime_ns, now.st_size)
+            status = files[0].stat()
+            raster = _first_raster(files[0], status.st_mtime_ns, status.st_size)
         except (InputError, OSError):
             return None
-        if found is None:
+        if raster is None:
             return None
-        return Sniff(1.0, f"{len(files)} clouds of {found.width} x {found.height} pixels")
+        return Sniff(1.0, f"{len(files)} clouds of {raster.width} x {raster.height} pixels")
 
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
@@ -77,25 +77,25 @@ class Grid:
             if raster is not None and len(cells.points) == raster.width * raster.height:
                 images.append(raster.image(cells.points))
         if raster is None or not images:
-            raise _refusal(path)
+            raise _not_organised(path)
         scale = 1e-3 if _median_z(images[0]) > MM_FROM else 1.0
         images = [image * np.float32(scale) for image in images]
-        behind, camera = 0.0, common_camera(images)
+        offset, camera = 0.0, common_camera(images)
         if camera is None:
-            behind = origin_behind(images)
-            camera = common_camera([_moved(image, behind) for image in images])
+            offset = ray_origin_offset(images)
+            camera = common_camera([_shifted(image, offset) for image in images])
         if camera is None:
-            raise _refusal(path)
-        frames = _Frames(raster, camera, scale, behind)
+            raise _not_organised(path)
+        frames = _Frames(raster, camera, scale, offset)
         source = CloudFileSource(path, files, frames.load)
         source.metadata |= {"depth_kind": "z"}
-        if behind:
+        if offset:
             source.warnings.append(
-                f"the origin is {1000 * behind:.1f} mm in front of the camera's centre of "
+                f"the origin is {1000 * offset:.1f} mm in front of the camera's centre of "
                 "projection; points are shifted to the centre"
             )
-        if raster.turned:
-            source.warnings.append(f"{raster.turned} against the pixels, and reversed")
+        if raster.reversed_axes:
+            source.warnings.append(f"{raster.reversed_axes} against the pixels, and reversed")
         return source
 
 
@@ -116,8 +116,8 @@ class Cells:
 def read_cells(path: Path) -> Cells:
     """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
     cells = _read(path)
-    sound = np.asarray((np.abs(cells.points) < FARTHEST_M).all(1))
-    return replace(cells, points=np.where(sound[:, None], cells.points, np.float32(np.nan)))
+    plausible = np.asarray((np.abs(cells.points) < FARTHEST_M).all(1))
+    return replace(cells, points=np.where(plausible[:, None], cells.points, np.float32(np.nan)))
 
 
 def _read(path: Path) -> Cells:
@@ -127,8 +127,8 @@ def _read(path: Path) -> Cells:
         return _cells(pcd.cloud, pcd.width if pcd.organised else None)
     if suffix == ".ply":
         ply = read_ply(path)
-        stated = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
-        width = stated.get("num_cols", "")
+        declared = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
+        width = declared.get("num_cols", "")
         return _cells(ply, int(width) if width.isdecimal() else None)
     return _read_csv(path)
 
@@ -140,18 +140,18 @@ def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
 def _read_csv(path: Path) -> Cells:
     text = read_text(path)
     head = text[: text.find("\n")].lower().replace(";", ",").replace("\t", ",")
-    names = [word.strip(' "#').split("[")[0].split("(")[0].strip() for word in head.split(",")]
-    named = {"x", "y", "z"} <= set(names)
-    table = parse_numbers(text, path, skip=int(named))
+    names = [cell.strip(' "#').split("[")[0].split("(")[0].strip() for cell in head.split(",")]
+    has_header = {"x", "y", "z"} <= set(names)
+    table = parse_numbers(text, path, skip=int(has_header))
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError("has no x, y and z per line", where=path, remedy="export x, y, z")
-    columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if named else {}
-    at = [columns.get(name, k) for k, name in enumerate("xyz")]
+    columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if has_header else {}
+    indices = [columns.get(name, k) for k, name in enumerate("xyz")]
     column = next((columns[name] for name in _AMPLITUDES if name in columns), None)
-    if not named and table.shape[1] == 4:
+    if not has_header and table.shape[1] == 4:
         column = 3
     with np.errstate(over="ignore"):
-        points = to_float32(table[:, at])
+        points = to_float32(table[:, indices])
         amplitude = None if column is None else to_float32(table[:, column])
     return Cells(points, amplitude)
 
@@ -163,15 +163,15 @@ class _Frames:
     raster: Raster
     camera: Camera
     scale: float
-    behind: float
+    offset: float
 
     def load(self, path: Path, index: int, timestamp: float) -> RangeFrame:
         cells = read_cells(path)
-        whole = len(cells.points) == self.raster.width * self.raster.height
-        points = self.raster.image(cells.points) if whole else cells.points
-        points = _moved(points * np.float32(self.scale), self.behind)
-        if not whole:
-            points, cells = self._placed(points, cells, path)
+        complete = len(cells.points) == self.raster.width * self.raster.height
+        points = self.raster.image(cells.points) if complete else cells.points
+        points = _shifted(points * np.float32(self.scale), self.offset)
+        if not complete:
+            points, cells = self._to_pixels(points, cells, path)
         return organised_frame(
             points,
             self.camera,
@@ -182,42 +182,50 @@ class _Frames:
             color=cells.color,
         )
 
-    def _placed(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
+    def _to_pixels(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
         """Assign points (n, 3), of a file without invalid ones, to pixels by their rays."""
         from scipy.spatial import cKDTree
 
         rays = self.camera.rays().reshape(-1, 2)
-        known = np.flatnonzero(np.isfinite(rays).all(-1))
-        seen = np.flatnonzero(np.isfinite(points).all(-1) & (points[:, 2] > 0))
-        off, near = cKDTree(rays[known]).query(points[seen, :2] / points[seen, 2:])
-        pixel = self.raster.width * self.raster.height
-        step = float(np.ptp(rays[known], axis=0).max()) / max(self.raster.width, self.raster.height)
+        has_ray = np.flatnonzero(np.isfinite(rays).all(-1))
+        measured = np.flatnonzero(np.isfinite(points).all(-1) & (points[:, 2] > 0))
+        distance, nearest = cKDTree(rays[has_ray]).query(
+            points[measured, :2] / points[measured, 2:]
+        )
+        count = self.raster.width * self.raster.height
+        step = float(np.ptp(rays[has_ray], axis=0).max()) / max(
+            self.raster.width, self.raster.height
+        )
         # Pixels without a measurement in the sampled files have no ray.
-        on = off < _OFF_RAY * step
-        at, seen = known[near[on]], seen[on]
-        if len(points) > pixel or len(np.unique(at)) < len(at) or np.mean(on) < _ON_RAYS:
+        on_ray = distance < _MAX_RAY_DISTANCE_PX * step
+        pixel, measured = has_ray[nearest[on_ray]], measured[on_ray]
+        if (
+            len(points) > count
+            or len(np.unique(pixel)) < len(pixel)
+            or np.mean(on_ray) < _MIN_ON_RAYS
+        ):
             raise InputError(
                 f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
                 "they are not on the rays of the previous files",
                 where=path,
                 remedy="export all points, including invalid ones",
             )
-        image = np.full((pixel, 3), np.nan, np.float32)
-        image[at] = points[seen]
+        image = np.full((count, 3), np.nan, np.float32)
+        image[pixel] = points[measured]
         amplitude, color = cells.amplitude, cells.color
         if amplitude is not None:
-            amplitude, chosen = np.zeros(pixel, np.float32), amplitude[seen]
-            amplitude[at] = chosen
+            amplitude, measured_amplitude = np.zeros(count, np.float32), amplitude[measured]
+            amplitude[pixel] = measured_amplitude
         if color is not None:
-            color, picked = np.zeros((pixel, 3), np.uint8), color[seen]
-            color[at] = picked
+            color, measured_color = np.zeros((count, 3), np.uint8), color[measured]
+            color[pixel] = measured_color
         shape = (self.raster.height, self.raster.width, 3)
         return image.reshape(shape), Cells(image, amplitude, color)
 
 
-def _moved(points: Float32, behind: float) -> Float32:
-    """Points (..., 3) relative to an origin `behind` metres farther back; keeps invalid ones."""
-    z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(behind), points[..., 2])
+def _shifted(points: Float32, offset: float) -> Float32:
+    """Points (..., 3) relative to an origin `offset` metres farther back; keeps invalid ones."""
+    z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(offset), points[..., 2])
     return np.concatenate([points[..., :2], z[..., None]], axis=-1)
 
 
@@ -227,7 +235,7 @@ def _median_z(image: Float32) -> float:
     return float(np.median(z)) if len(z) else 0.0
 
 
-def _refusal(path: Path) -> InputError:
+def _not_organised(path: Path) -> InputError:
     return InputError(
         "doesn't contain one point per pixel of a camera",
         where=path,
@@ -236,11 +244,11 @@ def _refusal(path: Path) -> InputError:
 
 
 @lru_cache(maxsize=4)
-def _first(file: Path, changed_ns: int, size: int) -> Raster | None:
+def _first_raster(file: Path, changed_ns: int, size: int) -> Raster | None:
     """The raster of a file's points; None if there is none, or if the reader pcd applies."""
     cells = read_cells(file)
     raster = cells.raster()
     if raster is None:
         return None
-    ours = file.suffix.lower() != ".pcd" or _median_z(raster.image(cells.points)) > MM_FROM
-    return raster if ours else None
+    applies = file.suffix.lower() != ".pcd" or _median_z(raster.image(cells.points)) > MM_FROM
+    return raster if applies else None

@@ -42,20 +42,20 @@ class HoloLens2:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        found = _streams(path)
-        return Sniff(1.0, f"{found[0]}_lut.bin") if found else None
+        streams = _streams(path)
+        return Sniff(1.0, f"{streams[0]}_lut.bin") if streams else None
 
     def open(self, path: Path, options: ReaderOptions) -> HoloLens2Source:
         """See `Reader.open`."""
         refuse_camera(options, "hololens2", PER_FRAME)
-        found = _streams(path)
-        if not found:
+        streams = _streams(path)
+        if not streams:
             raise InputError(
                 "has no 'Depth Long Throw_lut.bin' with images", where=path, remedy=_REMEDY
             )
-        source = HoloLens2Source(path, found[0])
-        if len(found) > 1:
-            source.warnings.append(f"{found[1]} is ignored: {found[0]} reaches farther")
+        source = HoloLens2Source(path, streams[0])
+        if len(streams) > 1:
+            source.warnings.append(f"{streams[1]} is ignored: {streams[0]} reaches farther")
         return source
 
 
@@ -65,12 +65,12 @@ class HoloLens2Source(FileSource):
     concurrent = True
 
     def __init__(self, folder: Path, stream: str) -> None:
-        self.images, whole = _images(folder, stream)
+        self.images, complete = _images(folder, stream)
         self.ticks = sorted(tick for tick, bright in self.images if not bright)
         if not self.ticks:
             raise InputError("contains no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
         super().__init__(np.array(self.ticks, float) / _TICKS)
-        if not whole:
+        if not complete:
             archive = folder / f"{stream}.tar"
             self.warnings.append(f"{archive} is cut off or damaged: its end is left out")
         self.ambiguity_m = _STREAMS[stream]
@@ -87,50 +87,55 @@ class HoloLens2Source(FileSource):
 
     def _size(self) -> tuple[int, int]:
         """(height, width) of the first image that can be read."""
-        error: InputError | None = None
+        first_error: InputError | None = None
         for tick in self.ticks:
             try:
                 height, width = self._image(tick, bright=False).shape
-            except InputError as trouble:
-                error = error or trouble
+            except InputError as error:
+                first_error = first_error or error
                 continue
             return height, width
-        assert error is not None
-        raise error
+        assert first_error is not None
+        raise first_error
 
     def _read_poses(self, folder: Path, stream: str) -> None:
         """Read T_world_rig of each frame, and the pose of the camera in the rig."""
-        fixed, moving = folder / f"{stream}_extrinsics.txt", folder / f"{stream}_rig2world.txt"
-        if not is_file(fixed) or not is_file(moving):
-            missing = moving if is_file(fixed) else fixed
+        extrinsics, trajectory = (
+            folder / f"{stream}_extrinsics.txt",
+            folder / f"{stream}_rig2world.txt",
+        )
+        if not is_file(extrinsics) or not is_file(trajectory):
+            missing = trajectory if is_file(extrinsics) else extrinsics
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
-            T_camera_rig = read_matrix_pose(read_numbers(fixed).reshape(4, 4), str(fixed))
-            table = read_numbers(moving)
+            T_camera_rig = read_matrix_pose(read_numbers(extrinsics).reshape(4, 4), str(extrinsics))
+            table = read_numbers(trajectory)
             if table.shape[-1] != 17:
-                raise InputError("has no rows of 17 numbers", where=moving, remedy=_REMEDY)
+                raise InputError("has no rows of 17 numbers", where=trajectory, remedy=_REMEDY)
         except (InputError, ValueError) as error:
             self.warnings.append(f"no reference poses: {error}")
             return
         # Ticks have more digits than float64.
-        rows = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
-        order = np.argsort(rows, kind="stable")
-        near = np.searchsorted(rows[order], np.array(self.ticks, float) - 64)
+        row_ticks = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
+        order = np.argsort(row_ticks, kind="stable")
+        nearest = np.searchsorted(row_ticks[order], np.array(self.ticks, float) - 64)
         poses = np.full((len(self.ticks), 4, 4), np.nan)
-        wrong: list[InputError] = []
-        for k, (tick, place) in enumerate(zip(self.ticks, near.tolist(), strict=True)):
-            if place == len(rows) or abs(rows[order[place]] - tick) > 64:
+        errors: list[InputError] = []
+        for k, (tick, position) in enumerate(zip(self.ticks, nearest.tolist(), strict=True)):
+            if position == len(row_ticks) or abs(row_ticks[order[position]] - tick) > 64:
                 continue
-            row = order[place]
+            row = order[position]
             try:
-                T_world_rig = read_matrix_pose(table[row, 1:].reshape(4, 4), f"{moving}, row {row}")
+                T_world_rig = read_matrix_pose(
+                    table[row, 1:].reshape(4, 4), f"{trajectory}, row {row}"
+                )
             except InputError as error:
-                wrong.append(error)
+                errors.append(error)
                 continue
             poses[k] = T_world_rig @ se3.inverse(T_camera_rig)
-        if wrong:
-            self.warnings.append(f"{len(wrong)} poses can't be read, the first: {wrong[0]}")
+        if errors:
+            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
         if np.isfinite(poses).any():
             self.reference = poses
 
@@ -194,35 +199,35 @@ _Images = dict[tuple[int, bool], tuple[Path, int, int]]
 def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
     """All images of a stream: from its folder if extracted, else from its archive.
 
-    Also whether they are all of the archive, which ends with blocks of zeros.
+    Also whether the archive is complete: it ends with blocks of zeros.
     """
-    found: _Images = {}
+    images: _Images = {}
     if is_folder(folder / stream):
         for path in list_folder(folder / stream):
             match = _NAME.fullmatch(path.name)
             if match and is_file(path):
-                found[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
+                images[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
     path = folder / f"{stream}.tar"
-    if found or not is_file(path):
-        return found, True
+    if images or not is_file(path):
+        return images, True
     try:
         with tarfile.open(path, "r:") as archive:
             for member in archive:
                 match = _NAME.fullmatch(member.name)
                 if match and member.isfile():
-                    place = (path, member.offset_data, member.size)
-                    found[int(match[1]), match[2] is not None] = place
+                    location = (path, member.offset_data, member.size)
+                    images[int(match[1]), match[2] is not None] = location
             end = archive.offset
         with path.open("rb") as file:
             file.seek(end)
-            whole = file.read(tarfile.BLOCKSIZE) == bytes(tarfile.BLOCKSIZE)
+            complete = file.read(tarfile.BLOCKSIZE) == bytes(tarfile.BLOCKSIZE)
     except OSError as error:
         raise input_error(error, path) from error
     except (tarfile.TarError, ValueError, EOFError) as error:
-        if not found:
+        if not images:
             raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error
-        whole = False
-    return found, whole
+        complete = False
+    return images, complete
 
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
@@ -238,5 +243,5 @@ def _rays(path: Path, shape: tuple[int, int]) -> Float32:
     table = np.frombuffer(data, "<f4").reshape(height, width, 3).astype(float)
     with np.errstate(all="ignore"):
         rays = table[..., :2] / table[..., 2:]
-        good = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
-    return np.where(good[..., None], rays, np.nan).astype(np.float32)
+        valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
+    return np.where(valid[..., None], rays, np.nan).astype(np.float32)

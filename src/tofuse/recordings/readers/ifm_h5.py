@@ -24,14 +24,14 @@ from tofuse.recordings.sources import FileSource
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _STREAM = "o3r_tof_"
-_NEEDED = (
+_REQUIRED = (
     "distance",
     "distanceResolution",
     "intrinsicCalibModelID",
     "intrinsicCalibModelParameters",
 )
 _MAX_FRAMES, _MAX_BYTES = 1_000_000, 1 << 26  # per file, and per frame
-_LENS_NUMBERS = 10
+_LENS_PARAMETERS = 10
 
 
 @part("reader", "ifm-h5", label="experimental")
@@ -43,8 +43,8 @@ class IfmH5:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        found = begins_with(file_of(path, ".h5", ".hdf5"), _MAGIC)
-        return Sniff(0.95, "an HDF5 file") if found else None
+        matches = begins_with(file_of(path, ".h5", ".hdf5"), _MAGIC)
+        return Sniff(0.95, "an HDF5 file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmH5Source:
         """See `Reader.open`."""
@@ -58,7 +58,7 @@ class IfmH5Source(FileSource):
     def __init__(self, path: Path, stream: str | None) -> None:
         self.path = path
         h5py = required_package("h5py", "hdf5", path)
-        self._one_at_a_time = threading.Lock()
+        self._lock = threading.Lock()
         try:
             file = h5py.File(path, "r")
             weakref.finalize(self, file.close)
@@ -91,7 +91,7 @@ class IfmH5Source(FileSource):
         self.name = stream or self.names[0]
         self.rows = streams[self.name]
         self.fields = self.rows.dtype.names or ()
-        for name in _NEEDED:
+        for name in _REQUIRED:
             if name not in self.fields:
                 raise InputError(f"has no {name}", where=f"{self.path}: {self.name}")
         if not 0 < len(self.rows) <= _MAX_FRAMES or self.rows.dtype.itemsize > _MAX_BYTES:
@@ -114,7 +114,7 @@ class IfmH5Source(FileSource):
         """See `FileSource.load`."""
         where = f"{self.path}: {self.name}, frame {index}"
         try:
-            with self._one_at_a_time:
+            with self._lock:
                 row = self.rows[index]
             return self._frame(row, index, where)
         except InputError:
@@ -124,10 +124,10 @@ class IfmH5Source(FileSource):
 
     def _frame(self, row: Any, index: int, where: str) -> RangeFrame:
         counts = self._image(row, "distance", where)
-        numbers = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
+        stored = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
-        found = tuple(numbers[:_LENS_NUMBERS].tolist())
-        info: HeadInfo = checked_info(unit, model, found, where)
+        parameters = tuple(stored[:_LENS_PARAMETERS].tolist())
+        info: HeadInfo = checked_info(unit, model, parameters, where)
         distance = info.metres(counts)
         if "confidence" in self.fields:
             flags = self._image(row, "confidence", where, counts.shape)
@@ -136,8 +136,8 @@ class IfmH5Source(FileSource):
             distance = np.where(flags & INVALID, np.float32(0), distance)
         noise = amplitude = None
         if "distanceNoise" in self.fields:
-            own = self._image(row, "distanceNoise", where, counts.shape)
-            noise = np.nan_to_num(info.metres(own), posinf=0, neginf=0)
+            noise_counts = self._image(row, "distanceNoise", where, counts.shape)
+            noise = np.nan_to_num(info.metres(noise_counts), posinf=0, neginf=0)
         if "amplitude" in self.fields:
             amplitude = self._image(row, "amplitude", where, counts.shape).astype(np.float32)
             amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)

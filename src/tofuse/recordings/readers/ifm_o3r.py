@@ -92,16 +92,16 @@ class IfmO3rSource(FileSource):
         counts = chunk_image(self.data, chunks[DISTANCE], where)
         distance = info.metres(counts)
         if CONFIDENCE in chunks:
-            flags = self._same_size(chunks[CONFIDENCE], counts.shape, where)
+            flags = self._image(chunks[CONFIDENCE], counts.shape, where)
             if flags.dtype.kind not in "ui":
                 raise InputError("has flags that are not integers", where=where)
             distance = np.where(flags & INVALID, np.float32(0), distance)
         noise = amplitude = None
         if NOISE in chunks:
-            own = self._same_size(chunks[NOISE], counts.shape, where)
-            noise = np.nan_to_num(info.metres(own), posinf=0, neginf=0)
+            noise_counts = self._image(chunks[NOISE], counts.shape, where)
+            noise = np.nan_to_num(info.metres(noise_counts), posinf=0, neginf=0)
         if AMPLITUDE in chunks:
-            amplitude = self._same_size(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
+            amplitude = self._image(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
             amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
         return RangeFrame(
             index,
@@ -113,7 +113,7 @@ class IfmO3rSource(FileSource):
             sigma_image=noise,
         )
 
-    def _same_size(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:
+    def _image(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:
         image: NDArray[Any] = chunk_image(self.data, chunk, where)
         if image.shape != shape:
             raise InputError(
@@ -134,8 +134,8 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
     for k, chunks in enumerate(frames):
         if not isinstance(chunks, InputError) and chunks:
             times[k] = next(iter(chunks.values())).time
-    known, index = np.isfinite(times), np.arange(len(times))
-    if not known.any():
+    valid, index = np.isfinite(times), np.arange(len(times))
+    if not valid.any():
         return index.astype(float)
-    times[~known] = np.interp(index[~known], index[known], times[known])
+    times[~valid] = np.interp(index[~valid], index[valid], times[valid])
     return times

@@ -70,8 +70,8 @@ class Kinect2:
 
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len("_depth.png")]
-    found = (file.with_name(f"{stem}_color{suffix}") for suffix in (".jpg", ".png"))
-    return next((path for path in found if is_file(path)), None)
+    candidates = (file.with_name(f"{stem}_color{suffix}") for suffix in (".jpg", ".png"))
+    return next((path for path in candidates if is_file(path)), None)
 
 
 def _calibration(folder: Path, name: str) -> Path | None:
@@ -79,10 +79,10 @@ def _calibration(folder: Path, name: str) -> Path | None:
     if is_file(folder / name):
         return folder / name
     try:
-        found = [p / name for p in list_folder(folder) if is_folder(p) and is_file(p / name)]
+        files = [p / name for p in list_folder(folder) if is_folder(p) and is_file(p / name)]
     except InputError:
         return None
-    return found[0] if len(found) == 1 else None
+    return files[0] if len(files) == 1 else None
 
 
 def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
@@ -112,6 +112,6 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
 
 def _numbers(text: str) -> Float64:
     try:
-        return np.array([float(word) for word in text.replace(",", " ").split()])
+        return np.array([float(cell) for cell in text.replace(",", " ").split()])
     except ValueError:
         return np.zeros(0)

@@ -79,14 +79,14 @@ class NativeSource(FileSource):
         rate = self.description.frame_rate_hz
         super().__init__(np.arange(len(self.files)) / (rate or 1.0))
         self._read_timestamps()
-        self.amplitude = self._channel("amplitude", ".png")
-        self.confidence = self._channel("confidence", ".png")
-        self.color = self._channel("color", *_IMAGES)
-        self.sigma = self._channel("sigma", ".png")
-        self.rays = self._channel("rays", ".npy")
+        self.amplitude = self._channel_files("amplitude", ".png")
+        self.confidence = self._channel_files("confidence", ".png")
+        self.color = self._channel_files("color", *_IMAGES)
+        self.sigma = self._channel_files("sigma", ".png")
+        self.rays = self._channel_files("rays", ".npy")
         self.by_frequency = self._frequencies()
         if camera_file is not None:
-            self.rays = []  # a given camera applies to all frames
+            self.rays = []  # the camera passed by the user applies to all frames
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
@@ -114,7 +114,7 @@ class NativeSource(FileSource):
         camera = self._camera_of(index, self.camera)
         kind = self.description.depth_kind
         if self.by_frequency:
-            depth = self._combined(index, camera, size, kind)
+            depth = self._unwrapped_depth(index, camera, size, kind)
         else:
             counts = read_image(self.files[index], size=size, dtype="uint16")
             depth = depth_from_counts(counts, self.description.depth_unit_m)
@@ -150,12 +150,12 @@ class NativeSource(FileSource):
         )
 
     def _camera_of(self, index: int, camera: Camera) -> Camera:
-        """Return the camera of one frame, where each has its own."""
+        """Return the camera of a frame: its own, if the recording has one per frame."""
         if self.cameras:
-            own = self.cameras[index]
-            if isinstance(own, InputError):
-                raise own
-            return own
+            lens = self.cameras[index]
+            if isinstance(lens, InputError):
+                raise lens
+            return lens
         if not self.rays:
             return camera
         table = read_rays(self.rays[index])
@@ -177,25 +177,25 @@ class NativeSource(FileSource):
         ):
             return []
         cameras: list[Pinhole | InputError] = []
-        known: dict[tuple[float, ...], Pinhole] = {}
+        lenses: dict[tuple[float, ...], Pinhole] = {}
         for k, row in enumerate(zip(*(columns[name] for name in LENS_COLUMNS), strict=True)):
             try:
                 values = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
                 values |= {name: float(v) for name, v in zip(LENS_COLUMNS, row, strict=True)}
                 where = f"{self.folder / 'frames.csv'}, row {k + 1}"
                 size = (camera.width, camera.height)
-                if row not in known:
-                    known[row] = checked_lens(type(camera), size, values, where)
-                cameras.append(known[row])
+                if row not in lenses:
+                    lenses[row] = checked_lens(type(camera), size, values, where)
+                cameras.append(lenses[row])
             except InputError as error:
                 cameras.append(error)
         return cameras
 
-    def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:
+    def _read_camera(self, camera_file: Path | None) -> tuple[CameraFile, Camera | None]:
         path = self.folder / "camera.json"
         if not self.is_clouds:
-            return load_camera(given or path)
-        if given is not None:
+            return load_camera(camera_file or path)
+        if camera_file is not None:
             raise InputError(
                 "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
             )
@@ -217,7 +217,7 @@ class NativeSource(FileSource):
         self.timestamps = table[:, 0]
         check_timestamps(self.timestamps, path, self.warnings)
 
-    def _channel(self, name: str, *suffixes: str) -> list[Path]:
+    def _channel_files(self, name: str, *suffixes: str) -> list[Path]:
         folder = self.folder / name
         if self.is_clouds or not is_folder(folder):
             return []
@@ -234,28 +234,30 @@ class NativeSource(FileSource):
         if self.is_clouds or not is_folder(folder):
             return {}
         images: dict[float, list[Path]] = {}
-        for own in list_folder(folder):
+        for subfolder in list_folder(folder):
             try:
-                hertz = float(own.name)
+                hertz = float(subfolder.name)
             except ValueError:
                 hertz = math.nan
-            if not 1e5 <= hertz <= 1e10 or not is_folder(own):
+            if not 1e5 <= hertz <= 1e10 or not is_folder(subfolder):
                 raise InputError(
-                    "isn't a frequency", where=own, remedy="name the folder in Hz, as 30000000"
+                    "isn't a frequency",
+                    where=subfolder,
+                    remedy="name the folder in Hz, as 30000000",
                 )
-            images[hertz] = files_with(own, ".png")
+            images[hertz] = files_with(subfolder, ".png")
             if len(images[hertz]) != len(self.files):
-                raise self._count_error(own, f"{len(images[hertz])} images")
+                raise self._count_error(subfolder, f"{len(images[hertz])} images")
         if len(images) == 1:
             raise InputError(
                 "has only one frequency", where=folder, remedy="use two or more, or remove it"
             )
         return images
 
-    def _combined(
+    def _unwrapped_depth(
         self, index: int, camera: Camera, size: tuple[int, int], kind: DepthKind
     ) -> Float32:
-        """The depth that is consistent with all frequencies; 0 where there is none."""
+        """Depth unwrapped with all frequencies; 0 where they are inconsistent."""
         unit = self.description.depth_unit_m
         periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
         ranges = []
@@ -263,9 +265,9 @@ class NativeSource(FileSource):
             counts = read_image(files[index], size=size, dtype="uint16")
             depth = depth_from_counts(counts, unit)
             ranges.append(depth if kind == "range" else range_from_z(camera, depth))
-        radial, apart = combined(ranges, periods)
-        agreed = np.where(apart < DISAGREEMENT * min(periods), radial, np.float32(0))
-        return agreed if kind == "range" else z_from_range(camera, agreed)
+        radial, disagreement = combined(ranges, periods)
+        consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))
+        return consistent if kind == "range" else z_from_range(camera, consistent)
 
     def _read_correction(self) -> DepthCorrection | None:
         path = self.folder / "correction.npz"
@@ -323,20 +325,21 @@ class NativeSource(FileSource):
         check_first_size(self.color, size, where, remedy)
 
     def _fill_metadata(self) -> None:
-        about = self.description
-        if about.unknown:
+        description = self.description
+        if description.unknown:
             self.warnings.append(
-                f"{self.folder / 'camera.json'}: unknown fields ignored: {', '.join(about.unknown)}"
+                f"{self.folder / 'camera.json'}: unknown fields ignored: "
+                f"{', '.join(description.unknown)}"
             )
         for name in ("sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
-            if getattr(about, name) is not None:
-                self.metadata[name] = getattr(about, name)
+            if getattr(description, name) is not None:
+                self.metadata[name] = getattr(description, name)
         if self.camera is not None:
-            self.metadata["depth_unit_m"] = about.depth_unit_m
-            self.metadata["depth_kind"] = about.depth_kind
+            self.metadata["depth_unit_m"] = description.depth_unit_m
+            self.metadata["depth_kind"] = description.depth_kind
             self.metadata["corrected"] = self.correction is not None
             if self.sigma:
-                self.metadata["sigma_unit_m"] = about.sigma_unit_m
+                self.metadata["sigma_unit_m"] = description.sigma_unit_m
         if is_folder(self.folder / "truth"):
             self.metadata["truth"] = str(self.folder / "truth")
 

@@ -33,7 +33,7 @@ _MODELS = {
     "OPENCV": "brown",
     "OPENCV_FISHEYE": "fisheye",
 }
-_SNIFFED = 1 << 16
+_HEAD_BYTES = 1 << 16
 _REMEDY = "correct it there"
 
 
@@ -48,7 +48,7 @@ class Nerfstudio:
         """See `Reader.sniff`."""
         file = _file(path)
         try:
-            head = read_head(file, _SNIFFED) if is_file(file) else b""
+            head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
         except InputError:
             return None
         if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
@@ -68,11 +68,11 @@ class NerfstudioSource(FileSource):
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        about = read_json(file)
-        listed = about.get("frames")
-        if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+        document = read_json(file)
+        entries = document.get("frames")
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("has no list of frames", where=file, remedy=_REMEDY)
-        self.frames = [_Frame(about, each, k, file) for k, each in enumerate(listed)]
+        self.frames = [_Frame(document, entry, k, file) for k, entry in enumerate(entries)]
         with_depth = [frame for frame in self.frames if frame.path(*_DEPTH) is not None]
         if not with_depth:
             raise InputError(
@@ -80,35 +80,35 @@ class NerfstudioSource(FileSource):
                 where=file,
                 remedy="record depth too: colour alone is not sufficient",
             )
-        left_out = len(self.frames) - len(with_depth)
-        self.frames = _in_order(with_depth)
+        without_depth = len(self.frames) - len(with_depth)
+        self.frames = _sorted(with_depth)
         times = np.array([frame.time for frame in self.frames])
         timed = bool(np.isfinite(times).all())
         super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
-        self.unit_m = _unit(about, file, any("depth_file_path" in f.own for f in self.frames))
-        self.sigma_unit_m = number_in(about, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
+        self.unit_m = _unit(document, file, any("depth_file_path" in f.entry for f in self.frames))
+        self.sigma_unit_m = number_in(document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
-        if left_out:
-            self.warnings.append(f"{file}: {left_out} frames have no depth: skipped")
+        if without_depth:
+            self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
         self._read_poses()
 
     def _read_poses(self) -> None:
         poses = np.full((len(self.frames), 4, 4), np.nan)
-        unknown: list[InputError] = []
+        errors: list[InputError] = []
         for k, frame in enumerate(self.frames):
             try:
                 poses[k] = frame.pose()
             except InputError as error:
-                unknown.append(error)
-        if unknown:
-            self.warnings.append(f"{len(unknown)} poses can't be read, the first: {unknown[0]}")
+                errors.append(error)
+        if errors:
+            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
         if np.isfinite(poses).any():
             self.reference = poses
 
-    def whole_color(self, index: int) -> UInt8 | None:
-        """See `FileSource.whole_color`."""
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.full_resolution_color`."""
         path = self.frames[index].image()
         return None if path is None else read_color(path)
 
@@ -148,7 +148,7 @@ class _Frame:
     """The entry of one frame; values common to all frames are its defaults."""
 
     common: dict[str, Any]
-    own: dict[str, Any]
+    entry: dict[str, Any]
     number: int
     file: Path
 
@@ -159,33 +159,33 @@ class _Frame:
     @property
     def time(self) -> float:
         """Timestamp in s; NaN if not given."""
-        value = self.own.get("timestamp")
+        value = self.entry.get("timestamp")
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e18:
             return math.nan
         return float(value)
 
     @property
     def key(self) -> list[tuple[int, int, str]]:
-        return name_order(Path(str(self.own.get("file_path", self.number))))
+        return name_order(Path(str(self.entry.get("file_path", self.number))))
 
     def path(self, *names: str) -> Path | None:
         """Return the path under the first of these keys that the entry has."""
-        named = next((self.own[name] for name in names if name in self.own), None)
-        if not isinstance(named, str) or not named or "\0" in named:
+        value = next((self.entry[key] for key in names if key in self.entry), None)
+        if not isinstance(value, str) or not value or "\0" in value:
             return None
-        return self.file.parent / named.replace("\\", "/")
+        return self.file.parent / value.replace("\\", "/")
 
     def image(self) -> Path | None:
         base = self.path("file_path")
         if base is None:
             return None
-        found = (base.with_name(base.name + suffix) for suffix in _IMAGES)
-        return next((path for path in found if is_file(path)), None)
+        candidates = (base.with_name(base.name + suffix) for suffix in _IMAGES)
+        return next((path for path in candidates if is_file(path)), None)
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"
         try:
-            table = np.array(self.own.get("transform_matrix"), float)
+            table = np.array(self.entry.get("transform_matrix"), float)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError("isn't made of numbers", where=where, remedy=_REMEDY) from error
         if table.shape == (3, 4):
@@ -193,27 +193,27 @@ class _Frame:
         return read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
-        if name in self.own:
-            return number_in(self.own, name, self.where, default, _REMEDY)
+        if name in self.entry:
+            return number_in(self.entry, name, self.where, default, _REMEDY)
         return number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         """Return the camera scaled from the file's image size to the depth's (width, height)."""
-        word = self.own.get("camera_model", self.common.get("camera_model", "OPENCV"))
-        model = _MODELS.get(word) if isinstance(word, str) else None
+        model_name = self.entry.get("camera_model", self.common.get("camera_model", "OPENCV"))
+        model = _MODELS.get(model_name) if isinstance(model_name, str) else None
         if model is None:
             raise InputError(
-                f"is {word!r:.60}",
+                f"is {model_name!r:.60}",
                 where=f"{self.where}: camera_model",
                 remedy=f"use one of {', '.join(_MODELS)}",
             )
         width, height = self.number_of("w", size[0]), self.number_of("h", size[1])
         pixels = image_size(width, height, f"{self.where}: w")
-        fx = self.number_of("fl_x", self._by_angle("camera_angle_x", width))
+        fx = self.number_of("fl_x", self._focal_length("camera_angle_x", width))
         # Pixel coordinates here start at the corner of the first pixel, in `Pinhole` at its centre.
         values = {
             "fx": fx,
-            "fy": self.number_of("fl_y", self._by_angle("camera_angle_y", height) or fx),
+            "fy": self.number_of("fl_y", self._focal_length("camera_angle_y", height) or fx),
             "cx": self.number_of("cx", width / 2) - 0.5,
             "cy": self.number_of("cy", height / 2) - 0.5,
         } | {name: self.number_of(name, 0.0) for name in DISTORTION_ORDER[model]}
@@ -233,9 +233,9 @@ class _Frame:
             )
         return scaled(camera, *size)
 
-    def _by_angle(self, name: str, pixels: float) -> float | None:
+    def _focal_length(self, name: str, pixels: float) -> float | None:
         """Focal length in pixels from the field of view; None if not given."""
-        angle = self.own.get(name, self.common.get(name))
+        angle = self.entry.get(name, self.common.get(name))
         if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < 3.1:
             return None
         return pixels / 2 / math.tan(angle / 2)
@@ -245,18 +245,18 @@ def _file(path: Path) -> Path:
     return path if path.name == NAME and not path.is_dir() else path / NAME
 
 
-def _in_order(frames: list[_Frame]) -> list[_Frame]:
+def _sorted(frames: list[_Frame]) -> list[_Frame]:
     """The frames sorted by time, or by image names if some have no time."""
     if all(math.isfinite(frame.time) for frame in frames):
         return sorted(frames, key=lambda frame: frame.time)
     return sorted(frames, key=lambda frame: frame.key)
 
 
-def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
+def _unit(document: dict[str, Any], file: Path, nerfstudio: bool) -> float:
     """Metres per count: as stated in the file, or nerfstudio's millimetre."""
     for name in ("depth_unit_scale_factor", "integer_depth_scale"):
-        if name in about:
-            unit = number_in(about, name, file, remedy=_REMEDY)
+        if name in document:
+            unit = number_in(document, name, file, remedy=_REMEDY)
             if not 1e-9 <= unit <= 1:
                 raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="use metres")
             return unit

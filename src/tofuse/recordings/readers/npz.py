@@ -34,7 +34,7 @@ _VALUES = (
     *("depth_unit_m", "depth_kind", "model", "frame_rate_hz", "ambiguity_m", "confidence_max"),
     *("amplitude_kind", "sensor"),
 )
-_KNOWN = ("depth", *_IMAGES, *_TABLES, *_VALUES)
+_NAMES = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 
 
 @part("reader", "npz", label="validated")
@@ -97,7 +97,7 @@ class NpzSource(FileSource):
                 self.metadata[name] = self._number(arrays, name)
         if "sensor" in arrays:
             self.metadata["sensor"] = str(arrays["sensor"])[:200]
-        unknown = [name for name in arrays if name not in _KNOWN]
+        unknown = [name for name in arrays if name not in _NAMES]
         if unknown:
             self.warnings.append(f"{path}: unknown arrays ignored: {', '.join(unknown)[:200]}")
 
@@ -144,10 +144,10 @@ class NpzSource(FileSource):
         height, width = self.depth.shape[1:]
         camera: Camera
         if options.camera is not None:
-            about, camera = load_camera(options.camera, (width, height))
-            self.kind = about.depth_kind
+            description, camera = load_camera(options.camera, (width, height))
+            self.kind = description.depth_kind
             if self.depth.dtype.kind != "f":  # floats are in metres
-                unit = about.depth_unit_m
+                unit = description.depth_unit_m
         elif "rays" in arrays:
             rays = self._floats(arrays, "rays")
             if rays.shape != (height, width, 2):
@@ -195,12 +195,12 @@ class NpzSource(FileSource):
     def _images(self, stack: NDArray[Any], name: str, ndim: int) -> NDArray[Any]:
         stack = stack[None] if stack.ndim == ndim - 1 else stack
         expected = (*self.depth.shape, 3)[:ndim]
-        whole = name in ("confidence", "color")
-        if stack.shape != expected or stack.dtype.kind not in ("u" if whole else "fui"):
+        is_uint8 = name in ("confidence", "color")
+        if stack.shape != expected or stack.dtype.kind not in ("u" if is_uint8 else "fui"):
             raise self._error(
                 name, f"has shape {stack.shape} and type {stack.dtype}", f"save {expected}"
             )
-        if whole and stack.dtype != np.uint8:
+        if is_uint8 and stack.dtype != np.uint8:
             raise self._error(name, f"has type {stack.dtype}", "save uint8")
         return stack
 

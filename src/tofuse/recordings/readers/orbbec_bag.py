@@ -23,7 +23,7 @@ from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import GREY
 
 # The order in which Orbbec writes them.
-_ORBBEC = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 @part("reader", "orbbec-bag")
@@ -75,8 +75,8 @@ class OrbbecSource(BagSource):
         """See `BagSource.open_bag`."""
         return open_container(path)
 
-    def find(self) -> None:
-        """See `BagSource.find`."""
+    def find_streams(self) -> None:
+        """See `BagSource.find_streams`."""
         self.depth = self.required_track(_ORBBEC_DEPTH, "depth")
         self.profile = self._profile(_ORBBEC_DEPTH_PROFILE)
         self.unit = 0.001
@@ -107,15 +107,15 @@ class OrbbecSource(BagSource):
     def _profile(self, topic: str) -> _Profile:
         where = f"{self.path}: {topic}"
         raw = bytes(self.required_track(topic, "profile of the stream").raw(0))
-        at = _header_end(raw, where)
-        if len(raw) < at + _PROFILE.size:
+        offset = _header_end(raw, where)
+        if len(raw) < offset + _PROFILE.size:
             raise InputError("is cut off", where=where, remedy="check the bag")
-        fields = _PROFILE.unpack_from(raw, at)
+        fields = _PROFILE.unpack_from(raw, offset)
         return _Profile(
             (fields[14], fields[15]),
             fields[16],
             dict(zip(("fx", "fy", "cx", "cy"), fields[17:21], strict=True)),
-            dict(zip(_ORBBEC, fields[21:29], strict=True)),
+            dict(zip(_COEFFICIENTS, fields[21:29], strict=True)),
             np.reshape(fields[2:11], (3, 3)),
             np.array(fields[11:14]) / 1000,
         )
@@ -124,18 +124,23 @@ class OrbbecSource(BagSource):
         """Read the part of an image message that is identical to ROS 1."""
         raw = bytes(track.raw(index))
         where = f"{self.path}: {track.connection.topic}, message {index}"
-        at = _header_end(raw, where)
+        offset = _header_end(raw, where)
         try:
-            height, width, length = struct.unpack_from("<3I", raw, at)
-            at += 12
-            encoding = raw[at : at + length].decode("ascii", "replace")
-            at += length
-            big, step, count = struct.unpack_from("<BII", raw, at)
+            height, width, length = struct.unpack_from("<3I", raw, offset)
+            offset += 12
+            encoding = raw[offset : offset + length].decode("ascii", "replace")
+            offset += length
+            big_endian, step, count = struct.unpack_from("<BII", raw, offset)
         except struct.error as error:
             raise InputError("is cut off", where=where, remedy="check the bag") from error
-        data = raw[at + 9 : at + 9 + count]
+        data = raw[offset + 9 : offset + 9 + count]
         return SimpleNamespace(
-            height=height, width=width, encoding=encoding, is_bigendian=big, step=step, data=data
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=big_endian,
+            step=step,
+            data=data,
         )
 
 

@@ -101,19 +101,19 @@ def _times(files: list[Path]) -> Float64:
     return np.arange(len(files), dtype=float)
 
 
-def _lens(facts: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhole:
+def _lens(metadata: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhole:
     fx, fy, cx, cy, width, height = _numbers(
-        facts, ("fx", "fy", "cx", "cy", "width", "height"), path
+        metadata, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return lens(K, image_size(width, height, f"{path}: width"), size, path)
 
 
-def _pose(facts: dict[str, Any], path: Path) -> Float64:
+def _pose(metadata: dict[str, Any], path: Path) -> Float64:
     table = np.eye(4)
-    table[:3] = np.reshape(_numbers(facts, _POSE, path), (3, 4))
+    table[:3] = np.reshape(_numbers(metadata, _POSE, path), (3, 4))
     return arkit_pose(table, str(path))
 
 
-def _numbers(facts: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
-    return np.array([number_in(facts, n, path, remedy="export 'raw data' again") for n in names])
+def _numbers(metadata: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
+    return np.array([number_in(metadata, n, path, remedy="export 'raw data' again") for n in names])

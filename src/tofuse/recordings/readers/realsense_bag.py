@@ -47,33 +47,33 @@ _REALSENSE_DEPTH = r"/device_\d+/sensor_\d+/Depth_\d+/image/data"
 class RealSenseSource(BagSource):
     """See `RealSenseBag`."""
 
-    def find(self) -> None:
-        """See `BagSource.find`."""
-        found = sorted(
+    def find_streams(self) -> None:
+        """See `BagSource.find_streams`."""
+        matches = sorted(
             c.topic for c in self.bag.connections if re.fullmatch(_REALSENSE_DEPTH, c.topic)
         )
-        if not found:
+        if not matches:
             raise InputError("has no depth of a RealSense", where=self.path, remedy="record it")
-        stream = found[0].removesuffix("/image/data")
+        stream = matches[0].removesuffix("/image/data")
         sensor = stream.rsplit("/", 1)[0]
-        self.depth = self.required_track(found[0], "depth")
+        self.depth = self.required_track(matches[0], "depth")
         self.stream = stream
         self.unit = self._unit(sensor)
         name = self._name(sensor.rsplit("/", 1)[0])
         self.metadata["sensor"] = name
         if "L5" in name:  # a stereo camera's infrared is another view
-            found = [
+            matches = [
                 c.topic
                 for c in self.bag.connections
                 if re.fullmatch(re.escape(sensor) + r"/Infrared_\d+/image/data", c.topic)
             ]
-            if found:
-                self.amplitude = self.track(sorted(found)[0])
+            if matches:
+                self.amplitude = self.track(sorted(matches)[0])
         device = sensor.rsplit("/", 1)[0]
         pattern = re.escape(device) + r"/sensor_\d+/Color_\d+/image/data"
-        found = [c.topic for c in self.bag.connections if re.fullmatch(pattern, c.topic)]
-        if found:
-            self.color = self.track(sorted(found)[0])
+        matches = [c.topic for c in self.bag.connections if re.fullmatch(pattern, c.topic)]
+        if matches:
+            self.color = self.track(sorted(matches)[0])
 
     def lens(self) -> Camera:
         """See `BagSource.lens`."""
@@ -87,13 +87,13 @@ class RealSenseSource(BagSource):
         if isinstance(lens, RayTable):
             lens = forward_brown(lens, self._brown(stream))
         assert isinstance(lens, Pinhole)
-        depth, color = self._places(self.stream), self._places(stream)
+        depth, color = self._extrinsics(self.stream), self._extrinsics(stream)
         common = sorted(depth.keys() & color.keys())
         if not common:
             raise InputError("has no pose relative to depth", where=f"{self.path}: {stream}")
         return ColorCamera(lens, color[common[0]] @ inverse(depth[common[0]]))
 
-    def _places(self, stream: str) -> dict[str, Float64]:
+    def _extrinsics(self, stream: str) -> dict[str, Float64]:
         """Return transforms (4, 4) into a stream's frame, by the number of their reference.
 
         ROS 1 bags store transforms; later versions text: a column-major rotation and a translation.
@@ -124,10 +124,10 @@ class RealSenseSource(BagSource):
         if not any(info.coefficients):
             return checked_lens(Pinhole, info.size, info.values, where)
         brown = self._brown(stream)
-        words = info.model.lower().replace("_", " ")
-        if words.startswith("inverse brown"):
+        model = info.model.lower().replace("_", " ")
+        if model.startswith("inverse brown"):
             return inverse_brown(brown)
-        if words.startswith("brown"):
+        if model.startswith("brown"):
             return brown
         raise InputError(
             f"has the distortion model {info.model!r:.40}", where=where, remedy="use --camera"
@@ -144,18 +144,20 @@ class RealSenseSource(BagSource):
         where = f"{self.path}: {stream}"
         message = first_message(self.bag, f"{stream}/info/camera_info")
         # Newer versions write text.
-        return self._as_text(stream, where) if message is None else camera_info(message, where)
+        return (
+            self._info_from_text(stream, where) if message is None else camera_info(message, where)
+        )
 
-    def _as_text(self, stream: str, where: str) -> Info:
+    def _info_from_text(self, stream: str, where: str) -> Info:
         text = first_message(self.bag, f"{stream}/camera_info")
         if text is None:
             raise InputError("has no camera_info", where=where, remedy="use --camera")
         fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
-        names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
+        keys = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
         try:
             return Info(
                 (int(fields["width"]), int(fields["height"])),
-                {ours: float(fields[theirs]) for ours, theirs in names.items()},
+                {name: float(fields[key]) for name, key in keys.items()},
                 fields.get("model", ""),
                 [float(d) for d in fields.get("coeffs", "").split(",") if d],
             )
@@ -188,4 +190,4 @@ class RealSenseSource(BagSource):
 
 
 def _numbers(text: str) -> Float64:
-    return np.array([float(word) for word in text.split(",")])
+    return np.array([float(cell) for cell in text.split(",")])

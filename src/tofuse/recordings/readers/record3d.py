@@ -53,8 +53,8 @@ class Record3D:
             if is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
                 return Sniff(1.0, "metadata.json and depth/*.exr")
             return None
-        found = begins_with(file_of(path, ".r3d"), b"PK\x03\x04")
-        return Sniff(1.0, "a .r3d archive") if found else None
+        matches = begins_with(file_of(path, ".r3d"), b"PK\x03\x04")
+        return Sniff(1.0, "a .r3d archive") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
         """See `Reader.open`."""
@@ -67,24 +67,24 @@ class Record3DSource(FileSource):
 
     def __init__(self, store: _Folder | _Archive) -> None:
         self.store = store
-        about = _Metadata(store.metadata(), store.where)
-        self.size = about.depth_size(store.default_size)
-        self.camera = about.lens(self.size)
-        times = about.times()
+        metadata = _Metadata(store.metadata(), store.where)
+        self.size = metadata.depth_size(store.default_size)
+        self.camera = metadata.lens(self.size)
+        times = metadata.times()
         numbers = np.array(store.numbers)
         # Poses and timestamps cover all frames; an export may contain a subset.
         if times is None or numbers.max() >= len(times):
-            rate = about.frame_rate()
+            rate = metadata.frame_rate()
             times = np.arange(numbers.max() + 1) / rate
-            known = False
+            has_times = False
         else:
-            known = True
+            has_times = True
         super().__init__(times[numbers])
-        if not known:
+        if not has_times:
             self.warnings.append(
                 f"{store.where}: no timestamps for all frames: assumed to be evenly spaced"
             )
-        poses = about.poses()
+        poses = metadata.poses()
         if poses is not None:
             inside = numbers < len(poses)
             self.reference = np.full((len(numbers), 4, 4), np.nan)
@@ -95,8 +95,8 @@ class Record3DSource(FileSource):
         else:
             self.warnings.append("the export contains no confidence")
 
-    def whole_color(self, index: int) -> UInt8 | None:
-        """See `FileSource.whole_color`."""
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.full_resolution_color`."""
         color = self.store.color(self.store.numbers[index])
         return None if color is None else as_color(parse_image(*color))
 
@@ -137,7 +137,7 @@ class _Folder:
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
         channels = parse_exr(read_bytes(path, limit=MAX_MEMBER_BYTES), path)
-        # The only channel of a grey image, whatever its name.
+        # A grey image has one channel, of any name.
         depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
         if depth is None:
             depth = next(iter(channels.values()))
@@ -267,11 +267,11 @@ class _Metadata:
             return None
         table = self._numbers("poses", None, columns=7)
         norms = quaternion.length(table[:, :4])
-        good = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
+        valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
-        poses[good] = np.eye(4)
-        poses[good, :3, :3] = quaternion.to_matrix(table[good, :4])
-        poses[good, :3, 3] = table[good, 4:]
+        poses[valid] = np.eye(4)
+        poses[valid, :3, :3] = quaternion.to_matrix(table[valid, :4])
+        poses[valid, :3, 3] = table[valid, 4:]
         return poses @ ARKIT_AXES
 
     def _numbers(self, field: str, count: int | None, columns: int = 0) -> Float64:
@@ -301,10 +301,10 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
     if not is_folder(folder):
         return {}
     try:
-        found = [(pattern.fullmatch(p.name), p) for p in list_folder(folder)]
+        matches = [(pattern.fullmatch(p.name), p) for p in list_folder(folder)]
     except InputError:
         return {}
-    return {int(match.group(1)): p for match, p in found if match}
+    return {int(match.group(1)): p for match, p in matches if match}
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:

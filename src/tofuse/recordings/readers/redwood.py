@@ -93,14 +93,14 @@ class Redwood:
 def _camera_file(path: Path) -> Path | None:
     """The .json with an intrinsic_matrix, if there is one; InputError if several differ."""
     files = [f for f in files_with(path, ".json") if is_file(f)]
-    found = [f for f in files if "intrinsic_matrix" in read_text(f)]
-    if len({read_text(f) for f in found}) > 1:
+    cameras = [f for f in files if "intrinsic_matrix" in read_text(f)]
+    if len({read_text(f) for f in cameras}) > 1:
         raise InputError(
-            f"has several cameras: {', '.join(f.name for f in found)}",
+            f"has several cameras: {', '.join(f.name for f in cameras)}",
             where=path,
             remedy="keep one of them",
         )
-    return found[0] if found else None
+    return cameras[0] if cameras else None
 
 
 def _read_intrinsics(path: Path) -> Pinhole:
@@ -120,8 +120,8 @@ def _read_intrinsics(path: Path) -> Pinhole:
 
 def _timestamps(files: list[Path]) -> Float64:
     """Seconds from names like 000001-000000033369.png (microseconds), else the index."""
-    found = [_MICROSECONDS.fullmatch(f.stem) for f in files]
-    times = np.array([int(m.group(1)) / 1e6 for m in found if m])
+    matches = [_MICROSECONDS.fullmatch(f.stem) for f in files]
+    times = np.array([int(m.group(1)) / 1e6 for m in matches if m])
     if len(times) == len(files) and (np.diff(times) > 0).all():
         return times
     return np.arange(len(files), dtype=float)
@@ -134,10 +134,10 @@ def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Pat
     color = files_with(folder, ".png", ".jpg", ".jpeg")
     if len(color) == len(files):
         return list(color)
-    numbered = {number: each for each in color if (number := _number(each)) is not None}
-    found = [numbered.get(number) if (number := _number(f)) is not None else None for f in files]
-    if any(found):
-        return found
+    numbered = {number: file for file in color if (number := _number(file)) is not None}
+    matches = [numbered.get(number) if (number := _number(f)) is not None else None for f in files]
+    if any(matches):
+        return matches
     warnings.append(
         f"{folder.name}/ has {len(color)} images, depth/ {len(files)}, and their names don't show "
         "which belong together: colour is ignored"
@@ -153,17 +153,17 @@ def _number(path: Path) -> int | None:
 
 def _poses(path: Path, count: int) -> Float64:
     """Read a trajectory.log: (count, 4, 4), NaN for frames that it omits."""
-    found = read_poses(path)
-    if found.frames is None:
+    trajectory = read_poses(path)
+    if trajectory.frames is None:
         raise InputError(
             "has timestamps instead of frame numbers", where=path, remedy="pass a .log"
         )
-    if (found.frames >= count).any():
+    if (trajectory.frames >= count).any():
         raise InputError(
-            f"has a pose of frame {found.frames.max()} of {count}",
+            f"has a pose of frame {trajectory.frames.max()} of {count}",
             where=path,
             remedy="check the counts",
         )
     out = np.full((count, 4, 4), np.nan)
-    out[found.frames] = found.poses
+    out[trajectory.frames] = trajectory.poses
     return out

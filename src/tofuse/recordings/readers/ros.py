@@ -46,8 +46,8 @@ IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 # Integer depth is in mm by convention (REP 118).
 _UNIT_M = {"u": 0.001, "f": 1.0}
-_AMPLITUDE_WORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
-_COLOR_WORDS = ("color", "colour", "rgb")
+_AMPLITUDE_KEYWORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
+_COLOR_KEYWORDS = ("color", "colour", "rgb")
 # Prefix of drifting odometry frames; frames above them are corrected.
 _ODOMETRY = "odom"
 
@@ -193,22 +193,24 @@ class RosSource(FileSource):
 
     def _read_camera(self, options: ReaderOptions) -> None:
         if options.camera is not None:
-            about, self.camera = load_camera(options.camera)
-            self.kind, self.unit = about.depth_kind, about.depth_unit_m
+            description, self.camera = load_camera(options.camera)
+            self.kind, self.unit = description.depth_kind, description.depth_unit_m
             return
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
-        near = self._infos_beside(self.connection)
-        chosen = near or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
-        if not chosen:
+        adjacent = self._camera_infos(self.connection)
+        candidates = (
+            adjacent or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
+        )
+        if not candidates:
             raise InputError(
                 f"has no CameraInfo for {self.connection.topic}",
                 where=self.path,
                 remedy="pass the depth camera with --camera camera.json",
             )
-        self.camera = self._lens_of(chosen[0])
+        self.camera = self._lens_of(candidates[0])
 
-    def _infos_beside(self, connection: Any) -> list[Any]:
-        """The CameraInfo connections of an image connection."""
+    def _camera_infos(self, connection: Any) -> list[Any]:
+        """The CameraInfo connections in the namespace of an image connection."""
         folder = connection.topic.rsplit("/", 1)[0]
         return [
             c
@@ -236,14 +238,14 @@ class RosSource(FileSource):
         except Exception as error:  # a damaged message affects only its frame
             self.warnings.append(f"tf is ignored: {damaged(error, self._where(0))}")
             return
-        above = transforms.above(frame)
-        odometry = next((each for each in above if _ODOMETRY in each.lower()), None)
+        ancestors = transforms.ancestors(frame)
+        odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
         if odometry is not None and transforms.moves(odometry, frame):
             poses = transforms.poses(odometry, frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.odometry = poses
-        if above[-1] != odometry and transforms.moves(above[-1], frame):
-            poses = transforms.poses(above[-1], frame, self.timestamps)
+        if ancestors[-1] != odometry and transforms.moves(ancestors[-1], frame):
+            poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.reference = poses
 
@@ -259,12 +261,12 @@ class RosSource(FileSource):
                 continue
             try:
                 first = self._color_image(track, 0, f"{self.path}: {connection.topic}")
-                own, other = self._frame_of(self.track), self._frame_of(track)
-                moved = _rank(self.connection) == 1  # depth is registered to colour
+                depth_frame, color_frame = self._frame_of(self.track), self._frame_of(track)
+                registered = _rank(self.connection) == 1  # depth is registered to colour
                 same_size = first.shape[:2] == (self.camera.height, self.camera.width)
-                T = transforms.fixed(other, own)
-                infos = self._infos_beside(connection)
-                if same_size and (moved or own == other):
+                T = transforms.static_transform(color_frame, depth_frame)
+                infos = self._camera_infos(connection)
+                if same_size and (registered or depth_frame == color_frame):
                     self.color = track
                 elif T is not None and infos:
                     self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
@@ -286,7 +288,7 @@ class RosSource(FileSource):
 
     def _is_color(self, connection: Any) -> bool:
         topic = connection.topic.lower()
-        if "depth" in topic or not any(word in topic for word in _COLOR_WORDS):
+        if "depth" in topic or not any(keyword in topic for keyword in _COLOR_KEYWORDS):
             return False
         if connection.msgtype == COMPRESSED:
             return True
@@ -299,38 +301,38 @@ class RosSource(FileSource):
         raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
     def _color_image(self, track: Track, index: int, where: str) -> UInt8:
-        turn = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
-        return turn(track.message(index), where)
+        decode = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
+        return decode(track.message(index), where)
 
     def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
-        k = None if self.color is None else self.color.near(frame.timestamp, MAX_GAP_S)
+        k = None if self.color is None else self.color.nearest(frame.timestamp, MAX_GAP_S)
         if self.color is None or k is None:
             return frame
-        seen = self._color_image(self.color, k, where)
-        return replace(frame, color_image=sampled_color(frame, seen, self.color_camera, where))
+        color = self._color_image(self.color, k, where)
+        return replace(frame, color_image=sampled_color(frame, color, self.color_camera, where))
 
     def _find_amplitude(self) -> Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
         assert self.camera is not None
         for connection in sorted(self.bag.connections, key=lambda c: c.topic):
-            named = any(word in connection.topic.lower() for word in _AMPLITUDE_WORDS)
+            is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
             if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
                 continue
-            if not named or self._encoding(connection) not in GREY:
+            if not is_named or self._encoding(connection) not in GREY:
                 continue
             track = Track(self.bag, connection)
             first = track.message(0)
             if (first.height, first.width) != (self.camera.height, self.camera.width):
                 continue
-            matched = [track.near(t, MAX_GAP_S) is not None for t in self.timestamps]
-            if sum(matched) > 0.5 * len(matched):
+            has_match = [track.nearest(t, MAX_GAP_S) is not None for t in self.timestamps]
+            if sum(has_match) > 0.5 * len(has_match):
                 self.metadata["amplitude_topic"] = connection.topic
                 return track
         return None
 
     def _depth(self, message: Any, where: str) -> Float32:
-        turn = decompressed if self.connection.msgtype == COMPRESSED else image
-        counts = turn(message, where)
+        decode = decompressed if self.connection.msgtype == COMPRESSED else image
+        counts = decode(message, where)
         assert self.camera is not None
         check_size(counts, self.camera, where)
         with np.errstate(all="ignore"):
@@ -349,20 +351,20 @@ class RosSource(FileSource):
         step = max(1, len(self.track) // SAMPLES)
         for k in range(0, len(self.track), step)[:SAMPLES]:
             try:
-                found = cloud(self.track.message(k), self._where(k))
+                content = cloud(self.track.message(k), self._where(k))
             except InputError:
                 continue
-            if min(found.width, found.height) < 2:
+            if min(content.width, content.height) < 2:
                 return None
-            images.append(found.points.reshape(found.height, found.width, 3))
+            images.append(content.points.reshape(content.height, content.width, 3))
         return common_camera(images)
 
-    def _cloud(self, found: Cloud, index: int, time: float) -> Frame:
+    def _cloud(self, content: Cloud, index: int, time: float) -> Frame:
         if self.camera is None:
-            return cloud_frame(index, time, found.points, amplitude=found.amplitude)
-        points = found.points.reshape(found.height, found.width, 3)
+            return cloud_frame(index, time, content.points, amplitude=content.amplitude)
+        points = content.points.reshape(content.height, content.width, 3)
         return organised_frame(
-            points, self.camera, index, time, self._where(index), amplitude=found.amplitude
+            points, self.camera, index, time, self._where(index), amplitude=content.amplitude
         )
 
 
@@ -371,10 +373,12 @@ def _rank(connection: Any) -> int | None:
     topic, kind = connection.topic.lower(), connection.msgtype
     if kind == IMAGE and "depth" in topic:
         # Depth in its own frame is preferred to depth registered to another camera.
-        registered = any(word in topic for word in ("align", "regist", "_to_", "color", "rgb"))
+        registered = any(
+            keyword in topic for keyword in ("align", "regist", "_to_", "color", "rgb")
+        )
         return 1 if registered else 0
     if kind == COMPRESSED and topic.endswith("compresseddepth"):
         return 2
-    if kind == IMAGE and any(word in topic for word in ("distance", "range")):
+    if kind == IMAGE and any(keyword in topic for keyword in ("distance", "range")):
         return 3
     return 4 if kind == CLOUD else None

@@ -37,7 +37,7 @@ class ScannerApp:
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         files = files_named(path, _DEPTH.fullmatch)
-        if any(is_file(_beside(file, "frame", ".json")) for file in files[:9]):
+        if any(is_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
             return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
         return None
 
@@ -51,26 +51,26 @@ class ScannerApp:
         source = PhoneSource(
             files,
             np.full(len(files), np.nan),
-            confidence=[if_file(_beside(file, "conf", ".png")) for file in files],
-            color=[if_file(_beside(file, "frame", ".jpg")) for file in files],
+            confidence=[if_file(_file_of_frame(file, "conf", ".png")) for file in files],
+            color=[if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
         )
         poses = np.full((len(files), 4, 4), np.nan)
-        unknown: list[InputError] = []
+        errors: list[InputError] = []
         for k, file in enumerate(files):
             try:
-                facts = _Facts.read(_beside(file, "frame", ".json"))
-                source.timestamps[k] = facts.time
-                source.cameras.append(facts.lens(size))
+                metadata = _FrameMetadata.read(_file_of_frame(file, "frame", ".json"))
+                source.timestamps[k] = metadata.time
+                source.cameras.append(metadata.lens(size))
             except InputError as error:
                 # Only this frame is unusable without its camera.
                 source.cameras.append(error)
                 continue
             try:
-                poses[k] = facts.pose()
+                poses[k] = metadata.pose()
             except InputError as error:
-                unknown.append(error)
-        if unknown:
-            source.warnings.append(f"{len(unknown)} poses can't be read, the first: {unknown[0]}")
+                errors.append(error)
+        if errors:
+            source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
         _fill_times(source)
         if np.isfinite(poses).any():
             source.reference = poses
@@ -78,7 +78,7 @@ class ScannerApp:
 
 
 @dataclass(frozen=True)
-class _Facts:
+class _FrameMetadata:
     """The content of a frame_NNNNN.json."""
 
     path: Path
@@ -86,7 +86,7 @@ class _Facts:
     time: float
 
     @classmethod
-    def read(cls, path: Path) -> _Facts:
+    def read(cls, path: Path) -> _FrameMetadata:
         data = read_json(path)
         return cls(path, data, float(_numbers(path, data, "time", 1)[0]))
 
@@ -127,12 +127,12 @@ def _numbers(
 
 
 def _fill_times(source: PhoneSource) -> None:
-    known = np.isfinite(source.timestamps)
-    index = np.arange(len(known))
-    if not known.any():
+    valid = np.isfinite(source.timestamps)
+    index = np.arange(len(valid))
+    if not valid.any():
         raise next(c for c in source.cameras if isinstance(c, InputError))
-    source.timestamps[~known] = np.interp(index[~known], index[known], source.timestamps[known])
+    source.timestamps[~valid] = np.interp(index[~valid], index[valid], source.timestamps[valid])
 
 
-def _beside(file: Path, name: str, suffix: str) -> Path:
+def _file_of_frame(file: Path, name: str, suffix: str) -> Path:
     return file.with_name(f"{name}_{file.stem.split('_', 1)[1]}{suffix}")

@@ -68,13 +68,15 @@ def _las_header(path: Path) -> Any:
     except Exception as error:  # laspy raises arbitrary exceptions
         raise _damaged(error, path) from error
     count, size = int(header.point_count), int(header.point_format.size)
-    whole = path.stat().st_size
-    packed = bool(getattr(header, "are_points_compressed", False))
-    if count > MAX_POINTS or count * size > whole * (_MAX_COMPRESSION if packed else 1):
+    file_size = path.stat().st_size
+    compressed = bool(getattr(header, "are_points_compressed", False))
+    if count > MAX_POINTS or count * size > file_size * (_MAX_COMPRESSION if compressed else 1):
         raise InputError(
-            f"point count: {count} points don't fit into {whole} bytes", where=path, remedy=_COPY
+            f"point count: {count} points don't fit into {file_size} bytes",
+            where=path,
+            remedy=_COPY,
         )
-    if packed and count:
+    if compressed and count:
         try:
             _check_chunks(path, header)
         except InputError:
@@ -87,10 +89,10 @@ def _las_header(path: Path) -> Any:
 def _check_records(head: bytes, path: Path) -> None:
     """Reject a record count that exceeds the file size: laspy tries to read each record."""
     count = int.from_bytes(head[100:104], "little")
-    more = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
-    if 54 * count + 60 * more > path.stat().st_size:  # header sizes in bytes
+    extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
+    if 54 * count + 60 * extended > path.stat().st_size:  # header sizes in bytes
         raise InputError(
-            f"header: {count + more} variable-length records don't fit into the file",
+            f"header: {count + extended} variable-length records don't fit into the file",
             where=path,
             remedy=_COPY,
         )
@@ -99,7 +101,7 @@ def _check_records(head: bytes, path: Path) -> None:
 def _check_chunks(path: Path, header: Any) -> None:
     """Reject a chunk table that is inconsistent with the file.
 
-    lazrs allocates what the table declares, and aborts the process if that fails. The table
+    lazrs allocates the declared size, and aborts the process if that fails. The table
     consists of its version, the number of chunks and their compressed sizes. Its offset precedes
     the chunks or, if unknown at that time, is in the last 8 bytes (specification of LASzip 2.2).
     """
@@ -134,10 +136,10 @@ def _check_chunks(path: Path, header: Any) -> None:
             )
         file.seek(start)
         chunks = lazrs.read_chunk_table(file, layout)
-    points, packed = (sum(each) for each in zip(*chunks, strict=True)) if chunks else (0, 0)
-    if packed > table - start or points < header.point_count:
+    points, compressed = (sum(column) for column in zip(*chunks, strict=True)) if chunks else (0, 0)
+    if compressed > table - start or points < header.point_count:
         raise InputError(
-            f"chunk table: {points} points in {packed} bytes, while the file has"
+            f"chunk table: {points} points in {compressed} bytes, while the file has"
             f" {header.point_count} in {table - start}",
             where=path,
             remedy=_COPY,
@@ -162,9 +164,9 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
         amplitude = np.asarray(points["intensity"], np.float32)
         color = None
         if {"red", "green", "blue"} <= names:
-            wide = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
+            values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
             # The standard uses 16 bits; many programs write 8-bit values.
-            color = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
+            color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
     except InputError:
         raise
     except Exception as error:
@@ -225,14 +227,14 @@ class E57Source(FileSource):
                 self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
             except InputError as error:
                 self.warnings.append(f"{error}; ignored")
-        unmoved = partial(self._read, shift=np.zeros(3))
-        self._shift, self._kept = find_shift(unmoved, len(self.counts))
+        read_unshifted = partial(self._read, shift=np.zeros(3))
+        self._shift, self._cached = find_shift(read_unshifted, len(self.counts))
         note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
-        kept = self._kept.pop(index, None)
-        return self._read(index, self._shift) if kept is None else kept
+        cached = self._cached.pop(index, None)
+        return self._read(index, self._shift) if cached is None else cached
 
     def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"

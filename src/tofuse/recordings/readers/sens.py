@@ -46,8 +46,8 @@ class Sens:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        found = begins_with(file_of(path, ".sens"), struct.pack("<I", VERSION))
-        return Sniff(1.0, "a .sens file") if found else None
+        matches = begins_with(file_of(path, ".sens"), struct.pack("<I", VERSION))
+        return Sniff(1.0, "a .sens file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> SensSource:
         """See `Reader.open`."""
@@ -79,22 +79,22 @@ class SensSource(FileSource):
                 self._size = file.seek(0, 2)
                 file.seek(0)
                 count = self._read_header(file)
-                found = list(self._walk(file, count))
+                frames = list(self._locate_frames(file, count))
         except OSError as error:
             raise input_error(error, path) from error
-        if not found:
+        if not frames:
             raise self._error("contains no complete frame", "copy the file again")
-        self.entries = [entry for entry, _, _ in found]
-        times = np.array([time for _, time, _ in found]) / _TIMES_PER_S
-        self.timestamps = times if times.any() else np.arange(len(found)) / _RATE_HZ
+        self.entries = [entry for entry, _, _ in frames]
+        times = np.array([time for _, time, _ in frames]) / _TIMES_PER_S
+        self.timestamps = times if times.any() else np.arange(len(frames)) / _RATE_HZ
         check_timestamps(self.timestamps, path, self.warnings)
-        if len(found) < count:
-            self.warnings.append(f"{path}: cut off after {len(found)} of {count} frames")
-        self.reference = self._poses([pose for _, _, pose in found])
+        if len(frames) < count:
+            self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
+        self.reference = self._poses([pose for _, _, pose in frames])
         if options.camera is not None:
-            about, self.camera = load_camera(options.camera, self.depth_size)
-            self.unit, self.kind = about.depth_unit_m, about.depth_kind
-            self.color = about.color or self.color
+            description, self.camera = load_camera(options.camera, self.depth_size)
+            self.unit, self.kind = description.depth_unit_m, description.depth_kind
+            self.color = description.color or self.color
         self.metadata |= {
             "sensor": self.sensor,
             "depth_unit_m": self.unit,
@@ -129,99 +129,99 @@ class SensSource(FileSource):
         shapes = _SHAPES.unpack(self._take(file, _SHAPES.size))
         self.color_packing, self.depth_packing = shapes[:2]
         color_size, self.depth_size = (shapes[2], shapes[3]), (shapes[4], shapes[5])
-        per_metre, count = shapes[6], int(shapes[7])
+        counts_per_metre, count = shapes[6], int(shapes[7])
         if not all(1 < side <= _MAX_SIDE for side in self.depth_size):
             raise self._error(f"has depth images of {self.depth_size}", "export it again")
         if self.depth_packing not in (RAW, ZLIB):
             raise self._error(
                 f"has depth compressed by method {self.depth_packing}", "export it with zlib"
             )
-        if not 1 <= per_metre <= 1e6:
-            raise self._error(f"has {per_metre} counts to a metre", "export it again")
-        self.unit = 1.0 / per_metre
-        color_lens, color_place, depth_lens, depth_place = matrices
+        if not 1 <= counts_per_metre <= 1e6:
+            raise self._error(f"has {counts_per_metre} counts to a metre", "export it again")
+        self.unit = 1.0 / counts_per_metre
+        color_lens, T_device_color, depth_lens, T_device_depth = matrices
         self.camera = self._lens(depth_lens, self.depth_size, "depth")
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
             self.color = ColorCamera(
                 self._lens(color_lens, color_size, "color"),
-                self._T_color_depth(color_place, depth_place),
+                self._T_color_depth(T_device_color, T_device_depth),
             )
         return count
 
     def _T_color_depth(self, T_device_color: Float64, T_device_depth: Float64) -> Float64:
         """T_color_depth (4, 4); identity if not given."""
         try:
-            places = [
+            poses = [
                 read_matrix_pose(T, f"{self.path}: extrinsics")
                 for T in (T_device_color, T_device_depth)
             ]
         except InputError as error:
             self.warnings.append(f"{error}; colour is assumed to have the pose of depth")
             return np.eye(4)
-        if not np.isfinite(places).all():
+        if not np.isfinite(poses).all():
             return np.eye(4)
-        return inverse(places[0]) @ places[1]
+        return inverse(poses[0]) @ poses[1]
 
     def _lens(self, matrix: Float64, size: tuple[int, int], name: str) -> Pinhole:
         values = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
         numbers = {key: float(value) for key, value in values.items()}
         return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
 
-    def _walk(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
+    def _locate_frames(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
         """Locate frames until the end of the file; a truncated one is skipped."""
-        at = file.tell()
+        offset = file.tell()
         for _ in range(count):
-            file.seek(at)
+            file.seek(offset)
             head = file.read(_FRAME.size)
             if len(head) < _FRAME.size:
                 return
             *pose, _, time, color, depth = _FRAME.unpack(head)
-            start = at + _FRAME.size
-            at = start + color + depth
-            if at > self._size:
+            start = offset + _FRAME.size
+            offset = start + color + depth
+            if offset > self._size:
                 return
             yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
 
     def _poses(self, tables: list[Float64]) -> Float64 | None:
         """T_world_camera (N, 4, 4); the format stores minus infinity where tracking was lost."""
         poses = np.full((len(tables), 4, 4), np.nan)
-        wrong = 0
+        invalid = 0
         for k, table in enumerate(tables):
             try:
                 poses[k] = read_matrix_pose(table, f"{self.path}: pose of frame {k}")
             except InputError:
-                wrong += 1
-        if wrong:
-            self.warnings.append(f"{self.path}: {wrong} poses are not rigid motions, and ignored")
+                invalid += 1
+        if invalid:
+            self.warnings.append(f"{self.path}: {invalid} poses are not rigid motions, and ignored")
         return poses if np.isfinite(poses[:, 0, 0]).any() else None
 
-    def _depth(self, packed: bytes, where: str) -> UInt16:
+    def _depth(self, data: bytes, where: str) -> UInt16:
         width, height = self.depth_size
         expected = 2 * width * height
         if self.depth_packing == ZLIB:
-            unpacker = zlib.decompressobj()
+            decompressor = zlib.decompressobj()
             try:
-                packed = unpacker.decompress(packed, expected + 1)
+                data = decompressor.decompress(data, expected + 1)
             except zlib.error as error:
                 raise InputError(
                     f"has damaged depth ({error})", where=where, remedy="copy the file again"
                 ) from error
-        if len(packed) != expected:
+        if len(data) != expected:
             raise InputError(
-                f"has {len(packed)} bytes of depth, not {expected}",
+                f"has {len(data)} bytes of depth, not {expected}",
                 where=where,
                 remedy="copy the file again",
             )
-        return np.frombuffer(packed, "<u2").reshape(height, width)
+        return np.frombuffer(data, "<u2").reshape(height, width)
 
-    def _color(self, packed: bytes, where: str) -> UInt8:
+    def _color(self, data: bytes, where: str) -> UInt8:
         assert self.color is not None
         size = (self.color.camera.width, self.color.camera.height)
         if self.color_packing != RAW:
-            return as_color(parse_image(packed, where, size=size))
-        if len(packed) != 3 * size[0] * size[1]:
-            raise InputError(f"has {len(packed)} bytes", where=where)
-        return np.frombuffer(packed, np.uint8).reshape(size[1], size[0], 3)
+            return as_color(parse_image(data, where, size=size))
+        if len(data) != 3 * size[0] * size[1]:
+            raise InputError(f"has {len(data)} bytes", where=where)
+        return np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)
 
     def _take(self, file: BinaryIO, count: int) -> bytes:
         data = file.read(count)

@@ -48,7 +48,7 @@ class SevenScenes:
             raise InputError("has no frame-*.depth.png", where=path, remedy="check the path")
         numbers = np.array([number for number, _ in numbered])
         files = [file for _, file in numbered]
-        color = [found for file in files if (found := _color(file)) is not None]
+        color = [image for file in files if (image := _color(file)) is not None]
         complete = len(color) == len(files)
         source = DepthImageSource(
             files,
@@ -84,10 +84,10 @@ def _depth_files(path: Path) -> list[tuple[int, Path]]:
     if not is_folder(path):
         return []
     try:
-        found = [(match, p) for p in list_folder(path) if (match := _DEPTH.fullmatch(p.name))]
+        matches = [(match, p) for p in list_folder(path) if (match := _DEPTH.fullmatch(p.name))]
     except InputError:
         return []
-    return sorted((int(match.group(1)), p) for match, p in found)
+    return sorted((int(match.group(1)), p) for match, p in matches)
 
 
 def _color(file: Path) -> Path | None:

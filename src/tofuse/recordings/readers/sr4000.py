@@ -21,8 +21,8 @@ from tofuse.recordings.sources import FileSource
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
 AMBIGUITY_M = 5.0
-# The export measures Z from about 1 cm in front of the optical centre; nearer points are not
-# measurable and don't determine a ray.
+# The export measures Z from about 1 cm in front of the optical centre; nearer points can't be
+# measured and don't determine a ray.
 NEAREST_M = 0.01
 
 _BLOCKS = {
@@ -91,15 +91,15 @@ class Sr4000Source(FileSource):
 
     def _read_timestamps(self) -> None:
         times = np.array([_time_stamp(path) for path in self.files])
-        known = np.isfinite(times)
+        valid = np.isfinite(times)
         index = np.arange(len(times))
-        if not known.any():
+        if not valid.any():
             self.warnings.append(f"no timestamps: a frame rate of {FRAME_RATE_HZ} Hz is assumed")
             self.timestamps = index / FRAME_RATE_HZ
             return
-        if not known.all():
-            self.warnings.append(f"{int((~known).sum())} frames have no timestamp: interpolated")
-        times[~known] = np.interp(index[~known], index[known], times[known])
+        if not valid.all():
+            self.warnings.append(f"{int((~valid).sum())} frames have no timestamp: interpolated")
+        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():
@@ -143,8 +143,8 @@ def _time_stamp(path: Path) -> float:
         with path.open("rb") as file:
             file.seek(0, 2)
             file.seek(max(0, file.tell() - _TAIL))
-            found = _TIME.search(file.read(_TAIL))
-        return float(found.group(1)) / 1000 if found else float("nan")
+            match = _TIME.search(file.read(_TAIL))
+        return float(match.group(1)) / 1000 if match else float("nan")
     except (OSError, ValueError):
         return float("nan")
 
@@ -158,7 +158,7 @@ def _read_blocks(path: Path) -> dict[str, Float64]:
         if name is None:
             continue
         try:
-            numbers = np.array([float(word) for word in body.split()])
+            numbers = np.array([float(cell) for cell in body.split()])
         except ValueError as error:
             raise InputError(
                 f"is damaged in the block {title.strip()!r} ({error})", where=path

@@ -71,11 +71,11 @@ class StraySource(PhoneSource):
         files = files_with(folder / "depth", ".png")
         if not files:
             raise InputError("has no .png files", where=folder / "depth", remedy="copy it again")
-        sure = {p.stem: p for p in _images(folder / "confidence")}
+        confidence = {p.stem: p for p in _images(folder / "confidence")}
         super().__init__(
             files,
             np.arange(len(files)) / FRAME_RATE_HZ,
-            confidence=[sure.get(f.stem) for f in files],
+            confidence=[confidence.get(f.stem) for f in files],
             color=[None] * len(files),
         )
         self.numbers = [int(f.stem) if f.stem.isdecimal() else k for k, f in enumerate(files)]
@@ -85,8 +85,8 @@ class StraySource(PhoneSource):
         if self.imu is not None:
             self.gravity = gravity_at(self.timestamps, self.imu)
 
-    def whole_color(self, index: int) -> UInt8 | None:
-        """See `FileSource.whole_color`."""
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.full_resolution_color`."""
         return None if self.video is None else self.video.read(self.numbers[index])
 
     def color_path(self, index: int) -> Path:
@@ -122,7 +122,7 @@ class StraySource(PhoneSource):
             self.warnings.append(f"{path}: has no columns {', '.join(_IMU)}: ignored")
             return None
         return {"timestamp": columns["timestamp"]} | {
-            name: sign * columns[own] for own, (name, sign) in _IMU.items()
+            name: sign * columns[column] for column, (name, sign) in _IMU.items()
         }
 
     def _read_odometry(self, folder: Path) -> None:
@@ -138,24 +138,24 @@ class StraySource(PhoneSource):
         row = np.array([rows.get(number, -1) for number in self.numbers])
         # A non-finite value counts as a missing row.
         times = np.where(row < 0, np.nan, columns["timestamp"][row])
-        known = np.isfinite(times)
-        if not known.any():
+        valid = np.isfinite(times)
+        if not valid.any():
             raise InputError(
                 "has no timestamp of any image in depth/", where=path, remedy="copy it again"
             )
-        if not known.all():
-            self.warnings.append(f"{path}: {int((~known).sum())} frames have no row: interpolated")
+        if not valid.all():
+            self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
         index = np.arange(len(times))
-        times[~known] = np.interp(index[~known], index[known], times[known])
+        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
         self.timestamps = times
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
-        good = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
-        good &= np.abs(quaternion.length(np.where(good[:, None], table, 0)[:, 3:]) - 1) < 0.01
-        poses[good] = np.eye(4)
-        poses[good, :3, :3] = quaternion.to_matrix(table[good, 3:])
-        poses[good, :3, 3] = table[good, :3]
-        self.reference = poses if good.any() else None
+        posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
+        posed &= np.abs(quaternion.length(np.where(posed[:, None], table, 0)[:, 3:]) - 1) < 0.01
+        poses[posed] = np.eye(4)
+        poses[posed, :3, :3] = quaternion.to_matrix(table[posed, 3:])
+        poses[posed, :3, 3] = table[posed, :3]
+        self.reference = poses if posed.any() else None
         self._read_lenses(folder, columns, row)
 
     def _read_lenses(self, folder: Path, columns: dict[str, Float64], row: Intp) -> None:

@@ -20,8 +20,8 @@ from tofuse.recordings.sources import FARTHEST_M, FileSource, read_timestamps, t
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
-_AMPLITUDE = ("intens", "ampl")
-_OTHER = (*_AMPLITUDE, "conf")
+_AMPLITUDE_KEYWORDS = ("intens", "ampl")
+_NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 
 @part("reader", "tiff")
@@ -72,13 +72,13 @@ class TiffSource(FileSource):
     def __init__(
         self, folder: Path, depth: Sequence[Path], amplitude: Sequence[Path], camera: Path
     ) -> None:
-        about, self.camera = load_camera(camera)
-        rate = about.frame_rate_hz
+        description, self.camera = load_camera(camera)
+        rate = description.frame_rate_hz
         super().__init__(np.arange(len(depth)) / (rate or 1.0))
         self.depth, self.amplitude = list(depth), list(amplitude)
-        self.unit, self.kind = about.depth_unit_m, about.depth_kind
-        self.amplitude_kind = about.amplitude_kind or "raw"
-        self.ambiguity_m = about.ambiguity_m
+        self.unit, self.kind = description.depth_unit_m, description.depth_kind
+        self.amplitude_kind = description.amplitude_kind or "raw"
+        self.ambiguity_m = description.ambiguity_m
         if self.amplitude and len(self.amplitude) != len(self.depth):
             self.warnings.append(
                 f"{len(self.amplitude)} images of amplitude for {len(self.depth)} of depth: "
@@ -93,8 +93,12 @@ class TiffSource(FileSource):
         if is_file(folder / "odometry.txt"):
             self.odometry = tum_poses(self, folder / "odometry.txt")
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
-        stated = {"sensor": about.sensor, "frame_rate_hz": rate, "ambiguity_m": self.ambiguity_m}
-        self.metadata |= {key: value for key, value in stated.items() if value is not None}
+        declared = {
+            "sensor": description.sensor,
+            "frame_rate_hz": rate,
+            "ambiguity_m": self.ambiguity_m,
+        }
+        self.metadata |= {key: value for key, value in declared.items() if value is not None}
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -127,8 +131,8 @@ def _is_range(file: Path) -> bool:
 
 
 def _is_amplitude(file: Path) -> bool:
-    return any(word in file.stem.lower() for word in _AMPLITUDE)
+    return any(keyword in file.stem.lower() for keyword in _AMPLITUDE_KEYWORDS)
 
 
 def _is_other(file: Path) -> bool:
-    return any(word in file.stem.lower() for word in _OTHER)
+    return any(keyword in file.stem.lower() for keyword in _NOT_DEPTH)

@@ -65,7 +65,7 @@ class Tum:
         color: list[Path | None] | None = None
         if is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
-            # A depth image without its own takes a neighbour's: colour is for display only.
+            # A depth image without a colour image takes that of a neighbour: only for display.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).any():
                 color = [color_files[k] if k >= 0 else None for k in pairs]
@@ -91,28 +91,28 @@ class Tum:
 def camera_of(path: Path) -> BrownConrady | None:
     """Return the colour camera, identified by the name of the folder or its parent."""
     for name in (path.absolute().name, path.absolute().parent.name):
-        found = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
-        if found:
-            return CAMERAS[f"freiburg{found.group(1)}"]
+        match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
+        if match:
+            return CAMERAS[f"freiburg{match.group(1)}"]
     return None
 
 
 def _read_list(path: Path) -> tuple[Float64, list[Path]]:
     times, files = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split("#", 1)[0].split()
-        if not words:
+        cells = line.split("#", 1)[0].split()
+        if not cells:
             continue
         try:
-            times.append(float(words[0]))
-            name = Path(words[1])
+            times.append(float(cells[0]))
+            name = Path(cells[1])
         except (ValueError, IndexError) as error:
             raise InputError(
                 "isn't a timestamp and a file name", where=f"{path}, line {number}"
             ) from error
-        if name.is_absolute() or ".." in name.parts or "\0" in words[1]:
+        if name.is_absolute() or ".." in name.parts or "\0" in cells[1]:
             raise InputError(
-                f"names {words[1]!r}, outside the folder", where=f"{path}, line {number}"
+                f"names {cells[1]!r}, outside the folder", where=f"{path}, line {number}"
             )
         files.append(path.parent / name)
     if not files:

@@ -52,13 +52,13 @@ def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     if table.shape[1] == 4:
         amplitude = _float32(table[:, 3])
     elif table.shape[1] >= 6:
-        three = table[:, 3:6]
+        columns = table[:, 3:6]
         if path.suffix.lower() == ".xyzrgb":
-            color = np.clip(np.rint(np.nan_to_num(three) * 255), 0, 255).astype(np.uint8)
-        elif path.suffix.lower() == ".xyzn" or _are_unit(three):
-            normals = _float32(three)
-        elif ((three >= 0) & (three <= 255) & (three == np.rint(three))).all():
-            color = three.astype(np.uint8)
+            color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
+        elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
+            normals = _float32(columns)
+        elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
+            color = columns.astype(np.uint8)
     return cloud_frame(
         index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
     )

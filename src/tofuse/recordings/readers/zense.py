@@ -76,8 +76,8 @@ def _settings(path: Path) -> Path | None:
     if not is_folder(path):
         return None
     files = [p for p in files_with(path, ".toml") if is_file(p)]
-    found = [p for p in files if "camera_fx" in read_text(p, limit=1 << 20)]
-    return found[0] if found else None
+    candidates = [p for p in files if "camera_fx" in read_text(p, limit=1 << 20)]
+    return candidates[0] if candidates else None
 
 
 def _read(path: Path) -> dict[str, Any]:
