@@ -9,10 +9,10 @@ least 95 % of its frames have a pose; for real recordings, the uncertainty of th
 added.
 
 Simulated scenes are recorded by several cameras, with and without multipath. Variants of each
-recording have every second or fourth frame, a wrong focal length, a depth offset, or a gap. The
-family `incidents` has cases of `stress.py`: a person passes through the view, the lens is covered,
-the camera approaches a bare wall, or continues in another place. Real recordings are used complete
-and with every fourth frame.
+recording have every second or fourth frame, a wrong focal length or principal point, a depth
+offset, or a gap. The family `incidents` has cases of `stress.py`: a person passes through the view,
+the lens is covered, the camera approaches a bare wall, or continues in another place. Real
+recordings are used complete and with every fourth frame.
 
     python benchmarks/verdict.py [--seeds 10 11] [--families room] [--real] [--json FILE]
 """
@@ -50,7 +50,7 @@ SCENES = {"room": 12, "rail": 10, "empty-room": 12, "corridor": 12, "flat": 3}
 FRAMES = 60
 CAMERAS = ("sr4000", "ifm-o3r", "pico-flexx")
 POSED = 0.95
-FOCAL, OFFSET_M = 1.05, 0.03
+FOCAL, CENTER, OFFSET_M = 1.05, 0.02, 0.03
 INCIDENTS = "incidents"
 UNCHANGED = "as it is"
 # Fault of a recording, by the end of a run's name, and the reasons that name it.
@@ -65,6 +65,7 @@ INCIDENT_CAUSES = {
 }
 CAUSES = {
     "focal 5 % off": CALIBRATION,
+    "principal point 2 % off": CALIBRATION,
     "depth 3 cm off": CALIBRATION,
     "gap": frozenset({"bridged_gap", "disconnected", "frames_missing"}),
     **INCIDENT_CAUSES,
@@ -137,6 +138,12 @@ def wrong_focal(frame: RangeFrame) -> RangeFrame:
     return replace(frame, camera=replace(camera, fx=FOCAL * camera.fx, fy=FOCAL * camera.fy))
 
 
+def wrong_principal_point(frame: RangeFrame) -> RangeFrame:
+    """The frame with a principal point that is off by a fraction of the focal length."""
+    camera = frame.camera
+    return replace(frame, camera=replace(camera, cx=camera.cx + CENTER * camera.fx))
+
+
 def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     """Yield variants of a recording."""
     yield UNCHANGED, recording
@@ -147,6 +154,7 @@ def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     frames = [f for f in recording if isinstance(f, RangeFrame)]
     changed = {
         "focal 5 % off": [wrong_focal(f) for f in frames],
+        "principal point 2 % off": [wrong_principal_point(f) for f in frames],
         "depth 3 cm off": [stress.farther(f, OFFSET_M) for f in frames],
     }
     for name, made in changed.items():

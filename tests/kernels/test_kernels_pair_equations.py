@@ -75,21 +75,26 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_focal_length_error_is_compensated(pair, kind):
+@pytest.mark.parametrize("error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y])
+def test_wrong_intrinsics_are_compensated(pair, kind, error):
     """The measured quantity is kept: z, or the range along another ray."""
     source, target, T = pair
-    share = 1.02
+    errors = np.zeros(kernels.ERRORS)
+    errors[error] = 0.01
 
     def stated(frame):
         camera = frame.camera
-        wrong = replace(camera, fx=share * camera.fx, fy=share * camera.fy)
+        fx, fy = (f * (1 + errors[kernels.FOCAL]) for f in (camera.fx, camera.fy))
+        cx, cy = (
+            camera.cx + errors[kernels.CENTER_X] * fx,
+            camera.cy + errors[kernels.CENTER_Y] * fy,
+        )
+        wrong = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
         return replace(as_measured(frame, kind), camera=wrong)
 
     views = stated(source), stated(target)
-    errors = np.zeros(kernels.ERRORS)
-    errors[kernels.FOCAL] = share - 1
     known = KNOWN.copy()
-    known[kernels.FOCAL] = 0
+    known[error] = 0
     plain = (0.0, 1.0, 0.1, 0.002, 4.0, 0.5)
 
     def misfit(out):

@@ -42,12 +42,14 @@ def frame(camera=CAMERA, kind="z") -> RangeFrame:
 @pytest.mark.parametrize("kind", ["z", "range"])
 def test_corrected_points_are_correct(camera, kind) -> None:
     before = frame(camera, kind)
-    after = CameraErrors(focal=0.1, offset_m=0.05).start().apply(before)
+    errors = CameraErrors(focal=0.1, offset_m=0.05, center_x=0.02, center_y=-0.03)
+    after = errors.start().apply(before)
     assert isinstance(after, RangeFrame)
     np.testing.assert_array_equal(after.valid, before.valid)
     slopes = [f.points[:, :2] / f.points[:, 2:] for f in (before, after)]
-    np.testing.assert_allclose(slopes[1], 1.1 * slopes[0], rtol=1e-5, atol=1e-6)
-    rays = np.concatenate([1.1 * slopes[0], np.ones((len(slopes[0]), 1))], axis=1)
+    true = 1.1 * slopes[0] + [0.02, -0.03]
+    np.testing.assert_allclose(slopes[1], true, rtol=1e-5, atol=1e-6)
+    rays = np.concatenate([true, np.ones((len(true), 1))], axis=1)
     lengths = np.linalg.norm(rays, axis=1)
     # The camera measures 2 m: the range, or z along the corrected ray.
     ranges = (2.0 if kind == "range" else 2.0 * lengths) + 0.05
@@ -62,12 +64,21 @@ def test_lens_distortion_is_kept() -> None:
 
 
 def test_errors_are_composed() -> None:
-    both = CameraErrors(0.1, 0.02, 0.004).and_then(CameraErrors(0.1, 0.01, 0.003, 0.005))
-    assert both.sigmas == {"focal": 0.003, "offset": 0.005}
-    assert CameraErrors(0.1, 0, 0.004).and_then(CameraErrors(offset_m=0.01)).focal_sigma == 0.004
+    first = CameraErrors(0.1, 0.02, 0.01, focal_sigma=0.004, center_x_sigma=0.002)
+    second = CameraErrors(0.1, 0.01, 0.0, -0.02, focal_sigma=0.003, offset_sigma_m=0.005)
+    both = first.and_then(second)
+    sigmas = {"focal": 0.003, "offset": 0.005, "center_x": 0.002, "center_y": 0.0}
+    assert both.sigmas == sigmas
     assert both.focal == pytest.approx(0.21)
     assert both.offset_m == pytest.approx(0.03)
-    assert in_words(both) == "a focal length 17.4% smaller and ranges 30 mm longer"
+    assert in_words(both) == (
+        "a focal length 17.4% smaller and ranges 30 mm longer and a principal point 1.1% of the "
+        "focal length further left and a principal point 2.0% of the focal length further down"
+    )
+    camera = both.camera(CAMERA)
+    again = second.camera(first.camera(CAMERA))
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(camera, name) == pytest.approx(getattr(again, name))
 
 
 def test_clouds_are_unchanged() -> None:
@@ -139,8 +150,12 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
         "part": "camera-errors",
         "focal": found.focal,
         "offset_m": 0.0,
+        "center_x": 0.0,
+        "center_y": 0.0,
         "focal_sigma": found.sigmas["focal"],
         "offset_sigma_m": 0.0,
+        "center_x_sigma": 0.0,
+        "center_y_sigma": 0.0,
     }
     codes = {r.code for r in result.diagnostics.reasons}
     assert "self_calibrated" in codes
@@ -173,26 +188,44 @@ def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     assert error_of(half, right) < right.diagnostics.accuracy.position_m
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", [0.99, 1.003, 1.01, 1.02])
-def test_bound_includes_focal_length_error(wrong) -> None:
-    """In a sweep to both sides and back, which closes loops without a full turn."""
+@pytest.fixture(scope="module")
+def sweep() -> tuple[list[RangeFrame], np.ndarray]:
+    """A sweep to both sides and back, which closes loops without a full turn; its poses."""
     camera = Pinhole(100, 100, 50.0, 50.0, 49.5, 49.5)
     s = 2 * np.pi * np.arange(60) / 59
     turns = np.stack([0.15 * np.sin(2 * s), 1.2 * np.sin(s), np.zeros(60)], 1)
     poses = se3.exp(np.concatenate([np.zeros((60, 3)), turns], 1))
     poses[:, :3, 3] = np.stack([0.4 * np.sin(s), 0.1 * np.sin(s), 0.4 * (np.cos(s) - 1)], 1)
-    frames = views_in_room(camera, poses, 0.005, 0)
-    stated = replace(camera, fx=wrong * 50, fy=wrong * 50)
-    recording = Recording.of(ArraySource([replace(f, camera=stated) for f in frames]), "", "test")
-    result = reconstruct(recording, COARSE)
+    return views_in_room(camera, poses, 0.005, 0), poses
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wrong", "corrected"),
+    [
+        ({"fx": 49.5, "fy": 49.5}, False),
+        ({"fx": 50.15, "fy": 50.15}, False),
+        ({"fx": 50.5, "fy": 50.5}, False),
+        ({"fx": 51.0, "fy": 51.0}, True),
+        ({"cx": 50.0}, False),
+        ({"cx": 50.5}, True),
+        ({"cy": 48.0}, True),
+    ],
+)
+def test_wrong_intrinsics_are_corrected_or_part_of_bound(sweep, wrong, corrected) -> None:
+    frames, poses = sweep
+    stated = [replace(f, camera=replace(f.camera, **wrong)) for f in frames]
+    result = reconstruct(Recording.of(ArraySource(stated), "", "test"), COARSE)
     error, _ = displacement(poses, result.trajectory)
-    assert error < result.diagnostics.accuracy.position_m
-    if wrong == 1.02:
+    d = result.diagnostics
+    assert error < d.accuracy.position_m
+    assert (d.calibrated is not None) == corrected
+    if corrected:
         assert error < 0.004
-        assert result.diagnostics.calibrated is not None
-    elif wrong != 1.003:
-        assert "unchecked_calibration" in [r.code for r in result.diagnostics.reasons]
+        name = "center_x" if "cx" in wrong else "center_y" if "cy" in wrong else "focal"
+        expected = {"fx": 0.02, "cx": 0.02, "cy": -0.03}[next(iter(wrong))]
+        assert getattr(d.calibrated, name) == pytest.approx(expected, rel=0.1)
+        assert run_json(result)["self_calibration"][name] == getattr(d.calibrated, name)
 
 
 def test_correct_focal_length_is_unchanged(recording) -> None:

@@ -1,4 +1,4 @@
-"""Correct known errors of a camera: its focal length, and an offset of its ranges."""
+"""Correct known errors of a camera: its intrinsics, and an offset of its ranges."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable, ray_lengths
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
+
 # Larger values indicate a wrong camera, not an error.
-
-
 @part("correction", "camera-errors")
 @dataclass(frozen=True)
 class CameraErrors(Bounded, Correction):
-    """Correct the focal length and the range offset of a camera.
+    """Correct the focal length, the principal point and the range offset of a camera.
 
     Attributes
     ----------
@@ -30,14 +29,21 @@ class CameraErrors(Bounded, Correction):
         stated one.
     offset_m
         Added to all ranges, m.
-    focal_sigma, offset_sigma_m
-        Standard deviations of both, which the stated accuracy of poses includes.
+    center_x, center_y
+        Added to the ray coordinates x / z and y / z: by so many true focal lengths the true
+        principal point is further left and up.
+    focal_sigma, offset_sigma_m, center_x_sigma, center_y_sigma
+        Standard deviations of these, which the stated accuracy of poses includes.
     """
 
     focal: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
+    center_x: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    center_y: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     focal_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     offset_sigma_m: Annotated[float, Bounds(0, 1)] = 0.0
+    center_x_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    center_y_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self) -> Corrector:
@@ -52,14 +58,23 @@ class CameraErrors(Bounded, Correction):
         return CameraErrors(
             self.focal + other.focal + self.focal * other.focal,
             self.offset_m + other.offset_m,
+            self.center_x * (1 + other.focal) + other.center_x,
+            self.center_y * (1 + other.focal) + other.center_y,
             other.focal_sigma if other.focal else self.focal_sigma,
             other.offset_sigma_m if other.offset_m else self.offset_sigma_m,
+            other.center_x_sigma if other.center_x else self.center_x_sigma,
+            other.center_y_sigma if other.center_y else self.center_y_sigma,
         )
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """The standard deviations of "focal" and "offset"."""
-        return {"focal": self.focal_sigma, "offset": self.offset_sigma_m}
+        """The standard deviations of "focal", "offset", "center_x" and "center_y"."""
+        return {
+            "focal": self.focal_sigma,
+            "offset": self.offset_sigma_m,
+            "center_x": self.center_x_sigma,
+            "center_y": self.center_y_sigma,
+        }
 
     @classmethod
     def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:
@@ -68,7 +83,9 @@ class CameraErrors(Bounded, Correction):
         They are the only corrections that change the rays of pixels.
         """
         return tuple(
-            cls(item["focal"], item["offset_m"]).start()
+            cls(
+                item["focal"], item["offset_m"], item.get("center_x", 0), item.get("center_y", 0)
+            ).start()
             for item in config.get("corrections", ())
             if item["part"] == "camera-errors"
         )
@@ -76,9 +93,11 @@ class CameraErrors(Bounded, Correction):
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""
         if isinstance(stated, Pinhole):
-            factor = 1 + self.focal
-            return replace(stated, fx=stated.fx / factor, fy=stated.fy / factor)
-        return RayTable(np.asarray(stated.rays() * np.float32(1 + self.focal)))
+            fx, fy = stated.fx / (1 + self.focal), stated.fy / (1 + self.focal)
+            cx, cy = stated.cx - self.center_x * fx, stated.cy - self.center_y * fy
+            return replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
+        center = np.array([self.center_x, self.center_y], np.float32)
+        return RayTable(np.asarray(stated.rays() * np.float32(1 + self.focal) + center))
 
 
 @dataclass(eq=False)
@@ -92,7 +111,7 @@ class _Corrector(Corrector):
         if not isinstance(frame, RangeFrame):
             return frame
         options = self.options
-        if options.focal:
+        if options.focal or options.center_x or options.center_y:
             cameras = self._cameras
             if cameras is None or cameras[0] != frame.camera:
                 cameras = self._cameras = (frame.camera, options.camera(frame.camera))

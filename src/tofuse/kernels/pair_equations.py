@@ -62,7 +62,9 @@ from tofuse.kernels.projection import jacobian_row, project_ray
 OFFSET = 0  # to be added to the range, m
 SCALE = 1  # relative, to be added to the depth
 FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
-ERRORS = 3
+CENTER_X = 3  # to be added to the ray coordinate x / z: principal point over focal length
+CENTER_Y = 4  # to be added to y / z
+ERRORS = 5
 
 EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
@@ -168,6 +170,13 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
     B[FOCAL, 0] = x - shorter * x
     B[FOCAL, 1] = y - shorter * y
     B[FOCAL, 2] = -shorter * z
+    for p, side in ((CENTER_X, x), (CENTER_Y, y)):
+        shorter = side * z / r2 if radial else 0.0
+        B[p, 0] = -shorter * x
+        B[p, 1] = -shorter * y
+        B[p, 2] = -shorter * z
+    B[CENTER_X, 0] += z
+    B[CENTER_Y, 1] += z
 
 
 @kernel
@@ -213,9 +222,9 @@ def _all_equations(
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
-        # Project with the corrected focal length of the target.
-        xn = x / (z * wider)
-        yn = y / (z * wider)
+        # Project with the corrected intrinsics of the target.
+        xn = (x / z - errors[CENTER_X]) / wider
+        yn = (y / z - errors[CENTER_Y]) / wider
         u, v, iu, _ = project_ray(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
@@ -303,10 +312,15 @@ def _all_equations(
         J[EXPOSURE] = -1.0
         for p in range(asked):
             J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
-        if asked > FOCAL:
-            # Of the camera errors only the focal length changes the rays of the target's pixels.
-            J[7 + FOCAL] -= (r00 * m0 + r01 * m1 + r02 * m2) * x
-            J[7 + FOCAL] -= (r10 * m0 + r11 * m1 + r12 * m2) * y
+        # Only errors of the intrinsics change the rays of the target's pixels.
+        d0 = r00 * m0 + r01 * m1 + r02 * m2
+        d1 = r10 * m0 + r11 * m1 + r12 * m2
+        if asked > FOCAL and not known[FOCAL]:
+            J[7 + FOCAL] -= d0 * (x - errors[CENTER_X] * z) + d1 * (y - errors[CENTER_Y] * z)
+        if asked > CENTER_X and not known[CENTER_X]:
+            J[7 + CENTER_X] -= d0 * z
+        if asked > CENTER_Y and not known[CENTER_Y]:
+            J[7 + CENTER_Y] -= d1 * z
         _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
@@ -446,10 +460,13 @@ def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
     for k in range(LANES):
         side2 = x[k] * x[k] + y[k] * y[k]
         r2 = max(side2 + z[k] * z[k], _TINY)  # columns without a point may be 0
-        shorter = side2 / r2 if radial else 0.0
-        along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - errors[FOCAL] * shorter
-        x[k] *= along + errors[FOCAL]
-        y[k] *= along + errors[FOCAL]
+        shorter = 0.0
+        if radial:
+            shift = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
+            shorter = (errors[FOCAL] * side2 + shift * z[k]) / r2
+        along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shorter
+        x[k] = x[k] * (along + errors[FOCAL]) + errors[CENTER_X] * z[k]
+        y[k] = y[k] * (along + errors[FOCAL]) + errors[CENTER_Y] * z[k]
         z[k] *= along
 
 
@@ -467,11 +484,14 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
             continue
         side2 = xn[k] * xn[k] + yn[k] * yn[k]
         r2 = side2 + 1
-        shorter = side2 / r2 if radial else 0.0
-        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + errors[FOCAL] * shorter
+        shorter = 0.0
+        if radial:
+            shift = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
+            shorter = (errors[FOCAL] * side2 + shift) / r2
+        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shorter
         wider = 1 + errors[FOCAL]
-        xn[k] /= wider
-        yn[k] /= wider
+        xn[k] = (xn[k] - errors[CENTER_X]) / wider
+        yn[k] = (yn[k] - errors[CENTER_Y]) / wider
         z[k] *= along
 
 

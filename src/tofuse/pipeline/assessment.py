@@ -190,15 +190,14 @@ class Assessment:
         """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
 
         It is the gap of a loop that a better calibration would close, or the change of the poses
-        under the estimated calibration unless a loop contradicts that; plus the uncertainty of
-        corrections.
+        under the estimated calibration; plus the uncertainty of corrections.
         """
         if check is None:
             return 0.0, 0.0
         errors = [np.zeros(2)]
         if check.alarm and check.gap is not None:
             errors.append(np.array(check.gap.before))
-        elif not check.contradicted:
+        else:
             errors.append(np.array(check.moved))
         for part in self.config.corrections:
             if isinstance(part, CameraErrors):

@@ -1,6 +1,6 @@
 """Self-calibration: calibration errors that a recording shows are corrected.
 
-Refined views show whether an error of the focal length or the depth offset distorts the trajectory:
+Refined views show whether an error of the intrinsics or of the depth distorts the trajectory:
 with a correction, they support each other better, and the drift over a loop is smaller
 (`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
 which is kept only if the error bound of the poses is smaller (`posegraph.accuracy`), although it
@@ -28,8 +28,18 @@ from tofuse.results.verdict import ranked
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
 # Options of `CameraErrors` by the names of the errors; their standard deviations.
-_FIELDS = {"focal": "focal", "offset": "offset_m"}
-_SIGMAS = {"focal": "focal_sigma", "offset": "offset_sigma_m"}
+_FIELDS = {
+    "focal": "focal",
+    "offset": "offset_m",
+    "center_x": "center_x",
+    "center_y": "center_y",
+}
+_SIGMAS = {
+    "focal": "focal_sigma",
+    "offset": "offset_sigma_m",
+    "center_x": "center_x_sigma",
+    "center_y": "center_y_sigma",
+}
 
 Reconstruct = Callable[[Config], Reconstruction]
 
@@ -67,6 +77,8 @@ def self_calibrated(
         calibration = SelfCalibration(
             correction.focal,
             correction.offset_m,
+            correction.center_x,
+            correction.center_y,
             {_FIELDS[check.best]: check.sigmas[check.best]},
             (_bound(initial), _bound(candidate)),
         )
@@ -144,7 +156,7 @@ def _with_calibration(result: Reconstruction, calibration: SelfCalibration) -> D
     """Return the diagnostics with the self-calibration and its reason."""
     d = result.diagnostics
     indices = [f.index for f in d.frames]
-    correction = CameraErrors(calibration.focal, calibration.offset_m)
+    correction = CameraErrors(*(getattr(calibration, field) for field in _FIELDS.values()))
     text = (
         f"The calibration of the camera was corrected: views agree with {in_words(correction)} "
         f"than stated.{_bound_change(*calibration.bound_m)}"

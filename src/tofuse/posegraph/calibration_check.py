@@ -1,6 +1,7 @@
 """Self-calibration check: whether all views together indicate an error of the camera.
 
-A wrong focal length or a depth offset bends the trajectory, and no single registration reveals it.
+A wrong focal length or principal point or a depth offset bends the trajectory, and no single
+registration reveals it.
 But where views overlap, and above all where a path closes a loop, their residuals can't all be
 small. So each error is estimated separately, with all poses free. An error that makes the views
 more consistent is a proposal. It is an alarm if it exceeds the calibration error of usual
@@ -23,6 +24,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import (
+    AlignedViews,
     Refined,
     align_pairs,
     align_views,
@@ -36,7 +38,9 @@ from tofuse.posegraph.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
-TOLERANCES = {"focal": 0.01, "offset": 0.01}
+TOLERANCES = {"focal": 0.01, "offset": 0.01, "center_x": 0.01, "center_y": 0.01}
+# Errors that the drift over a loop can reveal: that of a wrong principal point resembles any drift.
+_REVEALED_BY_LOOP = ("focal", "offset")
 # Significance of an error in standard deviations, for an alarm and for a full estimate; and the
 # fraction of the tolerance that one Newton step must reach for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
@@ -55,7 +59,12 @@ _LOOP_FACTOR, _MIN_CONFIRMED = 2.0, 0.5
 # Minimum number of views from which their spread is estimated.
 _MIN_VIEWS = 8
 _DELTA = 1e-3  # error of the camera for numerical differentiation
-_INDEX = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
+_INDEX = {
+    "focal": kernels.FOCAL,
+    "offset": kernels.OFFSET,
+    "center_x": kernels.CENTER_X,
+    "center_y": kernels.CENTER_Y,
+}
 # The solution may be far from the initial poses.
 _ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
 # This many pairs determine errors that all views share; larger sets are subsampled to about as
@@ -145,8 +154,9 @@ class CalibrationCheck:
     motion
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
-        Rms motion (m, rad) of the poses, after alignment, if the estimated error is corrected: that
-        of `best`, else the error with the larger effect of those that the views determine.
+        Rms motion (m, rad) of the poses, after alignment, if the likely errors are corrected
+        together; if none is likely, the largest motion by the estimate of one that the views
+        determine.
     """
 
     alarm: bool = False
@@ -165,18 +175,13 @@ class CalibrationCheck:
         return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
 
     @property
-    def contradicted(self) -> bool:
-        """Whether a loop shows that the estimated errors are not those of the camera."""
-        return not self.alarm and self.gap is not None and self.gap.contradicts
-
-    @property
     def unconfirmed(self) -> dict[str, float]:
         """Significant errors without an alarm that may be true.
 
         Either one of them is large, and no loop confirms or contradicts it, or the views agree
         better with the smaller ones.
         """
-        if self.alarm or self.contradicted:
+        if self.alarm or (self.gap is not None and self.gap.contradicts):
             return {}
         if not self.large and not self.improves:
             return {}
@@ -256,18 +261,17 @@ def check_calibration(
         )
 
     estimates = {name: refine_with(name) for name in likely}
-    joint_errors = estimates[likely[0]].errors
+    joint: Refined | AlignedViews = estimates[likely[0]]
     if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
-        error_indices = [_INDEX[name] for name in likely]
-        joint_errors = align_views(
+        joint = align_views(
             sampled_views,
             poses,
             coarse_to_fine,
-            calibrate=error_indices,
+            calibrate=[_INDEX[name] for name in likely],
             priors=priors,
             pairs=sampled_pairs,
-        ).errors
-    best_name = max(likely, key=lambda name: abs(joint_errors[_INDEX[name]]) / TOLERANCES[name])
+        )
+    best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
     large = any(
         _large(name, result.errors[_INDEX[name]], sigma[_INDEX[name]])
@@ -286,7 +290,7 @@ def check_calibration(
     elif (loop_check := by_loop()).alarm:
         return loop_check
     support = float(best.before.of_views(len(views)).mean())
-    position, rotation = aligned_motion(poses, best.poses)
+    position, rotation = aligned_motion(poses, joint.poses)
     return replace(
         without_error,
         alarm=alarm,
@@ -503,7 +507,7 @@ def _check_by_loop(
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
     candidates: dict[str, tuple[float, Gap]] = {}
-    for name in sigmas:
+    for name in (name for name in _REVEALED_BY_LOOP if name in sigmas):
         step = _FIRST_STEP * TOLERANCES[name]
         error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
@@ -553,4 +557,11 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
     if "offset" in errors:
         more = "longer" if errors["offset"] > 0 else "shorter"
         words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
+    for name, (less, more) in {"center_x": ("left", "right"), "center_y": ("up", "down")}.items():
+        if name in errors:
+            # A larger ray coordinate of a pixel is a principal point further left or up.
+            where = less if errors[name] > 0 else more
+            words.append(
+                f"a principal point {abs(errors[name]):.1%} of the focal length further {where}"
+            )
     return words

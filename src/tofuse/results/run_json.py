@@ -263,6 +263,8 @@ def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
     return {
         "focal": calibration.focal,
         "offset_m": calibration.offset_m,
+        "center_x": calibration.center_x,
+        "center_y": calibration.center_y,
         "sigma": dict(calibration.sigmas),
         "stated_bound_m": calibration.bound_m[0],
         "corrected_bound_m": calibration.bound_m[1],

@@ -98,8 +98,10 @@ class SelfCalibration:
         The true focal length is 1 / (1 + focal) of the stated one.
     offset_m
         Added to all ranges, m.
+    center_x, center_y
+        Added to the ray coordinates x / z and y / z.
     sigmas
-        Standard deviations of "focal" and "offset", from the scatter between views.
+        Standard deviations of the corrected ones, from the scatter between views.
     bound_m
         95 % bounds of the rms pose error with the stated and with the corrected calibration, m;
         inf where the poses are not bounded.
@@ -107,6 +109,8 @@ class SelfCalibration:
 
     focal: float
     offset_m: float
+    center_x: float
+    center_y: float
     sigmas: Mapping[str, float]
     bound_m: tuple[float, float]
 
