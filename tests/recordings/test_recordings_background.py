@@ -88,9 +88,7 @@ def test_object_includes_pixels_it_always_hides() -> None:
     found = moving_object(frames)
     middle = np.zeros((ROWS, COLUMNS), bool)
     middle[20:45, 34:46] = True
-    assert found.own[
-        middle
-    ].all()  # its depth is constant, or nearly so, and it is no background
+    assert found.own[middle].all()  # its depth is constant, or nearly so, and it is no background
     assert not found.own[:8].any()
     for image, mask in zip(frames, masks, strict=True):
         assert agreement(found.mask(image.z), mask) > 0.97
