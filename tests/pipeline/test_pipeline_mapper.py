@@ -21,7 +21,7 @@ from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.graph import Optimisation, Optimiser
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
@@ -202,7 +202,7 @@ def test_lost_first_frame_is_not_the_origin(frames) -> None:
 
 def test_given_loops_are_used_or_rejected(frames, whole) -> None:
     measured = np.linalg.inv(whole.trajectory[0]) @ whole.trajectory[7]
-    given = [GivenLoop(0, 7, measured), GivenLoop(1, 3, np.eye(4))]
+    given = [PriorLoop(0, 7, measured), PriorLoop(1, 3, np.eye(4))]
     lost = [blank(f) if f.index == 3 else f for f in frames]
     result = reconstruct(in_memory(lost), CONFIG, loops=given)
     used, refused = result.diagnostics.loops[1], result.diagnostics.loops[0]
@@ -244,7 +244,7 @@ class Doubting(Optimiser):
 
 
 def test_loops_left_out_by_optimiser_are_rejected(frames, whole) -> None:
-    loops = [GivenLoop(0, k, whole.trajectory[k]) for k in (3, 4, 5)]
+    loops = [PriorLoop(0, k, whole.trajectory[k]) for k in (3, 4, 5)]
     mapper = Mapper(replace(CONFIG, optimiser=Doubting()), loops=loops)
     for frame in frames[:6]:
         mapper.push(frame)
@@ -340,7 +340,7 @@ def test_model_before_loop_closure_is_kept() -> None:
     }
     config = changed(from_method("thesis", "cloud"), changes, where="test")
     closing = se3.inverse(poses[0]) @ poses[-1]
-    closed = reconstruct(recording, config, loops=[GivenLoop(0, len(views) - 1, closing)])
+    closed = reconstruct(recording, config, loops=[PriorLoop(0, len(views) - 1, closing)])
     opened = reconstruct(recording, config)
     before = closed.diagnostics.cloud_before
     assert opened.diagnostics.cloud_before is None

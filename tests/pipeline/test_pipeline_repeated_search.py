@@ -10,7 +10,7 @@ from revisited_path import Drifting, turn  # noqa: F401 - a fixture
 from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import Spacing
@@ -26,7 +26,7 @@ class Spaced(Revisits):
     most: int = 200
 
     def start(self, seed, given, views, search=None):
-        spacing = Spacing(angle=1e-6, distance=1e-6, most=self.most, max_stretch=1)
+        spacing = Spacing(angle=1e-6, distance=1e-6, max_views=self.most, max_stretch=1)
         return super().start(seed, given, views, search, spacing=spacing)
 
 
@@ -40,7 +40,7 @@ def reconstructed(frames, truth, most):
         loops=Spaced(searches=0, similar_pairs=0, most=most),
         refinement=NoRefinement(),
     )
-    ends = GivenLoop(0, last, se3.inverse(truth[0]) @ truth[last])
+    ends = PriorLoop(0, last, se3.inverse(truth[0]) @ truth[last])
     mapper = Mapper(config, loops=[ends], threads=1)
     for k, frame in enumerate(frames):
         mapper.push(replace(frame, timestamp=float(k)))

@@ -21,8 +21,8 @@ POSED = [
 ]
 
 
-def join(i, j, how="links", needed=True):
-    return Join(Link(i, j, FOUND, True, "made"), how, needed)
+def join(i, j, kind="links", defines_pose=True):
+    return Join(Link(i, j, FOUND, True, "made"), kind, defines_pose)
 
 
 def loop(i, j, accepted=True):
@@ -34,7 +34,7 @@ def loop(i, j, accepted=True):
     [
         ([], [], ()),
         ([join(2, 3), join(5, 6)], [], (3, 4, 5, 6, 7, 8)),
-        ([join(2, 3), join(1, 4, needed=False), join(5, 6)], [], (6, 7, 8)),
+        ([join(2, 3), join(1, 4, defines_pose=False), join(5, 6)], [], (6, 7, 8)),
         ([join(6, 5), join(2, 3), join(1, 4)], [], (6, 7, 8)),
         ([join(2, 3), join(5, 6)], [loop(0, 8)], ()),
         ([join(2, 3), join(5, 6)], [loop(0, 8, accepted=False)], (3, 4, 5, 6, 7, 8)),

@@ -85,7 +85,7 @@ def test_single_component_is_a_group(three) -> None:
     (group,) = Joining().join(three[:1], [])
     np.testing.assert_array_equal(group.T_group_component[0], np.eye(4))
     assert (group.frames, group.joins, group.bridged) == (10, (), {})
-    assert group.joined(0) == "links"
+    assert group.connection(0) == "links"
 
 
 def test_components_of_one_path_are_joined_without_given_links(three) -> None:
@@ -93,12 +93,12 @@ def test_components_of_one_path_are_joined_without_given_links(three) -> None:
     assert group.frames == 30
     assert_joined(group, three)
     assert not group.bridged
-    assert [group.joined(c) for c in range(3)] == ["links"] * 3
+    assert [group.connection(c) for c in range(3)] == ["links"] * 3
     # Each join needs one link; the others confirm it.
-    assert sum(join.needed for join in group.joins) == 2
+    assert sum(join.defines_pose for join in group.joins) == 2
     assert len(group.joins) > 2
     for join in group.joins:
-        assert join.how == "links"
+        assert join.kind == "links"
         true = se3.inverse(PATH[join.link.i]) @ PATH[join.link.j]
         off = se3.inverse(true) @ join.link.T_i_j
         assert np.linalg.norm(off[:3, 3]) < 0.02
@@ -305,9 +305,9 @@ def test_gap_in_steady_motion_is_bridged_and_reported() -> None:
     (group,) = Joining(searches=0).join(parts, [])
     assert_joined(group, parts, path)
     assert group.bridged == {1: "motion"}
-    assert (group.joined(0), group.joined(1)) == ("links", "motion")
+    assert (group.connection(0), group.connection(1)) == ("links", "motion")
     (join,) = group.joins
-    assert (join.how, join.needed) == ("motion", True)
+    assert (join.kind, join.defines_pose) == ("motion", True)
     assert (join.link.i, join.link.j) == (9, 13)
     assert not join.link.certain
     assert np.linalg.eigvalsh(join.link.information).min() > 0
@@ -336,7 +336,7 @@ def with_odometry(parts, path, sigma, seed=4):
 def test_gap_in_irregular_motion_is_bridged_by_odometry() -> None:
     path, parts = along_a_wall(shake=0.03)
     (group,) = Joining(searches=0).join(with_odometry(parts, path, 0.002), [])
-    assert group.joined(1) == "odometry"
+    assert group.connection(1) == "odometry"
     (join,) = group.joins
     off = se3.log(se3.inverse(se3.inverse(path[9]) @ path[13]) @ join.link.T_i_j)
     sigma = np.sqrt(np.diag(np.linalg.inv(join.link.information)))

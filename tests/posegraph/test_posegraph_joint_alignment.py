@@ -16,7 +16,7 @@ from tofuse.posegraph.accuracy import ObservedErrors, accuracy_of
 from tofuse.posegraph.build import build_graph
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.joint_alignment import Bodies, refine, spread_evenly
-from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
+from tofuse.posegraph.refinement import Joint, NoRefinement, propagate_poses, without_errors
 from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.registration.prepared_view import prepare_view
 
@@ -128,7 +128,7 @@ def test_frames_in_between_are_interpolated():
     step = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
     after = before[at].copy()
     after[1:] = step @ after[1:]
-    found = followed(before, at, after)
+    found = propagate_poses(before, at, after)
     np.testing.assert_allclose(found[at], after, atol=1e-12)
     np.testing.assert_allclose(found[6], step @ before[6], atol=1e-12)
     moved = found[:5, 0, 3] - before[:5, 0, 3]
@@ -194,7 +194,7 @@ def test_view_that_loses_support_stays_with_neighbours():
 
 def test_view_store_is_bounded():
     view = surfaces(path(1))[0]
-    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10, max_stretch=1e6))
+    store = ViewStore(Spacing(angle=0.01, distance=0.01, max_views=10, max_stretch=1e6))
     for k in range(400):
         store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
         assert len(store.views) <= 10

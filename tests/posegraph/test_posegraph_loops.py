@@ -14,7 +14,7 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
 from tofuse.posegraph.given_loops import read_loops
-from tofuse.posegraph.loops import Confirmation, GivenLoop, LoopDetector, mean_error
+from tofuse.posegraph.loops import Confirmation, LoopDetector, PriorLoop, mean_error
 from tofuse.posegraph.nearby import Nearby, yaw
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
@@ -174,7 +174,7 @@ def test_candidates_are_recorded_and_given_loops_used():
     motion = se3.inverse(poses[0]) @ poses[20]
     confirmation = Confirmation((Scripted(motion),))
     by_hand = pose(0.05)
-    given = [GivenLoop(0, 20, by_hand), GivenLoop(5, 21), GivenLoop(3, 17)]
+    given = [PriorLoop(0, 20, by_hand), PriorLoop(5, 21), PriorLoop(3, 17)]
     loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation)
     loops = loops.start(0, given, ViewStore(Spacing()))
     for k in range(22):

@@ -13,7 +13,7 @@ from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
 from tofuse.posegraph import revisits
 from tofuse.posegraph.information_gain import InformationGain
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import SampledView, ViewStore
 from tofuse.registration.base import Registration
@@ -121,7 +121,7 @@ def test_view_of_another_place_is_rejected_with_reason(turn):
 def test_given_loops_are_used(turn):
     frames, truth, start = turn
     T = se3.inverse(truth[0]) @ truth[12]
-    given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
+    given = [PriorLoop(0, 12, T), PriorLoop(1, 11), PriorLoop(0, 99)]
     found = pushed(Revisits(per_view=0), frames, start, given)
     by_pair = {(c.record.i, c.record.j): c for c in found}
     assert list(by_pair) == [(1, 11), (0, 12), (0, 99)]
@@ -213,4 +213,4 @@ def test_loops_are_searched_again_after_views_moved(turn):
     again = accepted(start)
     assert again >= first
     assert any(i == 0 and j >= 11 for i, j in again)
-    assert not loops.many
+    assert not loops.repeat_worthwhile

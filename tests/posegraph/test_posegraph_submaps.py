@@ -63,7 +63,7 @@ def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
 
 def test_store_spills_to_disk_and_spaces_views_by_motion(swing, tmp_path: Path) -> None:
     views, _ = swing
-    spacing = Spacing(angle=1e-3, distance=1e-3, most=8, max_stretch=4)
+    spacing = Spacing(angle=1e-3, distance=1e-3, max_views=8, max_stretch=4)
     little, much = (
         ViewStore(spacing, scratch=scratch) for scratch in (Scratch(100_000, tmp_path), Scratch())
     )

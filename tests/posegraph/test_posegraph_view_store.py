@@ -38,12 +38,12 @@ def test_views_are_stored_when_the_camera_has_moved() -> None:
 
 
 def test_views_are_spaced_more_sparsely_as_their_number_grows() -> None:
-    found = stored(3, Spacing(angle=0.03, most=30, max_stretch=4))
+    found = stored(3, Spacing(angle=0.03, max_views=30, max_stretch=4))
     assert set(np.diff(found)[-20:]) == {2}
 
 
 def test_views_of_a_path_that_repeats_itself_are_thinned() -> None:
-    spacing = Spacing(angle=0.03, most=30, max_stretch=4, enough=8)
+    spacing = Spacing(angle=0.03, max_views=30, max_stretch=4, views_per_place=8)
     few, many = len(stored(20, spacing)), len(stored(160, spacing))
     assert few > 8 * 72 / 2
     assert many < 3 * few

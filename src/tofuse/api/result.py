@@ -28,7 +28,7 @@ from tofuse.pipeline.reconstruct import reconstruct as reconstruct_recording
 from tofuse.pipeline.reconstruct import view_kind
 from tofuse.pipeline.report_files import write_report_files
 from tofuse.pipeline.run import quick_findings, with_findings
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.recordings.recording import Recording
 from tofuse.results.card import SEPARATOR, card
 from tofuse.results.folder import OutputFolder
@@ -248,7 +248,7 @@ def reconstruct(
     *,
     seed: int = 0,
     threads: int | None = None,
-    loops: Sequence[GivenLoop] = (),
+    loops: Sequence[PriorLoop] = (),
     progress: Progress | bool | None = None,
 ) -> Result:
     """Reconstruct a recording: trajectory, pose graph, fused cloud and surface, diagnostics.

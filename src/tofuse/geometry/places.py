@@ -14,21 +14,22 @@ from tofuse.arrays import Float64
 class PlaceCounts:
     """Thins the images of a camera that stays at a place or returns to it often.
 
-    A place is a cell of positions and viewing directions. All of the first `enough` images of a
-    place are kept, then every second one of twice as many, every fourth one of four times as many,
-    and so on: their number grows with the logarithm of the time that the camera is there.
+    A place is a cell of positions and viewing directions. All of the first `images_per_place`
+    images of a place are kept, then every second one of twice as many, every fourth one of four
+    times as many, and so on: their number grows with the logarithm of the time that the camera is
+    there.
 
     Parameters
     ----------
     angle, distance
         Size of a cell: rad, and fraction of the depth.
-    enough
+    images_per_place
         Number of images of a place of which all are kept.
     """
 
     angle: float
     distance: float
-    enough: int
+    images_per_place: int
     _count: dict[bytes, int] = field(default_factory=dict, init=False, repr=False)
 
     def keeps(self, depth: float, T_component_camera: Float64, component: int = 0) -> bool:
@@ -51,5 +52,5 @@ class PlaceCounts:
         place = np.append(cell, [octave, component]).astype(np.int64).tobytes()
         count = self._count.get(place, 0)
         self._count[place] = count + 1
-        every = 1 << int(math.log2(count / self.enough + 1))
+        every = 1 << int(math.log2(count / self.images_per_place + 1))
         return count % every == 0

@@ -19,7 +19,7 @@ from tofuse.pipeline.progress import Progress, Stopwatch
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joining import Group
-from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.loops import ClosedLoop, PriorLoop
 from tofuse.posegraph.merged_components import Join
 from tofuse.results.types import Reconstruction
 
@@ -32,13 +32,13 @@ class Assembly:
     ----------
     observations
         The store of observations.
-    given_loops
+    prior_loops
         Given loops.
     """
 
     config: Config
     observations: Observations
-    given_loops: tuple[GivenLoop, ...]
+    prior_loops: tuple[PriorLoop, ...]
     progress: Progress
     watch: Stopwatch
     seed: int
@@ -86,7 +86,7 @@ class Assembly:
             log,
             poses,
             joins,
-            self.given_loops,
+            self.prior_loops,
             self.observations.for_back_end(),
             self.progress,
             self.watch,

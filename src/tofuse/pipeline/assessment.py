@@ -27,7 +27,7 @@ from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.external_sensors import SensorPriors, with_sensors
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.refinement import Refinement
 from tofuse.recordings.frames import RangeFrame
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict
@@ -71,7 +71,7 @@ class Assessment:
         Its pose graph.
     observations
         Stored observations.
-    given_loops
+    prior_loops
         Given loops.
     """
 
@@ -79,7 +79,7 @@ class Assessment:
     log: FrameLog
     tracked: TrackedGraph
     observations: BackEndInput
-    given_loops: Sequence[GivenLoop]
+    prior_loops: Sequence[PriorLoop]
 
     def run(
         self,
@@ -119,7 +119,7 @@ class Assessment:
             tolerance_m=self.config.tolerance_m,
             has_covariances=observations.has_covariances,
             refinement=refined.refinement,
-            given_loops=frozenset((g.i, g.j) for g in self.given_loops if g.by_user),
+            given_loops=frozenset((g.i, g.j) for g in self.prior_loops if g.by_user),
             depths=tuple(
                 d
                 for index, d in observations.depths.items()
@@ -184,7 +184,7 @@ class Assessment:
         return accuracy, covariances
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
-        return self.tracked.measured(graph, self.observations.views, refinement.stated)
+        return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
 
     def _calibration_error(self, check: CalibrationCheck | None) -> tuple[float, float]:
         """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
@@ -287,6 +287,6 @@ def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tu
     first = component_of[tracked.posed[0].record.index]
     weak_components: set[int] = set()
     for k, sides in cut_edges(edges).items():
-        if k < len(tracked.joins) and tracked.joins[k].how == "links":
+        if k < len(tracked.joins) and tracked.joins[k].kind == "links":
             weak_components |= sides[1] if first in sides[0] else sides[0]
     return tuple(index for index, c in component_of.items() if c in weak_components)

@@ -20,7 +20,7 @@ from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
-from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.loops import ClosedLoop, PriorLoop
 from tofuse.posegraph.merged_components import Join
 from tofuse.posegraph.neighbour_check import worse_neighbours
 from tofuse.results.types import Component, Diagnostics, Reconstruction
@@ -44,7 +44,7 @@ class BackEnd:
         (4, 4) T_world_camera by frame index; that of the first frame is the identity.
     joins
         Edges between components.
-    given_loops
+    prior_loops
         Given loops.
     observations
         Stored observations.
@@ -58,12 +58,12 @@ class BackEnd:
         log: FrameLog,
         poses: dict[int, Float64],
         joins: Sequence[Join],
-        given_loops: Sequence[GivenLoop],
+        prior_loops: Sequence[PriorLoop],
         observations: BackEndInput,
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
-        self._config, self._log, self._given_loops = config, log, given_loops
+        self._config, self._log, self._prior_loops = config, log, prior_loops
         self._observations, self._progress, self._watch = observations, progress, watch
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
@@ -161,7 +161,7 @@ class BackEnd:
         Along a long trajectory the drift exceeds the search range of loops; the poses in its middle
         are corrected only after its ends are joined.
         """
-        for _ in range(_MAX_SEARCHES if self._observations.loops.many else 0):
+        for _ in range(_MAX_SEARCHES if self._observations.loops.repeat_worthwhile else 0):
             graph = self._tracked.build(loops)
             if not graph.loop.any():
                 break
@@ -209,7 +209,7 @@ class BackEnd:
         self._progress.stage("checking")
         with self._watch.timing("checking"):
             assessment = Assessment(
-                self._config, self._log, self._tracked, self._observations, self._given_loops
+                self._config, self._log, self._tracked, self._observations, self._prior_loops
             )
             assessed = assessment.run(closed, refined, fused.model, components)
         model, entries = assessed.model, self._log.entries
@@ -260,7 +260,7 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
     redundant = []
     for join in joins:
         link = join.link
-        if join.needed or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
+        if join.defines_pose or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
             continue
         r = link.registration
         record = LoopRecord(

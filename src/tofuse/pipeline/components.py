@@ -9,7 +9,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.posegraph.joining import Group
-from tofuse.posegraph.merged_components import How, Join
+from tofuse.posegraph.merged_components import Join, JoinKind
 from tofuse.results.ranges import runs
 from tofuse.results.types import Component, Reconstruction
 
@@ -27,7 +27,7 @@ class _Part:
     members: tuple[int, ...]
     group: Group
     T_main_component: Float64 | None
-    joined: How | None
+    connection: JoinKind | None
 
 
 def numbered_components(
@@ -61,7 +61,7 @@ def numbered_components(
             component_log = log.of(frames)  # in its own model it is the main component
             poses = poses_in_world(component_log, part.group.T_group_component)
             result = reconstruct(component_log, poses, part.group.joins)
-        components.append(Component(ranges, part.T_main_component, part.joined, result))
+        components.append(Component(ranges, part.T_main_component, part.connection, result))
     return numbered, tuple(components)
 
 
@@ -70,7 +70,7 @@ def _parts(groups: Sequence[Group]) -> list[_Part]:
     first = next(iter(main.T_group_component))
     to_first = se3.inverse(main.T_group_component[first])
     parts = [
-        _Part((c,), main, to_first @ T, None if c == first else main.joined(c))
+        _Part((c,), main, to_first @ T, None if c == first else main.connection(c))
         for c, T in main.T_group_component.items()
     ]
     parts += [_Part(tuple(g.T_group_component), g, None, None) for g in groups[1:]]

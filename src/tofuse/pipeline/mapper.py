@@ -22,7 +22,7 @@ from tofuse.pipeline.live_poses import LivePoses
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
@@ -57,7 +57,7 @@ class Mapper:
         *,
         seed: int = 0,
         threads: int | None = None,
-        loops: Sequence[GivenLoop] = (),
+        loops: Sequence[PriorLoop] = (),
         progress: Progress | None = None,
     ) -> None:
         self.config = from_method(config) if isinstance(config, str) else config
@@ -65,7 +65,7 @@ class Mapper:
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         self.watch = Stopwatch()
-        self._given_loops = tuple(loops)
+        self._prior_loops = tuple(loops)
         self._progress = progress or Silent()
         self._intake = Intake()
         self._log = FrameLog()
@@ -76,7 +76,7 @@ class Mapper:
     def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
         self._tracker = self.config.odometry.start(self.seed, self.config.search)
-        self._observations = Observations(self.config, self.seed, self._given_loops)
+        self._observations = Observations(self.config, self.seed, self._prior_loops)
         self._live_poses = LivePoses(self._observations.loops)
         self._component = 0
 
@@ -276,7 +276,7 @@ class Mapper:
         return Assembly(
             self.config,
             self._observations,
-            self._given_loops,
+            self._prior_loops,
             self._progress,
             self.watch,
             self.seed,

@@ -28,7 +28,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import TrackingState, push_frames, with_recording_facts
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
@@ -186,13 +186,13 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
     return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
 
 
-def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[GivenLoop]:
+def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[PriorLoop]:
     """Return the loops that earlier merges closed between sessions, to be registered again.
 
     The loop search selects the pairs with the largest overlap, which need not connect all sessions.
     """
     return [
-        GivenLoop(i + offset, j + offset, by_user=False)
+        PriorLoop(i + offset, j + offset, by_user=False)
         for session, offset in zip(sessions, offsets, strict=True)
         for i, j in session.links
     ]
@@ -233,8 +233,8 @@ def _with_sessions(
         "frames": len(recording),
         "warnings": list(recording.warnings),
     }
-    stated = [{s.component for s in session.posed.values()} for session in sessions]
-    pairs = session_pairs(result, records, stated, views)
+    components_before = [{s.component for s in session.posed.values()} for session in sessions]
+    pairs = session_pairs(result, records, components_before, views)
     result = replace(
         with_recording_facts(result, facts),
         sessions=records,

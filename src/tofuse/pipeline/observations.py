@@ -17,7 +17,7 @@ from tofuse.pipeline.budget import checked_bytes, views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
 from tofuse.pipeline.stage_results import BackEndInput
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import Spacing, Spilled, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
@@ -29,7 +29,7 @@ _CHECKED_IMAGES = 60  # images of the final comparison
 _COLUMNS = 200
 # Number of images of a place that are all fused into the model; of further ones a decreasing
 # fraction, as their noise is then averaged.
-_ENOUGH = 32
+_VIEWS_PER_PLACE = 32
 
 
 class Observations:
@@ -45,17 +45,17 @@ class Observations:
         Some frames for the report.
     """
 
-    def __init__(self, config: Config, seed: int, given_loops: Sequence[GivenLoop]) -> None:
-        loop_frames = [frame for loop in given_loops for frame in (loop.i, loop.j)]
+    def __init__(self, config: Config, seed: int, prior_loops: Sequence[PriorLoop]) -> None:
+        loop_frames = [frame for loop in prior_loops for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
         self.views: ViewStore[PreparedView] = ViewStore(
             Spacing(), always=loop_frames, scratch=scratch
         )
-        self.loops = config.loops.start(seed, given_loops, self.views, config.search)
+        self.loops = config.loops.start(seed, prior_loops, self.views, config.search)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
-        self._places = Spacing(enough=_ENOUGH).places()
+        self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
         self._checks = _EvenSample(_CHECKED_IMAGES, Spill(checked_bytes(config.memory_mb)))
         self._depths: dict[int, float] = {}  # typical ranges, m
         self._ambiguity_m: float | None = None

@@ -20,7 +20,7 @@ from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.self_calibration import self_calibrated
 from tofuse.pipeline.state_checks import check_tracked
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.phones import ARKIT_UP, POSES_BY
@@ -39,7 +39,7 @@ def reconstruct(
     *,
     seed: int = 0,
     threads: int | None = None,
-    loops: Sequence[GivenLoop] = (),
+    loops: Sequence[PriorLoop] = (),
     progress: Progress | None = None,
     stages: Stages | None = None,
 ) -> Reconstruction:
@@ -109,7 +109,7 @@ def _track(
     config: Config,
     seed: int,
     threads: int | None,
-    loops: Sequence[GivenLoop],
+    loops: Sequence[PriorLoop],
     progress: Progress,
     stages: Stages,
 ) -> Mapper:

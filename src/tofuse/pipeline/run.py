@@ -27,7 +27,7 @@ from tofuse.pipeline.reconstruct import reconstruct, view_kind
 from tofuse.pipeline.report_files import write_report_files
 from tofuse.pipeline.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.posegraph.given_loops import read_loops
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import OutputFolder, check_output, is_result
@@ -119,7 +119,7 @@ class _Job:
     recording: Recording
     config: Config
     seed: int
-    loops: tuple[GivenLoop, ...]
+    loops: tuple[PriorLoop, ...]
     findings: tuple[Finding, ...]
 
 

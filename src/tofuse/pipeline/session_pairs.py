@@ -79,7 +79,7 @@ class Model:
 def session_pairs(
     result: Reconstruction,
     records: Sequence[SessionRecord],
-    stated: Sequence[Collection[int]],
+    components_before: Sequence[Collection[int]],
     views: Sequence[View],
 ) -> tuple[SessionPair, ...]:
     """Return for each pair of sessions whether they are in one model, and the evidence of overlap.
@@ -88,7 +88,7 @@ def session_pairs(
     ----------
     result, records
         The merged result, and its sessions.
-    stated
+    components_before
         For each session, the components of its frames before the merge.
     views
         Prepared views of frames with a pose.
@@ -101,7 +101,7 @@ def session_pairs(
         for model in models:
             first_views, second_views = model.views(first, views), model.views(second, views)
             if first_views and second_views:
-                before = bool(set(stated[a]) & set(stated[b]))
+                before = bool(set(components_before[a]) & set(components_before[b]))
                 pairs.append(
                     _pair(a, b, first, second, model, first_views, second_views, before=before)
                 )

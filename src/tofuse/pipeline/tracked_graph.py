@@ -105,7 +105,7 @@ class TrackedGraph:
         join_edges = [
             Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
             for j in self.joins
-            if j.needed and not {j.link.i, j.link.j} <= refined_frames
+            if j.defines_pose and not {j.link.i, j.link.j} <= refined_frames
         ]
         loop_edges = [
             Measured(c.record.i, c.record.j, c.T_i_j, c.information)
@@ -118,7 +118,7 @@ class TrackedGraph:
         self,
         graph: PoseGraph,
         views: ViewStore[PreparedView],
-        stated: Sequence[tuple[int, int]] = (),
+        non_overlap_edges: Sequence[tuple[int, int]] = (),
     ) -> PoseGraph:
         """Return a graph without edges and directions that rest on extrapolated motion alone.
 
@@ -128,7 +128,7 @@ class TrackedGraph:
             A graph from `build`.
         views
             Prepared views of frames.
-        stated
+        non_overlap_edges
             See `degenerate_directions`.
         """
         tracked_pairs = {
@@ -138,11 +138,11 @@ class TrackedGraph:
         }
         view_by_index = {v.index: v for v in views.of(self.poses)}
         directions = degenerate_directions(
-            graph, self.unobservable, tracked_pairs, view_by_index, frozenset(stated)
+            graph, self.unobservable, tracked_pairs, view_by_index, frozenset(non_overlap_edges)
         )
         return without_degenerate(graph, directions, self.gaps)
 
     @property
     def gaps(self) -> set[tuple[int, int]]:
         """The frames before and after the gaps that no registration closes."""
-        return {(j.link.i, j.link.j) for j in self.joins if j.how != "links"}
+        return {(j.link.i, j.link.j) for j in self.joins if j.kind != "links"}

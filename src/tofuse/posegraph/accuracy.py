@@ -113,7 +113,7 @@ class ObservedErrors:
     split_m: float = 0.0
     split_rad: float = 0.0
 
-    def beyond(self, by_covariance: _CovarianceErrors | None) -> Float64:
+    def missing_in(self, by_covariance: _CovarianceErrors | None) -> Float64:
         """Return the combined errors (2,) in m and rad that are missing in the covariance.
 
         Parameters
@@ -178,7 +178,7 @@ def degenerate_directions(
     unobservable: Mapping[int, Float64],
     tracked: Collection[tuple[int, int]],
     views: Mapping[int, PosedView[PreparedView]],
-    stated: Collection[tuple[int, int]] = (),
+    non_overlap_edges: Collection[tuple[int, int]] = (),
 ) -> list[Float64]:
     """Return the degenerate directions of every edge: (k, 6), right perturbations of j.
 
@@ -196,7 +196,7 @@ def degenerate_directions(
         Pairs (i, j) that are the registrations of j in tracking.
     views
         Prepared views by frame index.
-    stated
+    non_overlap_edges
         Pairs (i, j) that do not come from the overlap of the two views: never degenerate.
     """
     degenerate = np.array(sorted(unobservable), np.intp)
@@ -205,7 +205,7 @@ def degenerate_directions(
     spanning: list[tuple[int, int]] = []  # those over degenerate frames, and their length
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
-        if (i, j) in stated:
+        if (i, j) in non_overlap_edges:
             result.append(_NO_DIRECTIONS)
             continue
         # A perturbation of i is the opposite one of j, by the adjoint.
@@ -306,7 +306,7 @@ def accuracy_of(
             unbounded_frames[0] if unbounded_frames else int(graph.ids[-1]), np.inf, np.inf
         )
         return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
-    extra = observed.beyond(by_covariance)
+    extra = observed.missing_in(by_covariance)
     rms_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.bounds, extra)
     pose_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.single, extra)
     pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
@@ -330,7 +330,9 @@ def covariances_of(covariances: GraphCovariances, observed: ObservedErrors) -> F
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
     metres.
     """
-    extra_variance = np.repeat(observed.beyond(_CovarianceErrors.of_graph(covariances)) ** 2 / 3, 3)
+    extra_variance = np.repeat(
+        observed.missing_in(_CovarianceErrors.of_graph(covariances)) ** 2 / 3, 3
+    )
     C = covariances.of_poses.copy()
     C[1:] += np.diag(extra_variance)
     return UNOBSERVED_ERROR_FACTOR**2 * C

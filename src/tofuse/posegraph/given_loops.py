@@ -10,12 +10,12 @@ import numpy as np
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.geometry import quaternion, se3
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 
 _UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 
 
-def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[GivenLoop]:
+def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[PriorLoop]:
     """Read lines of ``i j`` or ``i j tx ty tz qx qy qz qw`` (frame indices; the measured T_i_j, m).
 
     ``#`` starts a comment. `frames` are the existing indices, if they are to be checked.
@@ -26,7 +26,7 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
         If the file can't be read, and, with the line's number, for any other content, a frame that
         doesn't exist, a loop from a frame to itself, a duplicate pair.
     """
-    loops: dict[tuple[int, int], GivenLoop] = {}
+    loops: dict[tuple[int, int], PriorLoop] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
@@ -44,7 +44,7 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
     return list(loops.values())
 
 
-def _loop(words: list[str], where: str) -> GivenLoop:
+def _loop(words: list[str], where: str) -> PriorLoop:
     form = "write 'i j' or 'i j tx ty tz qx qy qz qw'"
     if len(words) not in (2, 9):
         raise InputError(f"has {len(words)} values", where=where, remedy=form)
@@ -56,7 +56,7 @@ def _loop(words: list[str], where: str) -> GivenLoop:
     if i < 0 or j < 0 or i == j:
         raise InputError(f"joins frames {i} and {j}", where=where, remedy="use two frames")
     if len(values) == 0:
-        return GivenLoop(min(i, j), max(i, j))
+        return PriorLoop(min(i, j), max(i, j))
     if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > _UNIT:
         raise InputError(
             "is not a rigid motion",
@@ -65,4 +65,4 @@ def _loop(words: list[str], where: str) -> GivenLoop:
         )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]
-    return GivenLoop(i, j, T) if i < j else GivenLoop(j, i, se3.inverse(T))
+    return PriorLoop(i, j, T) if i < j else PriorLoop(j, i, se3.inverse(T))

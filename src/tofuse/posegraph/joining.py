@@ -25,7 +25,7 @@ from tofuse.geometry import se3
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.gaps import TrackedComponent, View, extrapolated, odometry_over
 from tofuse.posegraph.join_checks import VERIFY, JoinChecks, link_of
-from tofuse.posegraph.merged_components import How, Join, MergedComponent, MergedComponents
+from tofuse.posegraph.merged_components import Join, JoinKind, MergedComponent, MergedComponents
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.registration.base import Link
 from tofuse.registration.pose_probability import logistic
@@ -72,9 +72,9 @@ class Group:
     T_group_component: Mapping[int, Float64]
     joins: tuple[Join, ...]
     frames: int
-    bridged: Mapping[int, How] = field(default_factory=dict)
+    bridged: Mapping[int, JoinKind] = field(default_factory=dict)
 
-    def joined(self, component: int) -> How:
+    def connection(self, component: int) -> JoinKind:
         """Return how a component is connected to the first one."""
         return self.bridged.get(component, "links")
 
@@ -264,7 +264,7 @@ class _Joiner:
             )
             if a is b or before.recording != after.recording:
                 continue
-            bridges: list[tuple[Link | None, How]] = [
+            bridges: list[tuple[Link | None, JoinKind]] = [
                 (odometry_over(before, after), "odometry"),
                 (extrapolated(before, after), "motion"),
             ]

@@ -22,13 +22,13 @@ from tofuse.registration.search import SearchOptions
 # Separates the random streams of loops from those of other stages that register the same pair.
 SEED_STAGE = 2
 
-# Assumed standard deviation of a given measurement: 1 cm and 0.01 rad (about half a degree).
-GIVEN_INFORMATION = np.diag([1e4] * 6)
+# Assumed standard deviation of a prior measurement: 1 cm and 0.01 rad (about half a degree).
+PRIOR_INFORMATION = np.diag([1e4] * 6)
 
 
 @dataclass(frozen=True, eq=False)
-class GivenLoop:
-    """A loop given by the user, or closed before: frames i, j (indices, i < j) show one place.
+class PriorLoop:
+    """A loop given by the user or closed earlier: frames i, j (indices, i < j) show one place.
 
     `T_i_j` is the (4, 4) relative pose, or None if it is to be registered. `by_user` is False if an
     earlier result closed it.
@@ -53,19 +53,19 @@ class ClosedLoop:
     information: Float64 | None = None
 
 
-def given_loop(
-    loop: GivenLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
+def close_prior_loop(
+    loop: PriorLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
 ) -> ClosedLoop:
-    """Accept or reject a given loop.
+    """Accept or reject a prior loop.
 
     Parameters
     ----------
     loop
-        The given loop.
+        The prior loop.
     posed
         Indices of the frames that have a pose.
     confirm
-        Registers frames i and j, if their relative pose was not given.
+        Registers frames i and j, if their relative pose was not known.
     """
     for frame in (loop.i, loop.j):
         if frame not in posed:
@@ -73,7 +73,7 @@ def given_loop(
     if loop.T_i_j is None:
         return confirm(loop.i, loop.j)
     record = LoopRecord(loop.i, loop.j, True, "given with its motion")
-    return ClosedLoop(record, loop.T_i_j, GIVEN_INFORMATION)
+    return ClosedLoop(record, loop.T_i_j, PRIOR_INFORMATION)
 
 
 def in_order(closed: Mapping[tuple[int, int], ClosedLoop]) -> list[ClosedLoop]:
@@ -97,7 +97,7 @@ class Loops(Protocol):
         ...
 
     @property
-    def many(self) -> bool:
+    def repeat_worthwhile(self) -> bool:
         """Whether there are enough views for a second detection to be worthwhile."""
         return False
 
@@ -118,7 +118,7 @@ class Loops(Protocol):
     def finish(
         self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
     ) -> list[ClosedLoop]:
-        """Return every candidate and given loop with its decision, in the order of j, then i.
+        """Return every candidate and prior loop with its decision, in the order of j, then i.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class LoopDetector(Protocol):
     def start(
         self,
         seed: int,
-        given: Sequence[GivenLoop],
+        prior: Sequence[PriorLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions | None = None,
     ) -> Loops:
@@ -150,8 +150,8 @@ class LoopDetector(Protocol):
         ----------
         seed
             Of the run's random numbers.
-        given
-            Given loops.
+        prior
+            Loops given by the user or closed earlier.
         views
             Prepared views of frames with a pose; each is stored before its frame is pushed.
         search

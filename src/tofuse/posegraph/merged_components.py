@@ -18,7 +18,7 @@ from tofuse.posegraph.gaps import TrackedComponent, View
 from tofuse.registration.base import Link
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD
 
-How = Literal["links", "motion", "odometry"]
+JoinKind = Literal["links", "motion", "odometry"]
 
 # Largest drift within components, as a fraction of the path.
 DRIFT = 0.05
@@ -32,17 +32,17 @@ class Join:
     ----------
     link
         The measurement T_i_j between frames i and j.
-    how
+    kind
         "links"; "odometry", or "motion" where the motion over a gap was extrapolated.
-    needed
+    defines_pose
         Whether it defines the pose of the component; otherwise it confirms another one.
     probability
         That the pose given by all links between the two sides is right; None if not computed.
     """
 
     link: Link
-    how: How
-    needed: bool
+    kind: JoinKind
+    defines_pose: bool
     probability: float | None = None
 
 
@@ -228,15 +228,15 @@ class MergedComponents:
         for frame in (link.i, link.j):
             self._nodes[self.component_of[frame]].add(frame)
 
-    def bridged_from(self, merged: MergedComponent, first: int) -> dict[int, How]:
+    def bridged_from(self, merged: MergedComponent, first: int) -> dict[int, JoinKind]:
         """Return the components that only bridges connect to the first one, and their kind."""
 
-        def reachable(*kinds: How) -> set[int]:
+        def reachable(*kinds: JoinKind) -> set[int]:
             nodes, changed = {first}, True
             ends_of_joins = [
                 {self.component_of[j.link.i], self.component_of[j.link.j]}
                 for j in merged.joins
-                if j.how in kinds
+                if j.kind in kinds
             ]
             while changed:
                 neighbours = {c for ends in ends_of_joins if ends & nodes for c in ends}
@@ -245,7 +245,7 @@ class MergedComponents:
             return nodes
 
         by_links, by_odometry = reachable("links"), reachable("links", "odometry")
-        bridged: dict[int, How] = dict.fromkeys(merged.T.keys() - by_links, "motion")
+        bridged: dict[int, JoinKind] = dict.fromkeys(merged.T.keys() - by_links, "motion")
         bridged.update(dict.fromkeys(by_odometry - by_links, "odometry"))
         return bridged
 

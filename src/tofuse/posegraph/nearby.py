@@ -15,10 +15,10 @@ from tofuse.parts import part
 from tofuse.posegraph.loops import (
     ClosedLoop,
     Confirmation,
-    GivenLoop,
     LoopDetector,
     Loops,
-    given_loop,
+    PriorLoop,
+    close_prior_loop,
     in_order,
 )
 from tofuse.posegraph.view_store import ViewStore
@@ -42,7 +42,7 @@ class Nearby(Bounded, LoopDetector):
         Smallest number of frames (with a pose) between the two.
     per_frame
         Largest number of candidates for each frame, the nearest in distance and yaw; 0 for none, so
-        that only given loops are used (as in chapter 4 of the thesis).
+        that only prior loops are used (as in chapter 4 of the thesis).
     confirmation
         Accepts or rejects candidates.
     """
@@ -56,12 +56,12 @@ class Nearby(Bounded, LoopDetector):
     def start(
         self,
         seed: int,
-        given: Sequence[GivenLoop],
+        prior: Sequence[PriorLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions | None = None,
     ) -> Loops:
         """See `LoopDetector.start`. Given loops replace detected ones."""
-        return _NearbyLoops(self, seed, given)
+        return _NearbyLoops(self, seed, prior)
 
     def candidates(self, poses: Float64) -> Intp:
         """Return the positions of earlier cameras that may form a loop with the newest, best first.
@@ -81,9 +81,9 @@ class Nearby(Bounded, LoopDetector):
 
 
 class _NearbyLoops(Loops):
-    def __init__(self, options: Nearby, seed: int, given: Sequence[GivenLoop]) -> None:
+    def __init__(self, options: Nearby, seed: int, prior: Sequence[PriorLoop]) -> None:
         self._options = options
-        self._given_loops = given
+        self._prior_loops = prior
         self._seed = seed
         self._views: dict[int, Frame] = {}
         self._poses: dict[int, Float64] = {}
@@ -107,8 +107,8 @@ class _NearbyLoops(Loops):
         self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
     ) -> list[ClosedLoop]:
         """See `Loops.finish`."""
-        for loop in self._given_loops:
-            self._closed[loop.i, loop.j] = given_loop(loop, self._poses, self._confirm)
+        for loop in self._prior_loops:
+            self._closed[loop.i, loop.j] = close_prior_loop(loop, self._poses, self._confirm)
         return in_order(self._closed)
 
     def _confirm(self, i: int, j: int) -> ClosedLoop:

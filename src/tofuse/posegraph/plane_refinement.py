@@ -20,7 +20,7 @@ from tofuse.posegraph.refinement import (
     Refinement,
     RefinementMethod,
     Refiner,
-    moved_to,
+    accepted_with,
     with_unsupported_views_fixed,
 )
 from tofuse.posegraph.view_store import Spacing, ViewStore
@@ -73,7 +73,7 @@ class _Planes(Refiner):
     def __init__(self, options: Planes) -> None:
         self._options = options
         self._store: ViewStore[SampledPoints] = ViewStore(
-            Spacing(most=options.max_views, max_stretch=1e6)
+            Spacing(max_views=options.max_views, max_stretch=1e6)
         )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
@@ -98,7 +98,7 @@ class _Planes(Refiner):
         lost = aligned.after < aligned.before - MAX_LOSS
         after = with_unsupported_views_fixed(before, aligned.poses, lost)
         edges = tuple(_edges(aligned, [view.index for view in views], lost))
-        return replace(moved_to(unchanged, positions, after), edges=edges)
+        return replace(accepted_with(unchanged, positions, after), edges=edges)
 
 
 def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:

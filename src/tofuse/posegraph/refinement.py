@@ -77,7 +77,7 @@ class Refinement:
         Measurement of each pair alone, by frame indices; none unless kept.
     calibration_check
         Evidence for errors of the camera, if it was computed.
-    stated
+    non_overlap_edges
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
@@ -93,7 +93,7 @@ class Refinement:
     errors: dict[str, float] = field(default_factory=dict)
     edges: tuple[Measured, ...] = ()
     calibration_check: CalibrationCheck | None = None
-    stated: tuple[tuple[int, int], ...] = ()
+    non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
 
@@ -169,12 +169,12 @@ class AlreadyRefined(RefinementMethod):
 
     Attributes
     ----------
-    measured, stated
+    measured, non_overlap_edges
         By frame indices: measurements of pairs of views, and other edges.
     """
 
     measured: tuple[Measured, ...]
-    stated: tuple[Measured, ...]
+    non_overlap_edges: tuple[Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
@@ -190,12 +190,12 @@ class _AlreadyRefined(_Idle):
     ) -> Refinement:
         """See `Refiner.finish`."""
         posed = set(ids)
-        edges = (*self._previous.measured, *self._previous.stated)
+        edges = (*self._previous.measured, *self._previous.non_overlap_edges)
         return Refinement(
             poses,
             kept=True,
             edges=tuple(e for e in edges if {e.i, e.j} <= posed),
-            stated=tuple((e.i, e.j) for e in self._previous.stated),
+            non_overlap_edges=tuple((e.i, e.j) for e in self._previous.non_overlap_edges),
         )
 
 
@@ -271,7 +271,7 @@ class _Joint(Refiner):
             after = before
         split_m, split_rad = evidence.split()
         return replace(
-            moved_to(unchanged, positions, after),
+            accepted_with(unchanged, positions, after),
             calibration_check=evidence.calibration(),
             split_m=split_m,
             split_rad=split_rad,
@@ -455,7 +455,7 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     return corrected.astype(np.float32)
 
 
-def moved_to(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
+def accepted_with(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
     """Return the accepted refinement in which the poses at `positions` become `after`.
 
     Parameters
@@ -470,14 +470,14 @@ def moved_to(unchanged: Refinement, positions: Intp, after: Float64) -> Refineme
     motion = se3.log(se3.inverse(unchanged.poses[positions]) @ after)
     return replace(
         unchanged,
-        poses=followed(unchanged.poses, positions, after),
+        poses=propagate_poses(unchanged.poses, positions, after),
         kept=True,
         moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
         moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
     )
 
 
-def followed(poses: Float64, positions: Intp, after: Float64) -> Float64:
+def propagate_poses(poses: Float64, positions: Intp, after: Float64) -> Float64:
     """Propagate refined poses to all frames.
 
     Each frame keeps its motion relative to the views before and after it, interpolated between the

@@ -20,10 +20,10 @@ from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.information_gain import InformationGain
 from tofuse.posegraph.loops import (
     ClosedLoop,
-    GivenLoop,
     LoopDetector,
     Loops,
-    given_loop,
+    PriorLoop,
+    close_prior_loop,
     in_order,
 )
 from tofuse.posegraph.view_store import (
@@ -59,7 +59,7 @@ _WEAK_PRIOR = ProjectiveOptions(
 _REJECTED = "fits worse than is typical of this camera, or alignments from both ends disagree"
 _TOO_FAR = "looks similar, but the trajectory can't have drifted that far"
 # Selection of the views that are tried: neighbours overlap by most of an image.
-_SPACING = Spacing(angle=0.15, distance=0.08, most=200)
+_SPACING = Spacing(angle=0.15, distance=0.08, max_views=200)
 # A candidate is a revisit if some view in between overlaps either view by less than this.
 _MAX_OVERLAP_BETWEEN = 0.1
 # Maximum difference of the poses of two consistent loops: the drift between them, m and rad.
@@ -125,7 +125,7 @@ class Revisits(Bounded, LoopDetector):
     def start(
         self,
         seed: int,
-        given: Sequence[GivenLoop],
+        prior: Sequence[PriorLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions | None = None,
         *,
@@ -137,7 +137,7 @@ class Revisits(Bounded, LoopDetector):
         `spacing` selects the views that are tried, and `appearance` pairs of similar views.
         """
         appearance = appearance or Appearance(self.similar_pairs, drift=self.max_drift)
-        return _RevisitLoops(self, given, views, search or SearchOptions(), spacing, appearance)
+        return _RevisitLoops(self, prior, views, search or SearchOptions(), spacing, appearance)
 
     def candidates(
         self,
@@ -188,7 +188,7 @@ class _RevisitLoops(Loops):
     def __init__(
         self,
         options: Revisits,
-        given: Sequence[GivenLoop],
+        prior: Sequence[PriorLoop],
         views: ViewStore[PreparedView],
         search: SearchOptions,
         spacing: Spacing,
@@ -201,7 +201,7 @@ class _RevisitLoops(Loops):
         self._latest: int | None = None  # index of the latest frame
         # Of views only, as long recordings have many more frames.
         self._poses: dict[int, Float64] = {}
-        self._given_loops = given
+        self._prior_loops = prior
         self._entries: dict[int, _Entry] = {}
         self._decisions: dict[tuple[int, int], ClosedLoop] = {}
         self._usual = FitStatistics()
@@ -221,9 +221,9 @@ class _RevisitLoops(Loops):
             self._chosen.push_posed(newest)
 
     @property
-    def many(self) -> bool:
-        """See `Loops.many`."""
-        return len(self._chosen.views) > self._spacing.most
+    def repeat_worthwhile(self) -> bool:
+        """See `Loops.repeat_worthwhile`."""
+        return len(self._chosen.views) > self._spacing.max_views
 
     def candidates_change(self, poses: Mapping[int, Float64]) -> bool:
         """See `Loops.candidates_change`."""
@@ -277,8 +277,8 @@ class _RevisitLoops(Loops):
         closed |= {(loop.record.i, loop.record.j): loop for loop in confirmed}
         self._search_rejected(posed, entries, overlap, closed)
         self._closed = {p: c for p, c in closed.items() if c.record.accepted}
-        for loop in self._given_loops:
-            closed[loop.i, loop.j] = given_loop(
+        for loop in self._prior_loops:
+            closed[loop.i, loop.j] = close_prior_loop(
                 loop, stored, lambda i, j: self._confirm(stored[i], stored[j])
             )
         return in_order(closed)

@@ -174,26 +174,26 @@ class Spacing:
     angle, distance
         A view is stored when the camera has moved this far since the last one: rad, and fraction of
         the median depth.
-    most
+    max_views
         When there are more, every other one is dropped, and the required motion is doubled.
     max_stretch
         Largest factor on the required motion, so that the views of a place suffice however long the
         path is.
-    enough
+    views_per_place
         At the largest factor, the views of a place that is visited repeatedly are thinned after
         this many, see `PlaceCounts`.
     """
 
     angle: float = 0.03
     distance: float = 0.015
-    most: int = 300
+    max_views: int = 300
     max_stretch: float = 4.0
-    enough: int = 16
+    views_per_place: int = 16
 
     def places(self) -> PlaceCounts:
         """Return counts of the places that are as wide as the largest required motion."""
         return PlaceCounts(
-            self.max_stretch * self.angle, self.max_stretch * self.distance, self.enough
+            self.max_stretch * self.angle, self.max_stretch * self.distance, self.views_per_place
         )
 
 
@@ -363,7 +363,7 @@ class ViewStore(Generic[V]):
     def _add(self, posed: PosedView[V]) -> None:
         self.views.append(posed)
         s = self._spacing
-        if len(self.views) > s.most and 2 * self._stretch <= s.max_stretch:
+        if len(self.views) > s.max_views and 2 * self._stretch <= s.max_stretch:
             self._drop_every_other()
             self._last = self.views[-1].T_component_camera, self.views[-1].component
             self._stretch *= 2
@@ -378,7 +378,7 @@ class ViewStore(Generic[V]):
                 kept.append(view)
             count += 1
         # If nearly every view is a separate component, some of these have to be dropped.
-        self.views = kept if len(kept) < self._spacing.most else self.views[::2]
+        self.views = kept if len(kept) < self._spacing.max_views else self.views[::2]
 
 
 def overlaps(

@@ -19,7 +19,7 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
-from tofuse.posegraph.refinement import followed
+from tofuse.posegraph.refinement import propagate_poses
 from tofuse.posegraph.split_half import refined_by_halves
 from tofuse.posegraph.view_store import SampledView
 from tofuse.results.types import Reconstruction
@@ -241,12 +241,12 @@ class _JointViews:
             return dict(self.tracks)
         self.improved = True
         self._halves = [
-            tuple(self._followed(first @ poses) for poses in pair)
+            tuple(self._propagated(first @ poses) for poses in pair)
             for pair in refined_by_halves(views, refinement, _OPTIONS, Priors.none())
         ]
-        return self._followed(self._poses)
+        return self._propagated(self._poses)
 
-    def _followed(self, poses: Float64) -> dict[int, Track]:
+    def _propagated(self, poses: Float64) -> dict[int, Track]:
         """Return the tracks that follow the refined poses of all views."""
         start, tracks = 0, {}
         for k in sorted(self._views):
@@ -254,7 +254,8 @@ class _JointViews:
             new_poses = poses[start : start + len(camera_views.views)]
             start += len(camera_views.views)
             tracks[k] = replace(
-                self.tracks[k], poses=followed(self.tracks[k].poses, camera_views.rows, new_poses)
+                self.tracks[k],
+                poses=propagate_poses(self.tracks[k].poses, camera_views.rows, new_poses),
             )
         return tracks
 

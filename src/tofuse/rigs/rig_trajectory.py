@@ -19,7 +19,7 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.joint_alignment import Bodies, refine
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.refinement import followed, pairwise_measurements
+from tofuse.posegraph.refinement import pairwise_measurements, propagate_poses
 from tofuse.posegraph.submaps import support_fell
 from tofuse.posegraph.view_store import SampledView, Spacing
 from tofuse.recordings.frames import RangeFrame
@@ -255,7 +255,7 @@ def refined(
     after = bodies.body_poses(initial[0] @ refinement.poses)
     posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     out = poses.copy()
-    out[posed] = followed(poses[posed], np.searchsorted(posed, used), after)
+    out[posed] = propagate_poses(poses[posed], np.searchsorted(posed, used), after)
     disagreement = disagreements_of(views, view_camera, refinement.poses, refinement.pairs)
     measured = pairwise_measurements([int(recording.indices[k]) for k in frames], refinement)
     out = np.asarray(se3.inverse(out[posed[0]]) @ out, np.float64)
@@ -271,7 +271,7 @@ def _spaced_instants(
     depth = 1.0
     if frame is not None:
         depth = float(np.median(frame.z[frame.valid]))
-    stretch, max_instants = 1.0, max(2, _SPACING.most // len(cameras))
+    stretch, max_instants = 1.0, max(2, _SPACING.max_views // len(cameras))
     while True:
         selected = [posed[0]]
         for k in posed[1:]:

@@ -21,7 +21,7 @@ from tofuse.lab.simulation.scenes import box
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 
@@ -293,7 +293,7 @@ def configuration(method: str, recorded: Recorded) -> Config:
 def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int, draw: int) -> Run:
     recording = recorded.every(stride)
     first, last = int(recording.indices[0]), int(recording.indices[-1])
-    loops = [GivenLoop(first, last)] if last > first else []
+    loops = [PriorLoop(first, last)] if last > first else []
     start = perf_counter()
     result = reconstruct(recording, config, seed=seed + draw, loops=loops)
     seconds = perf_counter() - start

@@ -20,7 +20,7 @@ from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.plane_refinement import SampledPoints
-from tofuse.posegraph.refinement import Refinement, RefinementMethod, Refiner, moved_to
+from tofuse.posegraph.refinement import Refinement, RefinementMethod, Refiner, accepted_with
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView
@@ -121,7 +121,7 @@ class _Relaxation(Refiner):
     def __init__(self, method: Relaxing) -> None:
         self._method = method
         self._store: ViewStore[SampledPoints] = ViewStore(
-            Spacing(most=method.views, max_stretch=1e6)
+            Spacing(max_views=method.views, max_stretch=1e6)
         )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
@@ -148,7 +148,7 @@ class _Relaxation(Refiner):
         )
         unchanged = Refinement(poses, False, len(clouds), len(again), support=support)
         better = bool(again) and support[1] >= support[0]
-        return moved_to(unchanged, at, after) if better else unchanged
+        return accepted_with(unchanged, at, after) if better else unchanged
 
 
 def relaxed(method: Relaxing, clouds: Sequence[Cloud], poses: Float64) -> Float64:
