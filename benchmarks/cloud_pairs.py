@@ -417,9 +417,9 @@ def samples(names: list[str], data: Path, max_pairs: int) -> tuple[list[Row], li
             )
             right, family = pair.is_right(found.T_target_source), families.index(KINDS[name].family)
             if guess is None:
-                searched.append((evidence.searched, right, family, evidence.probability))
+                searched.append((evidence.search_regressors, right, family, evidence.probability))
             elif not degenerate:
-                followed.append((evidence.followed, right, family, evidence.probability))
+                followed.append((evidence.local_regressors, right, family, evidence.probability))
     return searched, followed
 
 

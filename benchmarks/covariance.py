@@ -109,7 +109,7 @@ def outcome(
     perturbation = np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, np.radians(0.5), 3)])
     targets = [Target(views[a], np.eye(4))]
     aligned = align(views[b], targets, truth @ se3.exp(perturbation), options)
-    if not FitStatistics().assess(aligned).usual:
+    if not FitStatistics().assess(aligned).is_usual:
         return None
     plain: Float64 = np.linalg.inv(aligned.information + np.diag(1e-6 / UNITS**2))
     return Outcome(

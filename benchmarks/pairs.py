@@ -435,7 +435,7 @@ def _add(
     try:
         found = register_pair(source, target, always_search=True)
         if found is not None:
-            searched.append((_evidence(found).searched, is_right(found), scene))
+            searched.append((_evidence(found).search_regressors, is_right(found), scene))
         for metres, degrees in GUESSES:
             way = rng.standard_normal((2, 3))
             way *= np.array([[metres], [np.radians(degrees)]]) / np.linalg.norm(
@@ -444,7 +444,7 @@ def _add(
             guess = (np.eye(4) if true is None else true) @ se3.exp(way.ravel())
             near = follow(source, target, guess)
             if near is not None and not len(near.unobservable):
-                followed.append((_evidence(near).followed, is_right(near), scene))
+                followed.append((_evidence(near).local_regressors, is_right(near), scene))
     except RegistrationError:
         pass
 
@@ -491,8 +491,8 @@ def print_cameras(max_pairs: int) -> None:
     """Print results by camera of the models in use, and of those fitted without it."""
     searched, followed, cameras = samples_of_cameras(max_pairs)
     for title, poses, coefficients in (
-        ("Searched", searched, IMAGES.searched),
-        ("Followed from a guess", followed, IMAGES.followed),
+        ("Searched", searched, IMAGES.search),
+        ("Followed from a guess", followed, IMAGES.local),
     ):
         print(
             f"\n| {title} | poses | right | area under the ROC curve | right and accepted"

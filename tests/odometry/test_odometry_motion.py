@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Moment, MotionModel, is_small, jumps
+from tofuse.odometry.motion import Moment, MotionModel, find_jumps, is_small
 
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
@@ -159,15 +159,15 @@ def test_irregular_motion_stays_within_gate() -> None:
 
 def test_jumps_of_path_are_found() -> None:
     poses, moments = walk(20), [counted(k) for k in range(20)]
-    assert jumps(poses, moments) == []
+    assert find_jumps(poses, moments) == []
     shift = elsewhere(np.eye(4), 0.4)
     broken = [*poses[:8], None, *(shift @ T for T in poses[9:])]
-    found = jumps(broken, moments)
+    found = find_jumps(broken, moments)
     assert [k for k, _ in found] == [9]
     assert "0.40 m" in found[0][1]
-    assert jumps(broken, moments, {9}) == []
+    assert find_jumps(broken, moments, {9}) == []
     spike = [*poses[:8], shift @ poses[8], *poses[9:]]
-    assert jumps(spike, moments)[0][0] == 8
+    assert find_jumps(spike, moments)[0][0] == 8
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_jump_detection_uses_timestamps() -> None:
     broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
     for rate, found in ((30.0, [8]), (2.0, [])):
         moments = [Moment(k, k / rate) for k in range(20)]
-        assert [k for k, _ in jumps(broken, moments)] == found
+        assert [k for k, _ in find_jumps(broken, moments)] == found
 
 
 def test_limits_of_small_motion() -> None:

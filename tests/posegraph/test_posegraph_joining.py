@@ -19,7 +19,7 @@ from tofuse.posegraph.merged_components import MergedComponents
 from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.verification import IN_SIGHT
+from tofuse.registration.verification import MAX_OVERLAP_DISTANCE
 from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
@@ -276,8 +276,8 @@ def test_short_gap_does_not_support_distant_pose(three) -> None:
     checks = JoinChecks(merged)
     a, b = merged.all
     right = se3.inverse(PATH[0]) @ PATH[12]
-    assert checks.is_near(a, b, right, IN_SIGHT)
-    assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), IN_SIGHT)
+    assert checks.is_near(a, b, right, MAX_OVERLAP_DISTANCE)
+    assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), MAX_OVERLAP_DISTANCE)
 
 
 def test_motion_between_recordings_is_unconstrained(monkeypatch) -> None:
@@ -406,7 +406,7 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert one == pytest.approx(0.95)
     # The same views again add little: here the rotations are 0.24 rad.
     same = min_probability([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
-    odds = 19 ** (1 + 0.24 / IN_SIGHT) / 2
+    odds = 19 ** (1 + 0.24 / MAX_OVERLAP_DISTANCE) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
     other = min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
     assert other > same

@@ -14,7 +14,7 @@ from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import ClosedLoop
-from tofuse.posegraph.neighbour_check import worse_neighbours
+from tofuse.posegraph.neighbour_check import degraded_neighbours
 from tofuse.registration.base import Registration
 
 SIGMA = np.array([0.003] * 3 + [0.002] * 3)
@@ -29,12 +29,12 @@ def test_separated_neighbours_are_found_where_registrations_are_uncertain(posed_
     posed, truth = posed_views
     pulled = displaced_from(truth, 3)
     everywhere = frozenset(range(len(truth)))
-    assert list(worse_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
-    assert list(worse_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
-    assert not list(worse_neighbours(posed, truth, pulled, everywhere - {3}))
+    assert list(degraded_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
+    assert list(degraded_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
+    assert not list(degraded_neighbours(posed, truth, pulled, everywhere - {3}))
     # A loop that repairs a pair is accepted, and so is one that changes nothing.
-    assert not list(worse_neighbours(posed, pulled, truth, everywhere))
-    assert not list(worse_neighbours(posed, truth, truth, everywhere))
+    assert not list(degraded_neighbours(posed, pulled, truth, everywhere))
+    assert not list(degraded_neighbours(posed, truth, truth, everywhere))
 
 
 def chain(posed, truth, inflation, wrong):

@@ -82,7 +82,7 @@ def test_failed_searches_are_limited(monkeypatch, succeeding, asked):
     monkeypatch.setattr(revisits, "register_near", lambda *_: None)
     searched = []
 
-    def scripted(source, target, usual, options):
+    def scripted(source, target, fit_statistics, options):
         searched.append(len(searched))
         return registered(np.eye(4), 1.0 if len(searched) <= succeeding else 0.1)
 

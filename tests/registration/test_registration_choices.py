@@ -242,11 +242,11 @@ def test_projection_matches_points_on_same_pixel():
     target = target.keep(rng(3).random(target.depth.shape) < 0.9)
     a = aligned(source, target, SMALL)
     matches = Projection().prepare(a.target).match(a, 0.05)
-    uv = np.rint(CAMERA.project(a.moved)).astype(int)
+    uv = np.rint(CAMERA.project(a.transformed)).astype(int)
     pixel = np.column_stack(np.nonzero(target.valid))[:, ::-1]
     assert len(matches) > 8000
     np.testing.assert_array_equal(uv[matches.source], pixel[matches.target])
-    gap = a.moved[matches.source] - a.target.points[matches.target]
+    gap = a.transformed[matches.source] - a.target.points[matches.target]
     np.testing.assert_allclose(matches.distance, np.linalg.norm(gap, axis=1))
     # No pair is missing: the others are outside, on no point, or too far.
     inside = ((uv >= 0) & (uv < [120, 90])).all(1)
@@ -254,7 +254,7 @@ def test_projection_matches_points_on_same_pixel():
     position = np.full(target.valid.shape, -1)
     position[target.valid] = np.arange(len(a.target))
     there = position[uv[lost, 1], uv[lost, 0]]
-    far = np.linalg.norm(a.moved[lost] - a.target.points[np.maximum(there, 0)], axis=1) > 0.05
+    far = np.linalg.norm(a.transformed[lost] - a.target.points[np.maximum(there, 0)], axis=1) > 0.05
     assert ((there < 0) | far).all()
 
 
@@ -314,7 +314,7 @@ def test_closest_invariant_weighs_shape_against_distance():
         return np.column_stack([x, y, 2 - 0.08 * np.exp(-off / 0.005)])
 
     a = aligned(view(sheet(-0.15)), view(sheet(0.15)), resolution=0.02)
-    top = np.argmin(a.moved[:, 2])
+    top = np.argmin(a.transformed[:, 2])
     near = ClosestPoint().prepare(a.target).match(a, np.inf)
     assert abs(a.target.points[near.target[top], 0] - 0.15) > 0.2
     for features in (("moments",), ("curvature",)):

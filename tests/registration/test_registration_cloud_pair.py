@@ -448,7 +448,7 @@ def test_candidates_of_same_pose_are_not_rivals():
     best = both.evaluated(T)
     beside = both.evaluated(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
     elsewhere = both.evaluated(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
-    assert both.differ(beside.T_target_source, T)
+    assert both.are_distinct_poses(beside.T_target_source, T)
     assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
     assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NO_RIVAL
     found = register_clouds(source, target, None, np.random.default_rng(0))

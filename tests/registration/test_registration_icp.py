@@ -159,7 +159,7 @@ class WatchedMatcher(Matcher):
             def match(self, alignment: Alignment, reach: float) -> Matches:
                 seen.append((alignment.source.index.copy(), alignment.target.index.copy(), reach))
                 np.testing.assert_allclose(
-                    alignment.moved,
+                    alignment.transformed,
                     se3.transform(alignment.T_target_source, alignment.source.points),
                     atol=1e-12,
                 )

@@ -43,7 +43,7 @@ def pairs(m, weight=None):
 
 
 def cost(T, a, matches):
-    p = se3.transform(T, a.moved[matches.source])
+    p = se3.transform(T, a.transformed[matches.source])
     q = a.target.points[matches.target]
     return float((matches.weights() * ((p - q) ** 2).sum(1)).sum())
 
@@ -90,7 +90,7 @@ def test_closest_point_matches_brute_force(seed, reach):
     T = se3.exp(rng.normal(0, 0.2, 6))
     a = alignment(rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1, (80, 3)), T)
     got = ClosestPoint().prepare(a.target).match(a, reach)
-    distance = np.linalg.norm(a.moved[:, None] - a.target.points[None], axis=2)
+    distance = np.linalg.norm(a.transformed[:, None] - a.target.points[None], axis=2)
     near = np.flatnonzero(distance.min(1) <= reach)
     np.testing.assert_array_equal(got.source, near)
     np.testing.assert_array_equal(got.target, distance[near].argmin(1))
@@ -173,7 +173,7 @@ def test_weighted_rotation_agrees_with_scipy():
     rng = np.random.default_rng(1)
     a = alignment(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
     weight = rng.uniform(0.1, 2, 30)
-    p, q = a.moved, a.target.points
+    p, q = a.transformed, a.target.points
     p0, q0 = np.average(p, 0, weight), np.average(q, 0, weight)
     want, _ = Rotation.align_vectors(q - q0, p - p0, weights=weight)
     got = PointToPoint().motion(pairs(30, weight), a)
@@ -186,7 +186,7 @@ def test_best_fit_is_never_a_reflection():
     source = rng.normal(size=(20, 3))
     a = alignment(source, source * [1, 1, -1])
     _, _, H, _ = weighted_moments(
-        a.moved, a.target.points, np.arange(20), np.arange(20), np.ones(20)
+        a.transformed, a.target.points, np.arange(20), np.arange(20), np.ones(20)
     )
     U, _, Vt = np.linalg.svd(H)
     assert np.linalg.det(U @ Vt) < 0

@@ -25,7 +25,7 @@ from tofuse.registration.search import (
     Candidate,
     SearchOptions,
     _distinct,
-    differ,
+    are_distinct_poses,
     search,
 )
 from tofuse.registration.surface_options import SurfaceOptions
@@ -325,7 +325,7 @@ def test_best_of_distinct_poses_are_kept():
     ]
     kept = []
     for one in sorted(found, key=lambda c: -c.score):
-        if all(differ(one.T_target_source, c.T_target_source) for c in kept):
+        if all(are_distinct_poses(one.T_target_source, c.T_target_source) for c in kept):
             kept.append(one)
     assert 3 < len(kept) < 50
     assert _distinct(found, DISTINCT_M) == tuple(kept)

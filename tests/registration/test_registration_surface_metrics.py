@@ -65,7 +65,7 @@ def test_true_pairs_are_aligned_in_few_steps(metric):
     for _ in range(5):
         motion = metric.motion(matches, alignment) @ alignment.T_target_source
         moved = transform_points(motion, alignment.source.points)
-        alignment = replace(alignment, T_target_source=motion, moved=moved)
+        alignment = replace(alignment, T_target_source=motion, transformed=moved)
     np.testing.assert_allclose(alignment.T_target_source, T, atol=1e-5)
 
 

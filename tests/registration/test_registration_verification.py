@@ -9,7 +9,7 @@ from tofuse.registration.projective import Aligned
 from tofuse.registration.verification import (
     FitStatistics,
     comparable,
-    self_scaled,
+    usual_tolerances,
 )
 
 
@@ -65,7 +65,7 @@ def taught(count=60, seed=0, spread=0.15, **usual):
 )
 def test_unknown_camera_tolerates_moderate_fits(fit):
     found = FitStatistics().assess(aligned(**fit))
-    assert found.usual
+    assert found.is_usual
     assert found.excess == 0
     assert found.reason == ""
 
@@ -81,29 +81,29 @@ def test_unknown_camera_tolerates_moderate_fits(fit):
 )
 def test_unknown_camera_rejects_extreme_fits(fit, words):
     found = FitStatistics().assess(aligned(**fit))
-    assert not found.usual
+    assert not found.is_usual
     assert words in found.reason
     assert 0 < found.excess < np.inf
 
 
 def test_too_few_inliers_determine_no_pose():
     found = FitStatistics().assess(aligned(compared=30, outliers=0.0))
-    assert not found.usual
+    assert not found.is_usual
     assert "30 inliers are too few" in found.reason
     assert found.excess == np.inf
-    assert FitStatistics().assess(aligned(compared=100, outliers=0.0)).usual
+    assert FitStatistics().assess(aligned(compared=100, outliers=0.0)).is_usual
 
 
 def test_usual_fit_is_learned_per_camera():
     """A third of outliers is usual for one camera, and unusual for another."""
     many, few = taught(outliers=0.3), taught(outliers=0.03)
     third = aligned(outliers=0.3)
-    assert many.assess(third).usual
-    assert not few.assess(third).usual
+    assert many.assess(third).is_usual
+    assert not few.assess(third).is_usual
     assert "30% outliers, usually" in few.assess(third).reason
     for known in (many, few):
-        assert known.assess(aligned(outliers=0.03)).usual
-        assert not known.assess(aligned(outliers=0.85)).usual
+        assert known.assess(aligned(outliers=0.03)).is_usual
+        assert not known.assess(aligned(outliers=0.85)).is_usual
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_usual_fit_is_learned_per_camera():
 )
 def test_each_statistic_has_its_own_range(usual, twice, far):
     known = taught(**usual)
-    assert known.assess(aligned(**twice)).usual
-    assert not known.assess(aligned(**far)).usual
+    assert known.assess(aligned(**twice)).is_usual
+    assert not known.assess(aligned(**far)).is_usual
 
 
 def test_range_is_not_too_narrow_for_uniform_recordings():
     known = taught(200, spread=0.0, outliers=0.1)
-    assert known.assess(aligned(outliers=0.18)).usual
-    assert not known.assess(aligned(outliers=0.5)).usual
+    assert known.assess(aligned(outliers=0.18)).is_usual
+    assert not known.assess(aligned(outliers=0.5)).is_usual
 
 
 def test_few_outlier_views_do_not_change_usual_fit():
@@ -131,12 +131,12 @@ def test_few_outlier_views_do_not_change_usual_fit():
     known = taught(outliers=0.05)
     for _ in range(15):
         known.learn(aligned(outliers=0.7), 2.0)
-    assert not known.assess(aligned(outliers=0.7)).usual
+    assert not known.assess(aligned(outliers=0.7)).is_usual
     # The order is irrelevant.
     other = FitStatistics()
     for _ in range(15):
         other.learn(aligned(outliers=0.7), 2.0)
-    assert not all(other.assess(aligned(outliers=x)).usual for x in (0.05, 0.9))
+    assert not all(other.assess(aligned(outliers=x)).is_usual for x in (0.05, 0.9))
 
 
 def test_stricter_limits_accept_fewer_fits():
@@ -148,9 +148,9 @@ def test_stricter_limits_accept_fewer_fits():
             known.learn(aligned(), 2.0)
         found = [known.assess(fit) for fit in fits]
         # Beyond some fraction all are unusual, with an excess that grows with the outliers.
-        usual = [f.usual for f in found]
+        usual = [f.is_usual for f in found]
         assert usual == sorted(usual, reverse=True)
-        excess = [f.excess for f in found if not f.usual]
+        excess = [f.excess for f in found if not f.is_usual]
         assert excess == sorted(excess)
         counts.append(sum(usual))
     assert counts[0] < counts[1] <= counts[2]
@@ -173,11 +173,11 @@ def test_noise_scale_is_learned_from_alignments():
 
 
 def test_tolerance_of_agreement_follows_rms_of_camera():
-    fine, coarse = self_scaled(FitStatistics()), FitStatistics()
+    fine, coarse = usual_tolerances(FitStatistics()), FitStatistics()
     for _ in range(10):
         coarse.learn(aligned(rms_m=0.1), 2.0)
-    assert self_scaled(coarse).floor_fraction == pytest.approx(0.1)
-    assert self_scaled(coarse).floor_fraction > fine.floor_fraction
+    assert usual_tolerances(coarse).floor_fraction == pytest.approx(0.1)
+    assert usual_tolerances(coarse).floor_fraction > fine.floor_fraction
 
 
 def test_views_of_different_scale_are_not_comparable():

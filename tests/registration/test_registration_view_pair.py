@@ -292,12 +292,12 @@ def test_usual_fit_of_camera_decides_acceptance(pair):
     box = ((0.0, 0.2, 1.05), (0.35, 0.4, 0.1), 0.0)
     target, near = surface(pair[1]), A @ se3.exp([0.02, 0, 0, 0, 0.02, 0])
     plain, blocked = (surface(seen(near, 8, boxes=b)) for b in (BOXES, (*BOXES, box)))
-    usual = FitStatistics()
+    fit_statistics = FitStatistics()
     for _ in range(20):
         aligned = align(target, [Target(plain, np.eye(4))], np.eye(4), ProjectiveOptions())
-        usual.learn(aligned, target.depth)
-    assert follow(plain, target, np.eye(4), usual=usual) is not None
-    assert follow(blocked, target, np.eye(4), usual=usual) is None
+        fit_statistics.learn(aligned, target.depth)
+    assert follow(plain, target, np.eye(4), fit_statistics=fit_statistics) is not None
+    assert follow(blocked, target, np.eye(4), fit_statistics=fit_statistics) is None
 
 
 def test_alignment_is_accepted_if_consistent_in_both_directions(pair):

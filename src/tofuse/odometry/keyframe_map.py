@@ -11,7 +11,7 @@ from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
-from tofuse.registration.verification import IN_SIGHT
+from tofuse.registration.verification import MAX_OVERLAP_DISTANCE
 from tofuse.registration.view_descriptor import dissimilarity, view_descriptor
 
 # Maximum number of keyframes, so that memory is constant.
@@ -97,7 +97,9 @@ class KeyframeMap:
         distances = np.linalg.norm(T_camera_keyframes[:, :3, 3], axis=1) / depth + np.asarray(
             se3.angle(T_camera_keyframes)
         )
-        return self._keyframes[-1 if distances[-1] < IN_SIGHT else int(np.argmin(distances))]
+        return self._keyframes[
+            -1 if distances[-1] < MAX_OVERLAP_DISTANCE else int(np.argmin(distances))
+        ]
 
     def most_similar(self, view: PreparedView, component: int) -> Keyframe | None:
         """Return the most similar keyframe of another component; of ties the newest."""

@@ -186,7 +186,7 @@ class KeyframeTracker(Tracker):
             view,
             self._component,
             links,
-            doubtful=not accepted.assessment.usual,
+            doubtful=not accepted.assessment.is_usual,
             inflation=_inflation(accepted),
             moving=mask,
         )
@@ -198,7 +198,7 @@ class KeyframeTracker(Tracker):
         itself is doubtful.
         """
         T, keyframe = accepted.T_component_camera, accepted.keyframe
-        doubtful = not accepted.assessment.usual
+        doubtful = not accepted.assessment.is_usual
         replaces = keyframe is self._last and not doubtful
         if not (replaces or self._keyframes.is_far(T, keyframe)):
             return ()

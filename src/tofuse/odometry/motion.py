@@ -263,7 +263,7 @@ def is_small(T: Float64) -> bool:
     return bool((_distance_and_angle(np.eye(4), T) <= GATE).all())
 
 
-def jumps(
+def find_jumps(
     poses: Sequence[Float64 | None],
     moments: Sequence[Moment],
     interruptions: Collection[int] = (),

@@ -91,7 +91,7 @@ class MotionSegmentation:
         is_due = (
             self._moved
             or suspected
-            or not hypothesis.assessment.usual
+            or not hypothesis.assessment.is_usual
             or aligned.in_front > _MAX_IN_FRONT * aligned.compared
             or view.index % _SEGMENT_EVERY == 0
         )
@@ -104,7 +104,7 @@ class MotionSegmentation:
         )
         if moving.reliable and moving.fraction - excluded / view.pixels > MIN_MOVING_FRACTION:
             static = _realigned(T, keyframe, moving, hypotheses, predicted=hypothesis.predicted)
-            if static.assessment.usual or not hypothesis.assessment.usual:
+            if static.assessment.is_usual or not hypothesis.assessment.is_usual:
                 hypothesis = static
                 moving = self._segmented(
                     view, static.T_component_camera, keyframe, suspected=suspected

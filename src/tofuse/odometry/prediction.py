@@ -76,7 +76,7 @@ class Prediction:
             power = (float(exponent[0]), float(exponent[1]))
         return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
 
-    def at_worst(self) -> Prediction:
+    def with_max_growth(self) -> Prediction:
         """Return the model whose velocity error follows a random walk."""
         return replace(self, power=(_DEFAULT_POWER, _DEFAULT_POWER))
 

@@ -6,7 +6,7 @@ from tofuse.arrays import Float64
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.search import DISTINCT_M, SearchOptions, differ
+from tofuse.registration.search import DISTINCT_M, SearchOptions, are_distinct_poses
 from tofuse.registration.verification import FitStatistics, comparable
 from tofuse.registration.view_pair import register_pair
 
@@ -87,7 +87,7 @@ class Relocalizer:
         registration = self._probable(view, keyframe)
         if registration is None or self._search is None:
             return None
-        return not differ(registration.T_target_source, T)
+        return not are_distinct_poses(registration.T_target_source, T)
 
     def _probable(self, view: PreparedView, keyframe: Keyframe) -> Registration | None:
         """Register a view to a keyframe, each pair once, if the budget allows."""
@@ -101,7 +101,7 @@ class Relocalizer:
             registration = register_pair(
                 view,
                 keyframe.view,
-                usual=self._fit_statistics,
+                fit_statistics=self._fit_statistics,
                 options=self._search,
                 always_search=True,
                 rival_m=DISTINCT_M,

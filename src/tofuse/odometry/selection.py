@@ -15,7 +15,7 @@ from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.agreement import MIN_LEAD, AgreementOptions, agreement
 from tofuse.registration.projective import UNITS
 from tofuse.registration.search import DISTINCT_M, DISTINCT_RAD
-from tofuse.registration.verification import FitStatistics, finely_scaled, self_scaled
+from tofuse.registration.verification import FitStatistics, fine_tolerances, usual_tolerances
 
 # Weight of the deviation from the predicted motion, as a fraction of the points: small, as a wrong
 # pose loses more where the scene constrains it.
@@ -89,7 +89,7 @@ class HypothesisSelector:
                     if self._motion.gate_violation(start, now):
                         break
                     displaced = hypotheses.realigned(start, view, r, predicted=True)
-                    if displaced.assessment.usual and not self._violates_gate(displaced, now):
+                    if displaced.assessment.is_usual and not self._violates_gate(displaced, now):
                         yield displaced
 
     def _first_usual(self, hypotheses: Hypotheses, now: Moment) -> Hypothesis | None:
@@ -103,13 +103,13 @@ class HypothesisSelector:
         """
         rival_score = -np.inf
         for hypothesis in hypotheses:
-            usual, predicted = hypothesis.assessment.usual, self._is_predicted(hypothesis, now)
+            usual, predicted = hypothesis.assessment.is_usual, self._is_predicted(hypothesis, now)
             if self._violates_gate(hypothesis, now):
                 continue
             if not usual and (hypothesis.assessment.conflict or not predicted):
                 if predicted:
                     for static in self._segmentation.alternatives(hypothesis, hypotheses):
-                        if static.assessment.usual and not self._violates_gate(static, now):
+                        if static.assessment.is_usual and not self._violates_gate(static, now):
                             return static
                     rival_score = max(
                         rival_score, self._explanation_score(hypothesis, hypotheses, now)
@@ -145,7 +145,7 @@ class HypothesisSelector:
                 and hypothesis.assessment.conflict
             ):
                 continue  # mostly predicted, and the prediction explains the view badly
-            if self._agreement(hypothesis, finely_scaled(self._fit_statistics)) <= 0:
+            if self._agreement(hypothesis, fine_tolerances(self._fit_statistics)) <= 0:
                 continue
             score = self._explanation_score(hypothesis, hypotheses, now)
             if score > best_score:
@@ -160,7 +160,7 @@ class HypothesisSelector:
                 continue
             T = r.keyframe.T_component_camera @ link.T_i_j
             hypothesis = hypotheses.realigned(T, hypotheses.static_view, r, predicted=False)
-            if hypothesis.assessment.usual and self._motion.is_feasible(
+            if hypothesis.assessment.is_usual and self._motion.is_feasible(
                 hypothesis.T_component_camera, now
             ):
                 return replace(hypothesis, note=f"the prediction did not fit: {link.how}")
@@ -174,7 +174,7 @@ class HypothesisSelector:
         A doubtful reference counts only if there is no other: its own pose may follow a moving
         object.
         """
-        T, options = hypothesis.T_component_camera, finely_scaled(self._fit_statistics)
+        T, options = hypothesis.T_component_camera, fine_tolerances(self._fit_statistics)
         references = [
             hypothesis.reference if r.keyframe is hypothesis.keyframe else r
             for r in hypotheses.references
@@ -190,7 +190,7 @@ class HypothesisSelector:
     def _agreement(self, hypothesis: Hypothesis, options: AgreementOptions | None = None) -> float:
         """Return support minus contradiction of an alignment, over both images."""
         target = hypothesis.reference.target.view
-        options = options or self_scaled(self._fit_statistics)
+        options = options or usual_tolerances(self._fit_statistics)
         return agreement(hypothesis.view, target, hypothesis.T_keyframe_camera, options).score
 
     def _violates_gate(self, hypothesis: Hypothesis, now: Moment) -> bool:

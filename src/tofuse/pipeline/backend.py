@@ -22,7 +22,7 @@ from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_se
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, PriorLoop
 from tofuse.posegraph.merged_components import Join
-from tofuse.posegraph.neighbour_check import worse_neighbours
+from tofuse.posegraph.neighbour_check import degraded_neighbours
 from tofuse.results.types import Component, Diagnostics, Reconstruction
 
 # Maximum number of repeated loop searches along a long trajectory.
@@ -133,8 +133,8 @@ class BackEnd:
     ) -> tuple[Optimisation, frozenset[int]]:
         """Optimise a graph with loops; repeat if neighbouring views become inconsistent.
 
-        Registrations between such views then get their usual uncertainty (`worse_neighbours`). Also
-        returns the frames of these registrations.
+        Registrations between such views then get their usual uncertainty (`degraded_neighbours`).
+        Also returns the frames of these registrations.
         """
         row_of = {int(index): k for k, index in enumerate(graph.ids)}
         suspects = frozenset(
@@ -148,7 +148,7 @@ class BackEnd:
             views = self._observations.views.of(row_of) if suspects else []
             rows = [row_of[v.index] for v in views]
             before, after = graph.poses[rows], optimisation.graph.poses[rows]
-            worse_pairs = worse_neighbours(views, before, after, suspects)
+            worse_pairs = degraded_neighbours(views, before, after, suspects)
             cleared = suspects.intersection(k for i, j in worse_pairs for k in range(i + 1, j + 1))
             if not cleared:
                 return optimisation, confirmed

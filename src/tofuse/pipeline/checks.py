@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.evaluation.cross_view import CrossViewConsistency
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Moment, jumps
+from tofuse.odometry.motion import Moment, find_jumps
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.calibration_check import in_words as camera_in_words
 from tofuse.posegraph.covariances import loop_errors
@@ -251,7 +251,7 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     moments = [Moment(r.index, r.timestamp) for r in e.records]
     unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
     unexpected = {*e.interruptions, *_component_changes(e.records, has_pose), *unmeasured}
-    pose_jumps = jumps(poses, moments, unexpected)
+    pose_jumps = find_jumps(poses, moments, unexpected)
     frames = [e.records[k].index for k, _ in pose_jumps]
     if len(pose_jumps) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (

@@ -65,7 +65,7 @@ class TrackedGraph:
         confirmed
             Frames whose registrations get their uncertainty without `Step.inflation`.
         conservative
-            Whether the error of predicted motion grows at the maximum rate (`at_worst`).
+            Whether the error of predicted motion grows at the maximum rate (`with_max_growth`).
         """
         ids = [e.record.index for e in self.posed]
         tracked = np.array([self.poses[index] for index in ids])
@@ -77,7 +77,7 @@ class TrackedGraph:
         degenerate_run_of = degenerate_runs(unobservable)
         prediction = Prediction.of(tracked, unobservable) if degenerate_run_of.any() else None
         if prediction is not None and conservative:
-            prediction = prediction.at_worst()
+            prediction = prediction.with_max_growth()
         times = {e.record.index: e.record.timestamp for e in self.posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequential_edges = []

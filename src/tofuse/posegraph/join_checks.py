@@ -23,8 +23,13 @@ from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.pose_probability import CONTRADICTION
 from tofuse.registration.projective import ProjectiveOptions, Target, align
-from tofuse.registration.search import differ
-from tofuse.registration.verification import IN_SIGHT, PATIENT, FitStatistics, self_scaled
+from tofuse.registration.search import are_distinct_poses
+from tofuse.registration.verification import (
+    MAX_OVERLAP_DISTANCE,
+    PATIENT,
+    FitStatistics,
+    usual_tolerances,
+)
 from tofuse.registration.view_pair import follow
 
 # View pairs that verify a join, besides those of the links; and their smallest overlap.
@@ -54,7 +59,7 @@ class JoinChecks:
 
     Attributes
     ----------
-    usual
+    fit_statistics
         The usual fit of this camera's views.
     speed
         (2,) m/s and rad/s that the camera hardly exceeds; inf where unknown.
@@ -62,7 +67,7 @@ class JoinChecks:
 
     def __init__(self, merged: MergedComponents) -> None:
         self._merged = merged
-        self.usual = FitStatistics()
+        self.fit_statistics = FitStatistics()
         self._contradiction = CONTRADICTION
         tracked = list(merged.tracked.values())
         measured = np.concatenate([end_speeds(s, end=True) for s in tracked])
@@ -89,8 +94,8 @@ class JoinChecks:
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)
             if aligned.overlap >= _OVERLAP:
-                self.usual.learn(aligned, b.depth)
-                result = agreement(b.view, a.view, T_a_b, self_scaled(self.usual))
+                self.fit_statistics.learn(aligned, b.depth)
+                result = agreement(b.view, a.view, T_a_b, usual_tolerances(self.fit_statistics))
                 contradictions.append(result.contradiction)
         if len(contradictions) > 3:
             median = float(np.median(contradictions))
@@ -102,7 +107,7 @@ class JoinChecks:
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64
     ) -> list[tuple[View, View, Float64, Agreement]]:
         """View pairs of both sides that overlap most under T_a_b: T_i_j, and their agreement."""
-        compare = self_scaled(self.usual)
+        compare = usual_tolerances(self.fit_statistics)
         views_a = [
             self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in a.T
         ]
@@ -119,7 +124,8 @@ class JoinChecks:
             translation = np.linalg.norm(relative[:, :3, 3], axis=1) / v.depth
             distance = translation + np.asarray(se3.angle(relative))
             candidates += [
-                (float(distance[q]), p, int(q)) for q in np.flatnonzero(distance < IN_SIGHT)
+                (float(distance[q]), p, int(q))
+                for q in np.flatnonzero(distance < MAX_OVERLAP_DISTANCE)
             ]
         overlapping = []
         for _, p, q in sorted(candidates)[: 3 * VERIFY]:
@@ -149,11 +155,14 @@ class JoinChecks:
             agreed = at_implied
             if agreed.contradiction > self._contradiction:
                 target = [Target(first.view, np.eye(4))]
-                scale = self.usual.noise_scale
+                scale = self.fit_statistics.noise_scale
                 aligned = align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
                 if self._within_drift(T, aligned.T_world_source, first.depth, drift):
                     realigned = agreement(
-                        second.view, first.view, aligned.T_world_source, self_scaled(self.usual)
+                        second.view,
+                        first.view,
+                        aligned.T_world_source,
+                        usual_tolerances(self.fit_statistics),
                     )
                     agreed = min(agreed, realigned, key=lambda result: result.contradiction)
             overlap += agreed.overlap
@@ -208,11 +217,11 @@ class JoinChecks:
             if frozenset((first.index, second.index)) in linked:
                 continue
             # Along degenerate directions an alignment stays at its guess, which confirms nothing.
-            registration = follow(second.view, first.view, T, usual=self.usual)
+            registration = follow(second.view, first.view, T, fit_statistics=self.fit_statistics)
             link = link_of(first, second, registration)
             if link is None or len(link.registration.unobservable):
                 continue
-            if not differ(link.T_i_j, T):
+            if not are_distinct_poses(link.T_i_j, T):
                 registrations.append(replace(link, certain=False))
         return registrations
 

@@ -30,7 +30,7 @@ from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.registration.base import Link
 from tofuse.registration.pose_probability import logistic
 from tofuse.registration.search import DISTINCT_M, SearchOptions
-from tofuse.registration.verification import IN_SIGHT
+from tofuse.registration.verification import MAX_OVERLAP_DISTANCE
 from tofuse.registration.view_descriptor import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
@@ -187,7 +187,7 @@ class _Joiner:
         """Whether a single link may join two merged components before all searches are done."""
         T_a_b = self._merged.T_a_b(a, b, _best(links))
         if np.isfinite(self._checks.speed).all():
-            return self._checks.is_near(a, b, T_a_b, IN_SIGHT)
+            return self._checks.is_near(a, b, T_a_b, MAX_OVERLAP_DISTANCE)
         # Unordered views are joined one by one, so that the next is compared with more of them.
         # Joins that rest on one link are reconsidered later.
         return any(link.certain for link in links) or bool(self._confirming(a, b, T_a_b, links))
@@ -301,7 +301,7 @@ class _Joiner:
         registration = register_pair(
             second.view,
             first.view,
-            usual=self._checks.usual,
+            fit_statistics=self._checks.fit_statistics,
             options=self._search,
             rival_m=DISTINCT_M,
         )
@@ -373,7 +373,13 @@ class _Joiner:
             if p <= 0:
                 continue
             independence = min(
-                [1.0, *(self._merged.separation(a, b, link, other) / IN_SIGHT for other in counted)]
+                [
+                    1.0,
+                    *(
+                        self._merged.separation(a, b, link, other) / MAX_OVERLAP_DISTANCE
+                        for other in counted
+                    ),
+                ]
             )
             log_odds += independence * float(np.log(p / (1 - p)))
             counted.append(link)

@@ -11,7 +11,7 @@ from tofuse.registration.agreement import MIN_LEAD, Comparison
 from tofuse.registration.prepared_view import PreparedView
 
 
-def worse_neighbours(
+def degraded_neighbours(
     views: Sequence[PosedView[PreparedView]],
     before: Float64,
     after: Float64,

@@ -204,7 +204,7 @@ class _RevisitLoops(Loops):
         self._prior_loops = prior
         self._entries: dict[int, _Entry] = {}
         self._decisions: dict[tuple[int, int], ClosedLoop] = {}
-        self._usual = FitStatistics()
+        self._fit_statistics = FitStatistics()
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
         self._path_length: dict[int, Float64] = {}
@@ -350,10 +350,10 @@ class _RevisitLoops(Loops):
             self._learnt.add(pair)
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
             target = [Target(a.view.without_caches(), np.eye(4))]
-            scale = self._usual.noise_scale
+            scale = self._fit_statistics.noise_scale
             aligned = align(b.view.without_caches(), target, guess, _WEAK_PRIOR, usual_scale=scale)
             if aligned.overlap >= _MIN_OVERLAP:
-                self._usual.learn(aligned, b.view.depth)
+                self._fit_statistics.learn(aligned, b.view.depth)
 
     def _confirm(self, target: View, source: View) -> ClosedLoop:
         """Register the later view with the earlier one in both directions, once for each pair."""
@@ -381,7 +381,12 @@ class _RevisitLoops(Loops):
         """Arguments of `register_near`, with the initial guess of the trajectory."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Without caches, or the data derived for the comparison would stay in memory.
-        return source.view.without_caches(), target.view.without_caches(), guess, self._usual
+        return (
+            source.view.without_caches(),
+            target.view.without_caches(),
+            guess,
+            self._fit_statistics,
+        )
 
     def _decide(self, pair: tuple[int, int], registration: Registration | None) -> ClosedLoop:
         """Accept or reject the registration of frames (i, j)."""
@@ -444,7 +449,7 @@ class _RevisitLoops(Loops):
             len(pairs),
             lambda k: (
                 *(posed[n].view for n in reversed(pairs[k])),
-                self._usual,
+                self._fit_statistics,
                 self._search,
             ),
             large=True,
@@ -532,17 +537,22 @@ class _RevisitLoops(Loops):
 
 
 def register_near(
-    source: PreparedView, target: PreparedView, guess: Float64, usual: FitStatistics
+    source: PreparedView, target: PreparedView, guess: Float64, fit_statistics: FitStatistics
 ) -> Registration | None:
     """Register two views from the guess (4, 4) T_target_source of the trajectory."""
-    return follow(source, target, guess, usual=usual)
+    return follow(source, target, guess, fit_statistics=fit_statistics)
 
 
 def register_anywhere(
-    source: PreparedView, target: PreparedView, usual: FitStatistics, options: SearchOptions
+    source: PreparedView,
+    target: PreparedView,
+    fit_statistics: FitStatistics,
+    options: SearchOptions,
 ) -> Registration | None:
     """Register two views by exhaustive search, without a guess."""
-    return register_pair(source, target, usual=usual, options=options, rival_m=DISTINCT_M)
+    return register_pair(
+        source, target, fit_statistics=fit_statistics, options=options, rival_m=DISTINCT_M
+    )
 
 
 def _largest_gain(

@@ -118,7 +118,7 @@ class _Views:
             information=cloud_information(self.source_map, self.target_map, T, unobservable),
         )
 
-    def differ(self, a: Float64, b: Float64) -> bool:
+    def are_distinct_poses(self, a: Float64, b: Float64) -> bool:
         """Whether two poses (4, 4) are distinct hypotheses."""
         points = self.source_map.view.points.astype(np.float64)
         return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
@@ -220,7 +220,7 @@ def _registered(
         registration.unobservable, views.source_map.view.points.astype(np.float64)
     )
     across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
-    if views.differ(local.T_target_source, local.T_target_source @ across):
+    if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
         return views.with_information(registration)
     return views.with_information(_registration(views, local, [best]))
 
@@ -331,13 +331,13 @@ def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _P
     averaged = views.source_map.view, views.target_map.view
     for pose in poses:
         start = pose.T_target_source
-        if not views.differ(start, best.T_target_source):
+        if not views.are_distinct_poses(start, best.T_target_source):
             continue
         try:
             converged = CoarseToFine().approximate_pose(views.size, *averaged, start, _RIVAL_POINTS)
         except RegistrationError:
             converged = start
-        if views.differ(converged, T):
+        if views.are_distinct_poses(converged, T):
             return pose
     return _NO_RIVAL
 

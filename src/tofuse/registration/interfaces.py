@@ -98,7 +98,7 @@ class Alignment:
         Typical distance between neighbouring points in m (res of the thesis).
     T_target_source
         (4, 4) current estimate.
-    moved
+    transformed
         (n, 3) the source's points in the target's frame, m.
     """
 
@@ -106,7 +106,7 @@ class Alignment:
     target: Points
     resolution: float
     T_target_source: Float64
-    moved: Float64
+    transformed: Float64
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,6 @@ class _TreeSearch:
     tree: KdTree
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        index, squared = self.tree.nearest(alignment.moved, reach)
+        index, squared = self.tree.nearest(alignment.transformed, reach)
         source = np.flatnonzero(index >= 0)
         return Matches(source, index[source], np.sqrt(squared[source]))

@@ -46,7 +46,7 @@ class PointToPoint(Metric):
                 f"only {len(matches)} points of the views correspond, 3 are needed"
             )
         d0, m0, H, size = weighted_moments(
-            alignment.moved,
+            alignment.transformed,
             alignment.target.points,
             matches.source,
             matches.target,
@@ -74,7 +74,7 @@ class PointToPoint(Metric):
         degenerate.
         """
         weight = matches.weights()
-        residual = alignment.moved[matches.source] - alignment.target.points[matches.target]
+        residual = alignment.transformed[matches.source] - alignment.target.points[matches.target]
         degrees_of_freedom = max(3 * len(matches) - 6, 1)
         variance = float((weight[:, None] * residual * residual).sum()) / degrees_of_freedom
         variance = max(variance, (_MIN_SIGMA_RATIO * alignment.resolution) ** 2)

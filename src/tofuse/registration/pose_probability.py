@@ -29,19 +29,19 @@ _MIN_SUPPORT, _MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 
 @dataclass(frozen=True)
 class Model:
-    """Coefficients of `Evidence.searched` and `Evidence.followed`."""
+    """Coefficients of `Evidence.search_regressors` and `Evidence.local_regressors`."""
 
-    searched: tuple[float, ...]
-    followed: tuple[float, ...]
+    search: tuple[float, ...]
+    local: tuple[float, ...]
 
 
 # Fitted to images: 351 searched poses, 370 poses aligned from a guess. On held-out scenes the area
 # under the ROC curve is 0.99 and 0.91.
-IMAGES = Model(searched=(0.34, 6.17, -6.40, -4.21), followed=(0.55, 7.01, -6.02))
+IMAGES = Model(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
 # Fitted to clouds: 146 searched poses. On 226 held-out pairs, some without overlap, the area is
 # 0.98; of 90 accepted poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
 # known viewpoint.
-CLOUDS = Model(searched=(-1.82, 6.08, -4.78, -0.69), followed=(-2.29, 9.96, -5.5))
+CLOUDS = Model(search=(-1.82, 6.08, -4.78, -0.69), local=(-2.29, 9.96, -5.5))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Evidence:
         return cls(agreement.support, agreement.contradiction, margin, degenerate, model)
 
     @property
-    def searched(self) -> Float64:
+    def search_regressors(self) -> Float64:
         """Regressors (4,) of a pose that was compared with rivals.
 
         Square roots of margin and contradiction, as the step from 0 to 2 % is more informative than
@@ -90,7 +90,7 @@ class Evidence:
         return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy])
 
     @property
-    def followed(self) -> Float64:
+    def local_regressors(self) -> Float64:
         """Regressors (3,) of a pose aligned from a guess, without rivals.
 
         Degenerate directions don't count, as they keep the guess.
@@ -101,8 +101,8 @@ class Evidence:
     def probability(self) -> float:
         """Probability that the pose is right, 0 to 1."""
         if self.margin is None:
-            return logistic(float(self.followed @ self.model.followed))
-        return logistic(float(self.searched @ self.model.searched))
+            return logistic(float(self.local_regressors @ self.model.local))
+        return logistic(float(self.search_regressors @ self.model.search))
 
     def rejection_reason(self) -> str:
         """Return the reason why the pose is rejected; empty if it is accepted."""

@@ -91,7 +91,7 @@ class SearchOptions(Bounded):
     photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
 
 
-def differ(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
+def are_distinct_poses(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
     """Whether two poses (4, 4) are distinct hypotheses."""
     T_a_b = se3.inverse(a) @ b
     return bool(np.linalg.norm(T_a_b[:3, 3]) > distinct_m or se3.angle(T_a_b) > DISTINCT_RAD)

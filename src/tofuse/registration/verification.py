@@ -40,7 +40,7 @@ _WINDOW = 200
 # Once a camera is known, the distribution is updated every n-th alignment.
 _RELEARN_EVERY = 10
 # Views hardly overlap beyond this distance: the sum of a fraction of the depth and rad.
-IN_SIGHT = 1.2
+MAX_OVERLAP_DISTANCE = 1.2
 # For six unknowns, with noise that is correlated between neighbouring pixels.
 _MIN_INLIERS = 40
 # Registrations without a prediction need more iterations than tracking.
@@ -55,7 +55,7 @@ class Assessment:
 
     Attributes
     ----------
-    usual
+    is_usual
         Whether all statistics are within the usual range.
     excess
         Sum of the logarithms by which statistics exceed their usual value; 0 for a usual fit.
@@ -65,7 +65,7 @@ class Assessment:
         Whether the views conflict, rather than only being noisier.
     """
 
-    usual: bool
+    is_usual: bool
     excess: float
     reason: str
     conflict: bool = False
@@ -177,7 +177,7 @@ def are_inverse(
     return bool(np.linalg.norm(difference[:3, 3]) <= metres and se3.angle(difference) <= radians)
 
 
-def self_scaled(fit_statistics: FitStatistics) -> AgreementOptions:
+def usual_tolerances(fit_statistics: FitStatistics) -> AgreementOptions:
     """Return options that tolerate the usual errors of this camera."""
     default = AgreementOptions()
     return replace(
@@ -187,9 +187,9 @@ def self_scaled(fit_statistics: FitStatistics) -> AgreementOptions:
     )
 
 
-def finely_scaled(fit_statistics: FitStatistics) -> AgreementOptions:
+def fine_tolerances(fit_statistics: FitStatistics) -> AgreementOptions:
     """Return options that distinguish rival poses of one image by errors beyond the usual ones."""
-    coarse = self_scaled(fit_statistics)
+    coarse = usual_tolerances(fit_statistics)
     if not fit_statistics.is_known:
         return coarse
     return replace(

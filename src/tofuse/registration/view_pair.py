@@ -32,7 +32,7 @@ from tofuse.registration.search import (
     Match,
     Search,
     SearchOptions,
-    differ,
+    are_distinct_poses,
 )
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 from tofuse.registration.verification import (
@@ -41,7 +41,7 @@ from tofuse.registration.verification import (
     FitStatistics,
     are_inverse,
     comparable,
-    self_scaled,
+    usual_tolerances,
 )
 
 # Few iterations near a guess; otherwise enough for a step of a third of the view.
@@ -96,7 +96,7 @@ def register_pair(
     target: PreparedView,
     guess: Float64 | None = None,
     *,
-    usual: FitStatistics | None = None,
+    fit_statistics: FitStatistics | None = None,
     options: SearchOptions | None = None,
     always_search: bool = False,
     proposals: Callable[[], Float64] | None = None,
@@ -111,7 +111,7 @@ def register_pair(
         Prepared views.
     guess
         (4, 4) T_target_source; the identity unless given.
-    usual
+    fit_statistics
         Fit statistics of this camera, if known.
     options
         Range and effort of the search.
@@ -132,7 +132,7 @@ def register_pair(
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, uncertainty, rival_m)
+    pair = _Pair.of(source, target, fit_statistics, uncertainty, rival_m)
     local = pair.local_pose(np.eye(4) if guess is None else guess)
     if local is not None and local.is_certain and not always_search:
         return pair.registration(local, local.evidence, None)
@@ -159,16 +159,16 @@ def follow(
     target: PreparedView,
     guess: Float64,
     *,
-    usual: FitStatistics | None = None,
+    fit_statistics: FitStatistics | None = None,
     uncertainty: UncertaintyOptions | None = None,
 ) -> Registration | None:
     """Register two prepared views from a guess (4, 4) without a search; None if they don't fit.
 
-    For `usual` and `uncertainty` see `register_pair`.
+    For `fit_statistics` and `uncertainty` see `register_pair`.
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, uncertainty)
+    pair = _Pair.of(source, target, fit_statistics, uncertainty)
     local = pair.local_pose(guess)
     return None if local is None else pair.registration(local, local.evidence, None)
 
@@ -187,7 +187,7 @@ class _Pair:
 
     source: PreparedView
     target: PreparedView
-    usual: FitStatistics
+    fit_statistics: FitStatistics
     agreement_options: AgreementOptions
     distinct_m: float
     uncertainty: UncertaintyOptions | None
@@ -197,7 +197,7 @@ class _Pair:
         cls,
         source: PreparedView,
         target: PreparedView,
-        usual: FitStatistics | None,
+        fit_statistics: FitStatistics | None,
         uncertainty: UncertaintyOptions | None,
         rival_m: float = math.inf,
     ) -> _Pair:
@@ -209,14 +209,14 @@ class _Pair:
             view.with_falloff(_VIGNETTING) if view.unknown_falloff else view
             for view in (source, target)
         )
-        usual = usual or FitStatistics()
+        fit_statistics = fit_statistics or FitStatistics()
         depth = 0.5 * (source.depth + target.depth)
-        agreement_options = self_scaled(usual)
+        agreement_options = usual_tolerances(fit_statistics)
         agreement_options = replace(
             agreement_options, floor_m=agreement_options.floor_m * min(1.0, depth / _NEAR_M)
         )
         distinct_m = min(rival_m, _DISTINCT * depth)
-        return cls(source, target, usual, agreement_options, distinct_m, uncertainty)
+        return cls(source, target, fit_statistics, agreement_options, distinct_m, uncertainty)
 
     def local_pose(self, guess: Float64) -> _Pose | None:
         """Align from a guess (4, 4), first with few iterations; None if the views don't fit."""
@@ -237,20 +237,22 @@ class _Pair:
         self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
     ) -> Aligned:
         source, target = views
-        return align(source, _as_target(target), guess, options, usual_scale=self.usual.noise_scale)
+        return align(
+            source, _as_target(target), guess, options, usual_scale=self.fit_statistics.noise_scale
+        )
 
     def _consistent_pose(
         self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
     ) -> _Pose | None:
         """Align forwards and backwards; None if inconsistent, or if the fit is unusual."""
         forward = self._aligned(views, guess, options)
-        if not forward.converged or not self.usual.assess(forward).usual:
+        if not forward.converged or not self.fit_statistics.assess(forward).is_usual:
             return None
         T = forward.T_world_source
         backward = self._aligned((views[1], views[0]), se3.inverse(T), options)
         max_gap_m = _MAX_INCONSISTENCY * self.source.depth
         consistent = are_inverse(T, backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
-        if not consistent or not self.usual.assess(backward).usual:
+        if not consistent or not self.fit_statistics.assess(backward).is_usual:
             return None
         pose_agreement = agreement(self.source, self.target, T, self.agreement_options)
         return (
@@ -297,17 +299,19 @@ class _Pair:
         difference = se3.log(se3.inverse(local.T_target_source) @ best.T_target_source) / UNITS
         weak = local.aligned.unobservable
         across = se3.exp((difference - weak.T @ (weak @ difference)) * UNITS)
-        is_same = not differ(np.eye(4), across, self.distinct_m)
+        is_same = not are_distinct_poses(np.eye(4), across, self.distinct_m)
         return local if local.degenerate and best.degenerate and is_same else best
 
     def are_same(self, a: _Pose, b: _Pose) -> bool:
         """Whether two poses are the same hypothesis."""
-        return not differ(a.T_target_source, b.T_target_source, self.distinct_m)
+        return not are_distinct_poses(a.T_target_source, b.T_target_source, self.distinct_m)
 
     def rival(self, pose: _Pose, match: Match) -> Candidate | None:
         """Return the best candidate of a search that is distinct from `pose`."""
         T, distinct_m = pose.T_target_source, self.distinct_m
-        rivals = (c for c in match.candidates if differ(T, c.T_target_source, distinct_m))
+        rivals = (
+            c for c in match.candidates if are_distinct_poses(T, c.T_target_source, distinct_m)
+        )
         return next(rivals, None)
 
     def registration(

@@ -26,7 +26,7 @@ from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.pose_probability import ACCEPTED, Evidence
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, differ
+from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, are_distinct_poses
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
 from tofuse.rigs.joint import JointOptions, View, refined_poses
@@ -221,11 +221,13 @@ class _Placer:
         return distinct
 
     def _differ(self, a: Mapping[int, Float64], b: Mapping[int, Float64]) -> bool:
-        return a.keys() != b.keys() or any(differ(a[c], b[c], self._distinct_m) for c in a)
+        return a.keys() != b.keys() or any(
+            are_distinct_poses(a[c], b[c], self._distinct_m) for c in a
+        )
 
     def _is_distinct(self, T: Float64, others: Sequence[Float64]) -> bool:
         """Whether a pose (4, 4) differs from all others."""
-        return all(differ(T, other, self._distinct_m) for other in others)
+        return all(are_distinct_poses(T, other, self._distinct_m) for other in others)
 
     def _refine(self, hypothesis: _Hypothesis) -> _Hypothesis:
         """Refine all cameras of a hypothesis jointly, if that improves its score."""
@@ -289,7 +291,7 @@ class _Placer:
                 continue
             distinct.append(T)
             refined = self._align({**poses, camera: T})
-            if differ(pose, refined[camera], self._distinct_m):
+            if are_distinct_poses(pose, refined[camera], self._distinct_m):
                 scores.append(gain)
         return scores
 

@@ -43,7 +43,7 @@ class _LookupSearch:
     tree: KdTree
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        points, size = alignment.moved, len(self.tree)
+        points, size = alignment.transformed, len(self.tree)
         near, squared = self.tree.neighbours(points, min(_FIRST, size))
         lists = dict(enumerate(zip(near, squared, strict=True)))
         offers = [(float(squared[k, 0]), k, 0) for k in range(len(points))]

@@ -53,7 +53,7 @@ class _NormalSearch:
     steps: int
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        start, target = alignment.moved, alignment.target
+        start, target = alignment.transformed, alignment.target
         turn = np.eye(4)
         turn[:3, :3] = alignment.T_target_source[:3, :3]
         line = transform_points(turn, alignment.source.normals)
@@ -133,7 +133,7 @@ class _GridSearch:
     radius: int
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        moved = alignment.moved
+        moved = alignment.transformed
         pixels = np.ascontiguousarray(self.view.camera.project(moved))
         index = np.empty(len(moved), np.int64)
         squared = np.empty(len(moved))
@@ -176,7 +176,7 @@ class _CompatibleSearch:
         # Amplitudes select candidates; among these only the distance in space counts.
         asked = _log_amplitude(alignment.source)
         index, squared = self.tree.nearest_featured(
-            alignment.moved, self.features, asked, self.tolerance, reach, 0.0
+            alignment.transformed, self.features, asked, self.tolerance, reach, 0.0
         )
         source = np.flatnonzero(index >= 0)
         return Matches(source, index[source], np.sqrt(squared[source]))
@@ -231,7 +231,7 @@ class _InvariantSearch:
         spread = np.array([_mean_deviation(column) for column in of_target.T])
         by = self.options.weight * alignment.resolution / (spread * np.sqrt(of_target.shape[1]))
         index, squared = self.tree.nearest_featured(
-            alignment.moved, of_target * by, of_source * by, np.inf, reach
+            alignment.transformed, of_target * by, of_source * by, np.inf, reach
         )
         source = np.flatnonzero(index >= 0)
         return Matches(source, index[source], np.sqrt(squared[source]))

@@ -42,7 +42,7 @@ class Implicit(Bounded, SurfaceMetric):
         """See `Metric.motion`."""
         pairs = surface_pairs(matches, alignment)
         kept = with_normals(matches, alignment)
-        distance = self.distance(alignment.moved[kept.source], alignment)
+        distance = self.distance(alignment.transformed[kept.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)
         H, g, _ = plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)

@@ -58,7 +58,7 @@ class Graduated(Bounded, Metric):
 
     def _solved(self, matches: Matches, alignment: Alignment) -> tuple[Float64, Matches]:
         c2 = (self.inlier * alignment.resolution) ** 2
-        p = alignment.moved[matches.source]
+        p = alignment.transformed[matches.source]
         q = alignment.target.points[matches.target]
         given = matches.weights()
         weighted = replace(matches, weight=given)

@@ -58,7 +58,7 @@ def approximant(matches: Matches, alignment: Alignment) -> Float64:
     j = matches.target
     bending = neighbourhood(alignment.target).bending
     n = alignment.target.normals[j]
-    d = ((alignment.moved[matches.source] - alignment.target.points[j]) * n).sum(1)
+    d = ((alignment.transformed[matches.source] - alignment.target.points[j]) * n).sum(1)
     bent = d[:, None] * bending.curvature[j]
     weight = np.divide(bent, bent - 1, out=np.zeros_like(bent), where=bent < 0)
     tangents = bending.directions[j]
