@@ -480,7 +480,7 @@ def test_corrected_focal_length_does_not_affect_verdict(room_recording: Path) ->
     wrong = Finding("focal_length", "It is that of another camera.", "Use the right one.", {})
 
     def faults(focal: float, offset_m: float) -> list[str]:
-        corrected = SelfCalibration(focal, offset_m, 0.0, 0.0, {}, (0.1, 0.01))
+        corrected = SelfCalibration(focal, offset_m, 0.0, 0.0, 0.0, {}, (0.1, 0.01))
         diagnostics = replace(result.diagnostics, calibrated=corrected)
         found = with_findings(replace(result, diagnostics=diagnostics), [wrong])
         assert found.recording["findings"] == [wrong.to_dict()]

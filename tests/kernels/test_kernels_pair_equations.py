@@ -10,6 +10,7 @@ import pytest
 from corner_views import SHARP, corner, unpack
 from pair_equations import KNOWN, pair_equations
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import RayTable
 from tofuse.kernels import pair_equations as kernels
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import points_of
@@ -75,12 +76,14 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-@pytest.mark.parametrize("error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y])
+@pytest.mark.parametrize(
+    "error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y, kernels.DISTORTION]
+)
 def test_wrong_intrinsics_are_compensated(pair, kind, error):
     """The measured quantity is kept: z, or the range along another ray."""
     source, target, T = pair
     errors = np.zeros(kernels.ERRORS)
-    errors[error] = 0.01
+    errors[error] = 0.03 if error == kernels.DISTORTION else 0.01
 
     def stated(frame):
         camera = frame.camera
@@ -90,6 +93,9 @@ def test_wrong_intrinsics_are_compensated(pair, kind, error):
             camera.cy + errors[kernels.CENTER_Y] * fy,
         )
         wrong = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
+        if error == kernels.DISTORTION:
+            rays = camera.rays()
+            wrong = RayTable(rays / (1 + errors[error] * (rays**2).sum(-1, keepdims=True)))
         return replace(as_measured(frame, kind), camera=wrong)
 
     views = stated(source), stated(target)

@@ -40,14 +40,16 @@ def frame(camera=CAMERA, kind="z") -> RangeFrame:
 
 @pytest.mark.parametrize("camera", [CAMERA, RayTable(CAMERA.rays())])
 @pytest.mark.parametrize("kind", ["z", "range"])
-def test_corrected_points_are_correct(camera, kind) -> None:
+@pytest.mark.parametrize("distortion", [0.0, -0.04])
+def test_corrected_points_are_correct(camera, kind, distortion) -> None:
     before = frame(camera, kind)
-    errors = CameraErrors(focal=0.1, offset_m=0.05, center_x=0.02, center_y=-0.03)
+    errors = CameraErrors(0.1, 0.05, 0.02, -0.03, distortion)
     after = errors.start().apply(before)
     assert isinstance(after, RangeFrame)
     np.testing.assert_array_equal(after.valid, before.valid)
     slopes = [f.points[:, :2] / f.points[:, 2:] for f in (before, after)]
-    true = 1.1 * slopes[0] + [0.02, -0.03]
+    scale = 1.1 + distortion * (slopes[0] ** 2).sum(1, keepdims=True)
+    true = scale * slopes[0] + [0.02, -0.03]
     np.testing.assert_allclose(slopes[1], true, rtol=1e-5, atol=1e-6)
     rays = np.concatenate([true, np.ones((len(true), 1))], axis=1)
     lengths = np.linalg.norm(rays, axis=1)
@@ -65,9 +67,15 @@ def test_lens_distortion_is_kept() -> None:
 
 def test_errors_are_composed() -> None:
     first = CameraErrors(0.1, 0.02, 0.01, focal_sigma=0.004, center_x_sigma=0.002)
-    second = CameraErrors(0.1, 0.01, 0.0, -0.02, focal_sigma=0.003, offset_sigma_m=0.005)
+    second = CameraErrors(0.1, 0.01, 0.0, -0.02, 0.0, focal_sigma=0.003, offset_sigma_m=0.005)
     both = first.and_then(second)
-    sigmas = {"focal": 0.003, "offset": 0.005, "center_x": 0.002, "center_y": 0.0}
+    sigmas = {
+        "focal": 0.003,
+        "offset": 0.005,
+        "center_x": 0.002,
+        "center_y": 0.0,
+        "distortion": 0.0,
+    }
     assert both.sigmas == sigmas
     assert both.focal == pytest.approx(0.21)
     assert both.offset_m == pytest.approx(0.03)
@@ -152,10 +160,12 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
         "offset_m": 0.0,
         "center_x": 0.0,
         "center_y": 0.0,
+        "distortion": 0.0,
         "focal_sigma": found.sigmas["focal"],
         "offset_sigma_m": 0.0,
         "center_x_sigma": 0.0,
         "center_y_sigma": 0.0,
+        "distortion_sigma": 0.0,
     }
     codes = {r.code for r in result.diagnostics.reasons}
     assert "self_calibrated" in codes

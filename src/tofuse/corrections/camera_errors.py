@@ -20,7 +20,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 @part("correction", "camera-errors")
 @dataclass(frozen=True)
 class CameraErrors(Bounded, Correction):
-    """Correct the focal length, the principal point and the range offset of a camera.
+    """Correct focal length, principal point, radial distortion and range offset of a camera.
 
     Attributes
     ----------
@@ -32,7 +32,9 @@ class CameraErrors(Bounded, Correction):
     center_x, center_y
         Added to the ray coordinates x / z and y / z: by so many true focal lengths the true
         principal point is further left and up.
-    focal_sigma, offset_sigma_m, center_x_sigma, center_y_sigma
+    distortion
+        Times the squared distance from the axis, a relative correction of the ray coordinates too.
+    focal_sigma, offset_sigma_m, center_x_sigma, center_y_sigma, distortion_sigma
         Standard deviations of these, which the stated accuracy of poses includes.
     """
 
@@ -40,10 +42,12 @@ class CameraErrors(Bounded, Correction):
     offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
     center_x: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     center_y: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    distortion: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     focal_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     offset_sigma_m: Annotated[float, Bounds(0, 1)] = 0.0
     center_x_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     center_y_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    distortion_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self) -> Corrector:
@@ -51,7 +55,7 @@ class CameraErrors(Bounded, Correction):
         return _Corrector(self)
 
     def and_then(self, other: CameraErrors) -> CameraErrors:
-        """Return the composition of this correction with `other`, applied after it.
+        """Return the composition of this correction with `other`, to first order.
 
         The standard deviations are those of the last estimate of each error.
         """
@@ -60,20 +64,23 @@ class CameraErrors(Bounded, Correction):
             self.offset_m + other.offset_m,
             self.center_x * (1 + other.focal) + other.center_x,
             self.center_y * (1 + other.focal) + other.center_y,
+            self.distortion + other.distortion,
             other.focal_sigma if other.focal else self.focal_sigma,
             other.offset_sigma_m if other.offset_m else self.offset_sigma_m,
             other.center_x_sigma if other.center_x else self.center_x_sigma,
             other.center_y_sigma if other.center_y else self.center_y_sigma,
+            other.distortion_sigma if other.distortion else self.distortion_sigma,
         )
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """The standard deviations of "focal", "offset", "center_x" and "center_y"."""
+        """The standard deviations of "focal", "offset", "center_x", "center_y", "distortion"."""
         return {
             "focal": self.focal_sigma,
             "offset": self.offset_sigma_m,
             "center_x": self.center_x_sigma,
             "center_y": self.center_y_sigma,
+            "distortion": self.distortion_sigma,
         }
 
     @classmethod
@@ -84,7 +91,11 @@ class CameraErrors(Bounded, Correction):
         """
         return tuple(
             cls(
-                item["focal"], item["offset_m"], item.get("center_x", 0), item.get("center_y", 0)
+                item["focal"],
+                item["offset_m"],
+                item.get("center_x", 0.0),
+                item.get("center_y", 0.0),
+                item.get("distortion", 0.0),
             ).start()
             for item in config.get("corrections", ())
             if item["part"] == "camera-errors"
@@ -92,12 +103,13 @@ class CameraErrors(Bounded, Correction):
 
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""
-        if isinstance(stated, Pinhole):
+        if isinstance(stated, Pinhole) and not self.distortion:
             fx, fy = stated.fx / (1 + self.focal), stated.fy / (1 + self.focal)
             cx, cy = stated.cx - self.center_x * fx, stated.cy - self.center_y * fy
             return replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
-        center = np.array([self.center_x, self.center_y], np.float32)
-        return RayTable(np.asarray(stated.rays() * np.float32(1 + self.focal) + center))
+        rays = np.asarray(stated.rays(), np.float64)
+        scale = 1 + self.focal + self.distortion * (rays**2).sum(-1, keepdims=True)
+        return RayTable((rays * scale + [self.center_x, self.center_y]).astype(np.float32))
 
 
 @dataclass(eq=False)
@@ -111,7 +123,7 @@ class _Corrector(Corrector):
         if not isinstance(frame, RangeFrame):
             return frame
         options = self.options
-        if options.focal or options.center_x or options.center_y:
+        if options.focal or options.center_x or options.center_y or options.distortion:
             cameras = self._cameras
             if cameras is None or cameras[0] != frame.camera:
                 cameras = self._cameras = (frame.camera, options.camera(frame.camera))

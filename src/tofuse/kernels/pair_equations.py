@@ -64,7 +64,8 @@ SCALE = 1  # relative, to be added to the depth
 FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
 CENTER_X = 3  # to be added to the ray coordinate x / z: principal point over focal length
 CENTER_Y = 4  # to be added to y / z
-ERRORS = 5
+DISTORTION = 5  # relative, times x^2 + y^2 of the ray coordinates, to be added to these
+ERRORS = 6
 
 EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
@@ -177,6 +178,9 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
         B[p, 2] = -shorter * z
     B[CENTER_X, 0] += z
     B[CENTER_Y, 1] += z
+    rho2 = side2 / max(z * z, _TINY)
+    for axis in range(3):
+        B[DISTORTION, axis] = rho2 * B[FOCAL, axis]
 
 
 @kernel
@@ -203,7 +207,6 @@ def _all_equations(
     A = np.zeros((UNKNOWNS, UNKNOWNS))
     g = np.zeros(UNKNOWNS)
     limit2 = robust * robust
-    wider = 1.0 + errors[FOCAL]
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
@@ -223,8 +226,10 @@ def _all_equations(
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
         # Project with the corrected intrinsics of the target.
-        xn = (x / z - errors[CENTER_X]) / wider
-        yn = (y / z - errors[CENTER_Y]) / wider
+        xn, yn = x / z - errors[CENTER_X], y / z - errors[CENTER_Y]
+        rho2 = xn * xn + yn * yn
+        wider = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
+        xn, yn = xn / wider, yn / wider
         u, v, iu, _ = project_ray(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
@@ -321,6 +326,8 @@ def _all_equations(
             J[7 + CENTER_X] -= d0 * z
         if asked > CENTER_Y and not known[CENTER_Y]:
             J[7 + CENTER_Y] -= d1 * z
+        if asked > DISTORTION and not known[DISTORTION]:
+            J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
         _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
@@ -460,13 +467,14 @@ def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
     for k in range(LANES):
         side2 = x[k] * x[k] + y[k] * y[k]
         r2 = max(side2 + z[k] * z[k], _TINY)  # columns without a point may be 0
+        widening = errors[FOCAL] + errors[DISTORTION] * side2 / max(z[k] * z[k], _TINY)
         shorter = 0.0
         if radial:
             shift = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
-            shorter = (errors[FOCAL] * side2 + shift * z[k]) / r2
+            shorter = (widening * side2 + shift * z[k]) / r2
         along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shorter
-        x[k] = x[k] * (along + errors[FOCAL]) + errors[CENTER_X] * z[k]
-        y[k] = y[k] * (along + errors[FOCAL]) + errors[CENTER_Y] * z[k]
+        x[k] = x[k] * (along + widening) + errors[CENTER_X] * z[k]
+        y[k] = y[k] * (along + widening) + errors[CENTER_Y] * z[k]
         z[k] *= along
 
 
@@ -484,14 +492,14 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
             continue
         side2 = xn[k] * xn[k] + yn[k] * yn[k]
         r2 = side2 + 1
+        widening = errors[FOCAL] + errors[DISTORTION] * side2
         shorter = 0.0
         if radial:
             shift = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
-            shorter = (errors[FOCAL] * side2 + shift) / r2
+            shorter = (widening * side2 + shift) / r2
         along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shorter
-        wider = 1 + errors[FOCAL]
-        xn[k] = (xn[k] - errors[CENTER_X]) / wider
-        yn[k] = (yn[k] - errors[CENTER_Y]) / wider
+        xn[k] = (xn[k] - errors[CENTER_X]) / (1 + widening)
+        yn[k] = (yn[k] - errors[CENTER_Y]) / (1 + widening)
         z[k] *= along
 
 

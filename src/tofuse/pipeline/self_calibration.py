@@ -33,12 +33,14 @@ _FIELDS = {
     "offset": "offset_m",
     "center_x": "center_x",
     "center_y": "center_y",
+    "distortion": "distortion",
 }
 _SIGMAS = {
     "focal": "focal_sigma",
     "offset": "offset_sigma_m",
     "center_x": "center_x_sigma",
     "center_y": "center_y_sigma",
+    "distortion": "distortion_sigma",
 }
 
 Reconstruct = Callable[[Config], Reconstruction]
@@ -79,6 +81,7 @@ def self_calibrated(
             correction.offset_m,
             correction.center_x,
             correction.center_y,
+            correction.distortion,
             {_FIELDS[check.best]: check.sigmas[check.best]},
             (_bound(initial), _bound(candidate)),
         )

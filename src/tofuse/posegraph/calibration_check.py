@@ -1,7 +1,7 @@
 """Self-calibration check: whether all views together indicate an error of the camera.
 
-A wrong focal length or principal point or a depth offset bends the trajectory, and no single
-registration reveals it.
+A wrong focal length or principal point, neglected lens distortion or a depth offset bends the
+trajectory, and no single registration reveals it.
 But where views overlap, and above all where a path closes a loop, their residuals can't all be
 small. So each error is estimated separately, with all poses free. An error that makes the views
 more consistent is a proposal. It is an alarm if it exceeds the calibration error of usual
@@ -38,8 +38,14 @@ from tofuse.posegraph.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
-TOLERANCES = {"focal": 0.01, "offset": 0.01, "center_x": 0.01, "center_y": 0.01}
-# Errors that the drift over a loop can reveal: that of a wrong principal point resembles any drift.
+TOLERANCES = {
+    "focal": 0.01,
+    "offset": 0.01,
+    "center_x": 0.01,
+    "center_y": 0.01,
+    "distortion": 0.01,
+}
+# Errors that the drift over a loop can reveal; that by the others resembles any drift.
 _REVEALED_BY_LOOP = ("focal", "offset")
 # Significance of an error in standard deviations, for an alarm and for a full estimate; and the
 # fraction of the tolerance that one Newton step must reach for the latter.
@@ -64,6 +70,7 @@ _INDEX = {
     "offset": kernels.OFFSET,
     "center_x": kernels.CENTER_X,
     "center_y": kernels.CENTER_Y,
+    "distortion": kernels.DISTORTION,
 }
 # The solution may be far from the initial poses.
 _ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
@@ -564,4 +571,7 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
             words.append(
                 f"a principal point {abs(errors[name]):.1%} of the focal length further {where}"
             )
+    if "distortion" in errors:
+        kind = "barrel" if errors["distortion"] > 0 else "pincushion"
+        words.append(f"{abs(errors['distortion']):.1%} more {kind} distortion at 45 degrees")
     return words

@@ -142,8 +142,8 @@ def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
         return None
     bounds = (data["stated_bound_m"], data["corrected_bound_m"])
     before, after = (np.inf if b is None else float(b) for b in bounds)
-    center = data.get("center_x", 0.0), data.get("center_y", 0.0)
-    return SelfCalibration(data["focal"], data["offset_m"], *center, data["sigma"], (before, after))
+    lens = (data.get(name, 0.0) for name in ("center_x", "center_y", "distortion"))
+    return SelfCalibration(data["focal"], data["offset_m"], *lens, data["sigma"], (before, after))
 
 
 def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:

@@ -265,6 +265,7 @@ def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
         "offset_m": calibration.offset_m,
         "center_x": calibration.center_x,
         "center_y": calibration.center_y,
+        "distortion": calibration.distortion,
         "sigma": dict(calibration.sigmas),
         "stated_bound_m": calibration.bound_m[0],
         "corrected_bound_m": calibration.bound_m[1],

@@ -100,6 +100,8 @@ class SelfCalibration:
         Added to all ranges, m.
     center_x, center_y
         Added to the ray coordinates x / z and y / z.
+    distortion
+        Radial distortion, as in `CameraErrors`.
     sigmas
         Standard deviations of the corrected ones, from the scatter between views.
     bound_m
@@ -111,6 +113,7 @@ class SelfCalibration:
     offset_m: float
     center_x: float
     center_y: float
+    distortion: float
     sigmas: Mapping[str, float]
     bound_m: tuple[float, float]
 
