@@ -166,12 +166,12 @@ def at_true_poses(recording: Recording) -> Mesh:
     config = adapted(from_method("default"), recording)
     preparation, views = Preparation(config), []
     for frame, T in zip(recording, recording.reference, strict=True):
-        ready = preparation.process(frame, T, None, None)
-        preparation.add_pose(ready.filtered, T)
-        assert isinstance(ready.filtered, RangeFrame)
-        assert isinstance(ready.clean, RangeFrame)
-        surface = prepare_view(ready.filtered, SurfaceOptions())
-        views.append(RangeView.of(ready.clean, surface))
+        filtered = preparation.process(frame, T, None, None)
+        preparation.add_pose(filtered.for_tracking, T)
+        assert isinstance(filtered.for_tracking, RangeFrame)
+        assert isinstance(filtered.for_model, RangeFrame)
+        surface = prepare_view(filtered.for_tracking, SurfaceOptions())
+        views.append(RangeView.of(filtered.for_model, surface))
     return fuse_surface(views, recording.reference, config.fusion)
 
 

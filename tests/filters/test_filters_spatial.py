@@ -287,7 +287,7 @@ def test_no_filter_adds_or_moves_points(seed: int, size: tuple[int, int]) -> Non
         assert item.mask(f, history).shape == f.valid.shape
         assert not (left.valid & ~f.valid).any()
         assert np.array_equal(left.depth[left.valid], f.depth[left.valid])
-        assert removal.seen == len(f)
+        assert removal.received == len(f)
         assert removal.removed == len(f) - len(left)
         if "cloud" in item.takes:
             assert len(apply_filters([item], cloud)[0]) <= len(cloud)

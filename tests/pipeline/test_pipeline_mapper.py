@@ -156,7 +156,7 @@ def test_preparation_out_of_order_gives_same_result(
     case = frames[:5] if amplitude else [replace(f, amplitude_image=None) for f in frames[:5]]
     plain, early = Mapper(config, threads=1), Mapper(config, threads=2)
     prepared = [early.prepare(f) for f in reversed(case)][::-1]
-    assert {(p.corrected, p.ready is not None) for p in prepared} == {(corrected, ready)}
+    assert {(p.corrected, p.filtered is not None) for p in prepared} == {(corrected, ready)}
     for frame, p in zip(case, prepared, strict=True):
         np.testing.assert_array_equal(plain.push(frame), early.push(frame, prepared=p))
     a, b = plain.finish(), early.finish()

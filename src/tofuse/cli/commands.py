@@ -242,7 +242,7 @@ def register(arguments: argparse.Namespace) -> int:
         return exit_status(result)
     console = make_console()
     head, tail = decision(result)
-    color = _STATUS_COLORS[result.found.believed]
+    color = _STATUS_COLORS[result.registration.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
     for line in registering.text(result):
         console.print(line, markup=False)

@@ -85,13 +85,13 @@ class Correction(Protocol):
         return False
 
     def after_trial(
-        self, helps: bool, strength: float = float("nan"), error: float = float("inf")
+        self, improves: bool, strength: float = float("nan"), error: float = float("inf")
     ) -> Correction:
         """Return the correction with the outcome of a trial.
 
         Parameters
         ----------
-        helps
+        improves
             Whether it is to be used.
         strength, error
             Fraction of the predicted error that is present, and its standard error; NaN and

@@ -85,7 +85,7 @@ class Multipath(Bounded, Correction):
         return not self.applied
 
     def after_trial(
-        self, helps: bool, strength: float = float("nan"), error: float = float("inf")
+        self, improves: bool, strength: float = float("nan"), error: float = float("inf")
     ) -> Multipath:
         """See `Correction.after_trial`.
 
@@ -94,13 +94,15 @@ class Multipath(Bounded, Correction):
         is added to `relative_sigma`.
         """
         if not np.isfinite([strength, error]).all():
-            return replace(self, trial=False, applied=helps)
+            return replace(self, trial=False, applied=improves)
         relative_sigma = (
-            float(np.hypot(self.relative_sigma, error / strength)) if helps else self.relative_sigma
+            float(np.hypot(self.relative_sigma, error / strength))
+            if improves
+            else self.relative_sigma
         )
         outcome = (float(strength), float(error))
         return replace(
-            self, trial=False, applied=helps, strength=outcome, relative_sigma=relative_sigma
+            self, trial=False, applied=improves, strength=outcome, relative_sigma=relative_sigma
         )
 
     def start(self, model: MultipathModel | None = None) -> MultipathCorrector:

@@ -85,10 +85,10 @@ class Interval(Bounded):
 
 @dataclass(frozen=True)
 class Removal:
-    """Statistics of one filter on one frame: it removed `removed` of `seen` points."""
+    """Statistics of one filter on one frame: it removed `removed` of `received` points."""
 
     name: str
-    seen: int
+    received: int
     removed: int
 
 

@@ -162,7 +162,7 @@ def _after_trial(
         if tested.disabled:
             progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")
     else:
-        tested = item.after_trial(helps=True)
+        tested = item.after_trial(improves=True)
     corrections = tuple(tested if c is item else c for c in config.corrections)
     return replace(config, corrections=corrections)
 

@@ -20,7 +20,7 @@ from tofuse.pipeline.frame_log import FrameLog, record_of
 from tofuse.pipeline.intake import Intake
 from tofuse.pipeline.live_poses import LivePoses
 from tofuse.pipeline.observations import Observations
-from tofuse.pipeline.preparation import Preparation, Prepared, Ready
+from tofuse.pipeline.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
@@ -122,26 +122,26 @@ class Mapper:
         if repeated:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
-        busy = prepared is not None and prepared.ready is not None
+        busy = prepared is not None and prepared.filtered is not None
         with threads(self.threads), serial_chunks(busy):
-            ready = self._prepare(frame, history, prepared)
-            step = self._track(ready, T_odometry, repeated)
-            self._store(ready, step, T_odometry, gravity)
+            filtered = self._prepare(frame, history, prepared)
+            step = self._track(filtered, T_odometry, repeated)
+            self._store(filtered, step, T_odometry, gravity)
             self._close_loops(step)
-            return self._report(ready, step)
+            return self._report(filtered, step)
 
     def _prepare(
         self, frame: Frame, history: Sequence[Frame] | None, prepared: Prepared | None
-    ) -> Ready:
+    ) -> FilteredFrame:
         with self.watch.timing("filters"):
             T_expected = None
             if self._log.entries and self._log.entries[-1].has_pose:
                 T_expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
             return self._preparation.process(frame, T_expected, history, prepared)
 
-    def _track(self, ready: Ready, T_odometry: Float64 | None, repeated: bool) -> Step:
+    def _track(self, filtered: FilteredFrame, T_odometry: Float64 | None, repeated: bool) -> Step:
         with self.watch.timing("tracking"):
-            step = self._tracker.push(ready.filtered, T_odometry, ready.surface)
+            step = self._tracker.push(filtered.for_tracking, T_odometry, filtered.surface)
         if repeated and step.status == "tracked":
             reason = f"the same image as frame {self._log.entries[-1].record.index}"
             step = replace(step, status="predicted", reason=reason)
@@ -149,25 +149,29 @@ class Mapper:
             self._component = step.component
             self._preparation.begin_component()
         if step.status == "tracked" and step.T_component_camera is not None:
-            self._preparation.add_pose(ready.filtered, step.T_component_camera)
+            self._preparation.add_pose(filtered.for_tracking, step.T_component_camera)
         return step
 
     def _store(
-        self, ready: Ready, step: Step, T_odometry: Float64 | None, gravity: Float64 | None
+        self,
+        filtered: FilteredFrame,
+        step: Step,
+        T_odometry: Float64 | None,
+        gravity: Float64 | None,
     ) -> None:
-        frame = ready.frame
+        frame = filtered.corrected
         self._log.add(record_of(frame, step), step, T_odometry, gravity)
         lost = step.T_component_camera is None
         if step.moving is not None:
-            ready = replace(ready, clean=ready.clean.keep(~step.moving))
+            filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))
         if not lost:
             with self.watch.timing("loops"):
-                self._observations.add(ready, step)
+                self._observations.add(filtered, step)
             with self.watch.timing("fusion"):
                 self._queue.submit(
-                    lambda: self._observations.add_to_model(frame, ready.clean, step)
+                    lambda: self._observations.add_to_model(frame, filtered.for_model, step)
                 )
-        self._queue.submit(lambda: self._observations.sample(ready, lost=lost))
+        self._queue.submit(lambda: self._observations.sample(filtered, lost=lost))
 
     def _close_loops(self, step: Step) -> None:
         """Correct the current component by loops whose search started some frames ago."""
@@ -177,11 +181,11 @@ class Mapper:
                 graph = self._assembly().graph(self._log, step.component, loops)
                 self._live_poses.apply_loops(graph, self.config.optimiser.optimise(graph).graph)
 
-    def _report(self, ready: Ready, step: Step) -> Float64 | None:
+    def _report(self, filtered: FilteredFrame, step: Step) -> Float64 | None:
         self._progress.advance(self._log.entries[-1].record)
         T_world_camera = self._live_poses.pose(step)
         if T_world_camera is not None:
-            self._progress.placed(ready.clean, T_world_camera)
+            self._progress.placed(filtered.for_model, T_world_camera)
         return T_world_camera
 
     def prepare(self, frame: Frame) -> Prepared | None:

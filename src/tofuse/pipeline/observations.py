@@ -15,7 +15,7 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.odometry.base import Step
 from tofuse.pipeline.budget import checked_bytes, views_bytes
 from tofuse.pipeline.config import Config
-from tofuse.pipeline.preparation import Ready
+from tofuse.pipeline.preparation import FilteredFrame
 from tofuse.pipeline.stage_results import BackEndInput
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import Spacing, Spilled, ViewStore
@@ -61,20 +61,20 @@ class Observations:
         self._ambiguity_m: float | None = None
         self._has_covariances = False
 
-    def add(self, ready: Ready, step: Step) -> None:
+    def add(self, filtered: FilteredFrame, step: Step) -> None:
         """Store the data of a frame with a pose for joining, loops and refinement."""
         T, surface = step.T_component_camera, step.surface
         assert T is not None
-        if isinstance(ready.frame, RangeFrame):
-            self._ambiguity_m = ready.frame.ambiguity_m
+        if isinstance(filtered.corrected, RangeFrame):
+            self._ambiguity_m = filtered.corrected.ambiguity_m
         if surface is not None:
             # Covariances of trackers with prepared views are realistic; those of ICP are too small.
             self._has_covariances = True
             self.views.push(surface, T, step.component, _reduced)
-        view: Frame = ready.clean
+        view: Frame = filtered.for_model
         # Methods on prepared views need no points, which take long to compute.
         if surface is None or self.loops.points or self._refiner.points:
-            view = as_cloud(ready.clean, _MAX_POINTS)
+            view = as_cloud(filtered.for_model, _MAX_POINTS)
         self.loops.push(view, T)
         self._refiner.push(view, T)
 
@@ -89,15 +89,15 @@ class Observations:
         if self._places.keeps(depth, step.T_component_camera, step.component):
             self._model.add(clean, step.surface, _MAX_POINTS)
 
-    def sample(self, ready: Ready, *, lost: bool) -> None:
+    def sample(self, filtered: FilteredFrame, *, lost: bool) -> None:
         """Store small images of some frames for the report."""
-        frame, filtered, clean = ready.frame, ready.filtered, ready.clean
+        frame, tracked, modelled = filtered.corrected, filtered.for_tracking, filtered.for_model
         if (
             isinstance(frame, RangeFrame)
-            and isinstance(filtered, RangeFrame)
-            and isinstance(clean, RangeFrame)
+            and isinstance(tracked, RangeFrame)
+            and isinstance(modelled, RangeFrame)
         ):
-            self.samples.take(lost=lost, make=partial(FrameSample.of, frame, filtered, clean))
+            self.samples.take(lost=lost, make=partial(FrameSample.of, frame, tracked, modelled))
 
     def for_back_end(self) -> BackEndInput:
         """Return the input of the back end."""

@@ -82,7 +82,7 @@ def register_files(
 
 def exit_status(result: PairResult) -> int:
     """Return 0 if the pose is accepted, 3 if not or if it can't be verified."""
-    return 0 if result.found.believed else 3
+    return 0 if result.registration.believed else 3
 
 
 def _registered(

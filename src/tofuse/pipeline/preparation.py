@@ -16,12 +16,12 @@ from tofuse.registration.prepared_view import PreparedView
 
 
 @dataclass(frozen=True, eq=False)
-class Ready:
+class FilteredFrame:
     """A frame as corrected, as filtered for tracking, and as filtered for the model.
 
     Attributes
     ----------
-    frame, filtered, clean
+    corrected, for_tracking, for_model
         Corrected; filtered for tracking; filtered for the model.
     removals
         Number of points that each filter removed.
@@ -29,9 +29,9 @@ class Ready:
         The filtered view prepared for tracking, if that was done in advance.
     """
 
-    frame: Frame
-    filtered: Frame
-    clean: Frame
+    corrected: Frame
+    for_tracking: Frame
+    for_model: Frame
     removals: tuple[Removal, ...]
     surface: PreparedView | None = None
 
@@ -46,13 +46,13 @@ class Prepared:
         The frame after the first `corrected` corrections, up to one that depends on other frames.
     corrected
         Number of corrections that were applied.
-    ready
-        The prepared frame, if no step depends on other frames.
+    filtered
+        The filtered frame, if no step depends on other frames.
     """
 
     frame: Frame
     corrected: int
-    ready: Ready | None
+    filtered: FilteredFrame | None
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Counts:
 
     def add(self, removal: Removal) -> None:
         """Count the points that a filter removed from a frame."""
-        self.received[removal.name] = self.received.get(removal.name, 0) + removal.seen
+        self.received[removal.name] = self.received.get(removal.name, 0) + removal.received
         self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
     @property
@@ -115,8 +115,9 @@ class Preparation:
             frame, corrected = corrector.apply(frame), corrected + 1
         if self._config.window > 1:
             return Prepared(frame, corrected, None)
-        ready = self._filtered(frame, ())
-        return Prepared(frame, corrected, replace(ready, surface=tracker.prepare(ready.filtered)))
+        filtered = self._filtered(frame, ())
+        surface = tracker.prepare(filtered.for_tracking)
+        return Prepared(frame, corrected, replace(filtered, surface=surface))
 
     def process(
         self,
@@ -124,7 +125,7 @@ class Preparation:
         T_expected: Float64 | None,
         history: Sequence[Frame] | None,
         prepared: Prepared | None,
-    ) -> Ready:
+    ) -> FilteredFrame:
         """Correct and filter the next frame.
 
         Parameters
@@ -140,13 +141,13 @@ class Preparation:
         """
         past = tuple(self._corrected(f) for f in (self._history if history is None else history))
         frame = self._corrected(frame, T_expected, prepared)
-        ready = prepared.ready if prepared is not None else None
-        if ready is None:
-            ready = self._filtered(frame, past)
+        filtered = prepared.filtered if prepared is not None else None
+        if filtered is None:
+            filtered = self._filtered(frame, past)
         self._history.append(frame)
-        for removal in ready.removals:
+        for removal in filtered.removals:
             self.counts.add(removal)
-        return ready
+        return filtered
 
     def add_pose(self, frame: Frame, T_component_camera: Float64) -> None:
         """Pass the pose (4, 4) of a frame in the current component to the corrections."""
@@ -172,7 +173,7 @@ class Preparation:
             frame = corrector.apply(frame, T_expected)
         return frame
 
-    def _filtered(self, frame: Frame, past: Sequence[Frame]) -> Ready:
+    def _filtered(self, frame: Frame, past: Sequence[Frame]) -> FilteredFrame:
         filtered, removals = apply_filters(self._config.filters, frame, past)
         clean, more = apply_filters(self._config.model_filters, filtered, past)
-        return Ready(frame, filtered, clean, (*removals, *more))
+        return FilteredFrame(frame, filtered, clean, (*removals, *more))

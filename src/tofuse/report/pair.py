@@ -50,7 +50,7 @@ def render_pair(result: PairResult) -> str:
         version=__version__,
         style=asset("style.css"),
         script=script(),
-        tone=_TONES[result.found.believed],
+        tone=_TONES[result.registration.believed],
         head=head,
         tail=tail,
         facts=_facts(result, scene),
@@ -77,7 +77,7 @@ def render_pair(result: PairResult) -> str:
 
 
 def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
-    registration = result.found
+    registration = result.registration
     name = "Displacement of the centre" if result.source.center.any() else "Translation"
     facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
     facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))

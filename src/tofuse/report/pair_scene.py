@@ -75,14 +75,14 @@ class PairScene:
 
 def pair_scene(result: PairResult) -> PairScene:
     """Subsample both views and compute the distances between them."""
-    T = result.found.T_target_source
+    T = result.registration.T_target_source
     source, target = _search_points(result.source.frame), _search_points(result.target.frame)
     target_points = target.points.astype(float)
     source_points = se3.transform(T, source.points.astype(float))
     a = _sampled_view(source, source_points, target_points, len(result.source.frame))
     b = _sampled_view(target, target_points, source_points, len(result.target.frame))
     all_distances = np.concatenate([a.distance, b.distance])
-    max_distance = _MAX_RMS * result.found.rms_m
+    max_distance = _MAX_RMS * result.registration.rms_m
     matched = (
         all_distances[all_distances <= max_distance]
         if (all_distances <= max_distance).any()
@@ -108,7 +108,7 @@ def pair_scene(result: PairResult) -> PairScene:
     identity = np.eye(4)
     target_scene = scene(b, identity, _uniform(TARGET, len(b.points)))
     layers = {
-        "before": (scene(a, result.start, _uniform(SOURCE, len(a.points))), target_scene),
+        "before": (scene(a, result.T_start, _uniform(SOURCE, len(a.points))), target_scene),
         "after": (scene(a, T, _uniform(SOURCE, len(a.points))), target_scene),
         "distance": (
             scene(a, T, distance_colors(a.distance, cap)),

@@ -15,7 +15,7 @@ _SMALL_RAD = 1e-6
 
 def decision(result: PairResult) -> tuple[str, str]:
     """Return whether the pose is accepted, and the remainder of the sentence."""
-    registration = result.found
+    registration = result.registration
     probability = (
         ""
         if registration.probability is None
@@ -64,7 +64,7 @@ def matrix(result: PairResult) -> list[str]:
 
 def overlap(result: PairResult) -> str:
     """Return overlap, support and contradiction as text, as far as the method provides them."""
-    registration = result.found
+    registration = result.registration
     parts = []
     if registration.overlap is not None:
         parts.append(f"{percent(registration.overlap)} of the points overlap")
@@ -79,7 +79,7 @@ def overlap(result: PairResult) -> str:
 
 def rms(result: PairResult) -> str:
     """Return the rms distance of corresponding points as text."""
-    value = result.found.rms_m
+    value = result.registration.rms_m
     return f"{1000 * value:.2f} mm" if np.isfinite(value) else "unknown"
 
 
@@ -97,7 +97,7 @@ def sigma(result: PairResult) -> str:
 def sigma_note(result: PairResult) -> str:
     """Return an explanation of `sigma`."""
     note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
-    if result.found.believed is None:
+    if result.registration.believed is None:
         note += "; from point noise only, usually too small"
     return note
 
@@ -117,13 +117,13 @@ def runner_up(result: PairResult) -> str:
     """Return the distance and the margin of the best rival pose as text; empty without one."""
     parts = []
     distance = result.runner_up_distance
-    if distance is None and result.found.margin is not None:
+    if distance is None and result.registration.margin is not None:
         return "no other pose fits"
     if distance is not None:
         metres, angle = distance
         parts.append(f"{metres:.3f} m and {np.degrees(angle):.1f}\N{DEGREE SIGN} away")
-    if result.found.margin is not None:
-        margin = result.found.margin
+    if result.registration.margin is not None:
+        margin = result.registration.margin
         parts.append(
             f"fits {percent(abs(margin))} {'more' if margin < 0 else 'fewer'} of the points"
         )

@@ -57,9 +57,9 @@ class PairResult:
     ----------
     source, target
         The views.
-    found
+    registration
         The registration of the local frames.
-    start
+    T_start
         (4, 4) initial guess T_target_source of the local frames.
     guess
         The file of the initial guess, or None.
@@ -69,8 +69,8 @@ class PairResult:
 
     source: LocalView
     target: LocalView
-    found: Registration
-    start: Float64
+    registration: Registration
+    T_start: Float64
     guess: str | None = None
     seconds: float = 0.0
 
@@ -83,7 +83,7 @@ class PairResult:
     @property
     def T_target_source(self) -> Float64:
         """(4, 4), maps coordinates of the source's file to those of the target's."""
-        return self.in_files(self.found.T_target_source)
+        return self.in_files(self.registration.T_target_source)
 
     @property
     def moved_m(self) -> Float64:
@@ -95,16 +95,16 @@ class PairResult:
     @property
     def runner_up(self) -> Float64 | None:
         """(4, 4) T_target_source of the best rival pose; None where there is none."""
-        T_rival = self.found.runner_up
+        T_rival = self.registration.runner_up
         return None if T_rival is None else self.in_files(T_rival)
 
     @property
     def runner_up_distance(self) -> tuple[float, float] | None:
         """Distance of the runner-up at the source's median point (m), and its angle (rad)."""
-        T_rival = self.found.runner_up
+        T_rival = self.registration.runner_up
         if T_rival is None:
             return None
-        T = self.found.T_target_source
+        T = self.registration.T_target_source
         center = np.median(self.source.frame.points.astype(float), axis=0)[None]
         displacement = se3.transform(T_rival, center) - se3.transform(T, center)
         return float(np.linalg.norm(displacement)), float(se3.angle(se3.inverse(T) @ T_rival))
@@ -118,7 +118,7 @@ class PairResult:
     @cached_property
     def covariance(self) -> Float64 | None:
         """(6, 6) of the right perturbation at the source's `center`; None if unbounded."""
-        if len(self.found.unobservable):
+        if len(self.registration.unobservable):
             return None
         return self._observed_covariance
 
@@ -144,12 +144,12 @@ class PairResult:
     def _observed_covariance(self) -> Float64 | None:
         """(6, 6), without the unobservable directions; None where the information is unusable."""
         units = np.array([1, 1, 1, *[self.lever_m] * 3])
-        information = np.asarray(self.found.information, float)
+        information = np.asarray(self.registration.information, float)
         if information.shape != (6, 6) or not np.isfinite(information).all():
             return None
         basis = np.eye(6)
-        if len(self.found.unobservable):
-            _, s, vt = np.linalg.svd(self.found.unobservable * units)
+        if len(self.registration.unobservable):
+            _, s, vt = np.linalg.svd(self.registration.unobservable * units)
             basis = vt[int((s > 1e-9 * s[0]).sum()) :].T
         if basis.shape[1] == 0:
             return None
@@ -163,7 +163,7 @@ class PairResult:
     @cached_property
     def free_motions(self) -> tuple[Float64, Float64]:
         """Unobservable directions: axes (a, 3) of translations, and axes (b, 3) of rotations."""
-        directions = np.asarray(self.found.unobservable, float).reshape(-1, 6)
+        directions = np.asarray(self.registration.unobservable, float).reshape(-1, 6)
         if not len(directions):
             return np.zeros((0, 3)), np.zeros((0, 3))
         # An orthonormal basis in metres, with as many pure translations as possible.
@@ -179,7 +179,7 @@ class PairResult:
     def aligned(self) -> Float64:
         """(N, 3) points of the source in the coordinates of the target's file, m."""
         points = se3.transform(
-            self.found.T_target_source, self.source.frame.points.astype(np.float64)
+            self.registration.T_target_source, self.source.frame.points.astype(np.float64)
         )
         return points + self.target.center
 
@@ -195,7 +195,7 @@ def _unit(vectors: Float64) -> Float64:
 
 def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null where unknown."""
-    registration = result.found
+    registration = result.registration
     sigma_m, sigma_rad = result.sigma
     covariance = result.covariance
     data: dict[str, Any] = plain(
@@ -290,7 +290,7 @@ def write_aligned(result: PairResult, path: Path) -> None:
     points = result.aligned()
     normals = frame.normals
     if normals is not None:
-        normals = (normals @ result.found.T_target_source[:3, :3].T).astype(np.float32)
+        normals = (normals @ result.registration.T_target_source[:3, :3].T).astype(np.float32)
     write_ply(
         path,
         GeometryRecord(
