@@ -30,7 +30,7 @@ def check_still(sample: Sample) -> Iterator[Finding]:
     """Check whether the camera moves at all."""
     if sample.turning or len(sample.views) < _MIN_FRAMES or not sample.pairs:
         return
-    if _stands_still(sample):
+    if _is_static(sample):
         yield Finding(
             "static",
             f"The camera does not move in the {len(sample.views)} sampled frames: the model will "
@@ -41,7 +41,7 @@ def check_still(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def _stands_still(sample: Sample) -> bool:
+def _is_static(sample: Sample) -> bool:
     """Whether neither neighbouring nor distant frames show motion."""
     if not sample.pairs or not all(_still(p) for p in sample.pairs):
         return False

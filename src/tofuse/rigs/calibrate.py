@@ -17,7 +17,7 @@ from tofuse.recordings.rig import Disagreement, Rig, RigCamera
 from tofuse.rigs.check import CameraMotion, compare_in_scene
 from tofuse.rigs.inputs import Camera, open_cameras
 from tofuse.rigs.moving_rig import MovingRig, calibrate_moving
-from tofuse.rigs.static_rig import StillRig, calibrate_still, stands_still
+from tofuse.rigs.static_rig import StaticRig, calibrate_static, is_static
 
 Motion = Literal["auto", "still", "moving"]
 
@@ -84,7 +84,7 @@ def calibrate_cameras(
     progress = progress or Silent()
     progress.stage("opening")
     if not moves(cameras, motion):
-        return _from_static(cameras, paths, calibrate_still(cameras, progress))
+        return _from_static(cameras, paths, calibrate_static(cameras, progress))
     return _from_moving(cameras, paths, calibrate_moving(cameras, progress))
 
 
@@ -143,20 +143,20 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
     """
     if motion != "auto":
         return motion == "moving"
-    still = [stands_still(camera) for camera in cameras]
-    if any(still) and not all(still):
-        names = [c.name for c, s in zip(cameras, still, strict=True) if s]
+    static = [is_static(camera) for camera in cameras]
+    if any(static) and not all(static):
+        names = [c.name for c, s in zip(cameras, static, strict=True) if s]
         raise InputError(
             f"{' and '.join(names)} stood still while other cameras moved",
             where="the rig",
             remedy="pass recordings of cameras that are fixed to each other, or set the motion "
             "with --motion still or --motion moving",
         )
-    return not all(still)
+    return not all(static)
 
 
 def _from_static(
-    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: StillRig
+    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: StaticRig
 ) -> Calibration:
     names = [camera.name for camera in cameras]
     refined = estimate.refined

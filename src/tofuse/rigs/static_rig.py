@@ -18,7 +18,7 @@ from tofuse.geometry import se3
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.view_store import SampledView
-from tofuse.recordings.background import FarSurface, far_surface
+from tofuse.recordings.background import BackgroundSurface, background_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.still import average_of, change_between
@@ -30,7 +30,7 @@ from tofuse.rigs.placing import Placement, place
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
 # sampled frames.
-_SAMPLED_FRAMES, _STILL_PIXELS, _STILL_FRAMES = 12, 0.5, 0.75
+_SAMPLED_FRAMES, _STATIC_PIXELS, _STATIC_FRAMES = 12, 0.5, 0.75
 # Maximum number of instants of a dynamic scene, and of averaged images of a static one.
 _MAX_INSTANTS, _MAX_AVERAGED = 60, 48
 # Maximum and minimum number of points of a view, and target number over all instants.
@@ -48,7 +48,7 @@ _MIN_INSTANTS, _SIGNIFICANCE = 5, 0.001
 
 
 @dataclass(frozen=True, eq=False)
-class StillRig:
+class StaticRig:
     """The calibration of static cameras.
 
     Attributes
@@ -75,29 +75,29 @@ class StillRig:
     notes: tuple[str, ...]
 
 
-def stands_still(camera: Camera) -> bool:
+def is_static(camera: Camera) -> bool:
     """Whether a camera does not move: most pixels measure the same surface repeatedly."""
     frames = camera.images(_SAMPLED_FRAMES)
     if len(frames) < 3:
         model = noise_model_for(camera.recording)
         return len(frames) < 2 or change_between(frames[0], frames[1], model).still
-    return bool(_static_fraction(frames) >= _STILL_PIXELS)
+    return bool(_static_fraction(frames) >= _STATIC_PIXELS)
 
 
 def _static_fraction(frames: Sequence[RangeFrame]) -> float:
     """Return the fraction of pixels that measure the same surface in most of the frames."""
-    background: FarSurface = far_surface(frames)
+    background: BackgroundSurface = background_surface(frames)
     has_background = np.isfinite(background.z) & (background.z > 0)
     valid = np.mean([f.valid for f in frames], axis=0) > 0.5
     observed = valid | has_background
     return (
-        float((background.static_fraction[observed] >= _STILL_FRAMES).mean())
+        float((background.static_fraction[observed] >= _STATIC_FRAMES).mean())
         if observed.any()
         else 1.0
     )
 
 
-def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
+def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig:
     """Place and refine static cameras relative to each other."""
     notes: list[str] = []
     progress.stage("instants")
@@ -119,7 +119,7 @@ def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
             instants = [_views_at(c, o, times) for c, o in zip(cameras, offsets, strict=True)]
             refined = refine_together(_views(instants, order), refined.poses)
         refined = _with_clock_uncertainty(cameras, order, refined, offsets, instants)
-    return StillRig(placement, refined, order, offsets, count, tuple(notes))
+    return StaticRig(placement, refined, order, offsets, count, tuple(notes))
 
 
 def _with_clock_uncertainty(
