@@ -30,7 +30,7 @@ from tofuse.kernels.threads import threads
 from tofuse.pipeline.evaluating import evaluate
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.readers.native import NativeSource
-from tofuse.recordings.recording import ArraySource, Recording, evenly
+from tofuse.recordings.recording import ArraySource, Recording, evenly_spaced
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 
@@ -283,10 +283,10 @@ def test_invalid_input_is_rejected() -> None:
 
 
 def test_frames_are_sampled_evenly() -> None:
-    assert evenly(np.arange(10), 100).tolist() == list(range(10))
-    assert evenly(np.arange(101), 5).tolist() == [0, 25, 50, 75, 100]
-    assert evenly(np.array([3, 8, 9]), 2).tolist() == [3, 9]
-    assert evenly(np.arange(0), 5).tolist() == []
+    assert evenly_spaced(np.arange(10), 100).tolist() == list(range(10))
+    assert evenly_spaced(np.arange(101), 5).tolist() == [0, 25, 50, 75, 100]
+    assert evenly_spaced(np.array([3, 8, 9]), 2).tolist() == [3, 9]
+    assert evenly_spaced(np.arange(0), 5).tolist() == []
 
 
 def test_poses_are_assigned_to_nearest_frame() -> None:

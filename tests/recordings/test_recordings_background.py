@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.background import far_surface, moving_object
+from tofuse.recordings.background import background_surface, moving_object
 from tofuse.recordings.frames import RangeFrame
 
 ROWS, COLUMNS = 60, 80
@@ -54,7 +54,7 @@ def agreement(found: np.ndarray, true: np.ndarray) -> float:
     return float((found & true).sum() / (found | true).sum())
 
 
-def test_far_surface_is_farthest_repeated_depth() -> None:
+def test_background_is_farthest_repeated_depth() -> None:
     """Compared with a search through all runs of depths, pixel by pixel."""
     rng = np.random.default_rng(0)
     count = 12
@@ -67,19 +67,21 @@ def test_far_surface_is_farthest_repeated_depth() -> None:
     z[3, :, :40] = 4.0  # a single depth is no surface
     z[:, :5] = 0
     z[:4, :5] = 1.0  # mostly invalid
-    far = far_surface([frame(image, k) for k, image in enumerate(z)])
-    assert np.isinf(far.z[:5]).all()
-    assert np.allclose(far.static_fraction[:5], 8 / 12)
+    background = background_surface([frame(image, k) for k, image in enumerate(z)])
+    assert np.isinf(background.z[:5]).all()
+    assert np.allclose(background.static_fraction[:5], 8 / 12)
     behind = np.abs(z[:, 5:] - 2) < 0.1
     for s in range(8):
         columns = (stripe == s) & (U[0] % 10 > 1) & (U[0] % 10 < 8)
         times = behind[:, 0, columns][:, 0].sum()
         if times < 3:
-            assert not (np.abs(far.z[5:, columns] - 2) < 0.1).any()
+            assert not (np.abs(background.z[5:, columns] - 2) < 0.1).any()
             continue
-        assert np.abs(far.z[5:, columns] - 2).max() < 0.02
-        assert far.static_fraction[5:, columns].mean() == pytest.approx(times / count, abs=0.01)
-        assert np.median(far.sigma[5:, columns]) == pytest.approx(0.005, rel=0.6)
+        assert np.abs(background.z[5:, columns] - 2).max() < 0.02
+        assert background.static_fraction[5:, columns].mean() == pytest.approx(
+            times / count, abs=0.01
+        )
+        assert np.median(background.sigma[5:, columns]) == pytest.approx(0.005, rel=0.6)
     assert 2 <= sum(behind[:, 0, stripe == s][:, 0].sum() >= 3 for s in range(8)) <= 8
 
 
@@ -88,8 +90,10 @@ def test_object_includes_pixels_it_always_hides() -> None:
     found = moving_object(frames)
     middle = np.zeros((ROWS, COLUMNS), bool)
     middle[20:45, 34:46] = True
-    assert found.own[middle].all()  # its depth is constant, or nearly so, and it is no background
-    assert not found.own[:8].any()
+    assert found.always_occluded[
+        middle
+    ].all()  # its depth is constant, or nearly so, and it is no background
+    assert not found.always_occluded[:8].any()
     for image, mask in zip(frames, masks, strict=True):
         assert agreement(found.mask(image.z), mask) > 0.97
     assert 0.85 < found.depth_range[0] < 1.1 < found.depth_range[1] < 1.3
@@ -100,8 +104,8 @@ def test_static_objects_in_front_are_background() -> None:
     shelf = np.where(U < 14, 1.1, np.where(V > 52, 1.6, 3.0))
     frames, masks = recording(background=shelf)
     found = moving_object(frames)
-    assert not found.own[:, :14].any()
-    assert not found.own[53:].any()
+    assert not found.always_occluded[:, :14].any()
+    assert not found.always_occluded[53:].any()
     assert min(
         agreement(found.mask(f.z), m) for f, m in zip(frames, masks, strict=True)
     ) > 0.97  # fmt: skip

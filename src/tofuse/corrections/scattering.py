@@ -130,9 +130,11 @@ class ScatteringCorrector(Corrector):
 def _moving_and_static(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
     """Return masks (H, W) of moving pixels, and of static pixels away from them."""
     segmentation = moving_object(images)
-    moving = segmentation.own | np.any([segmentation.mask(image.z) for image in images], axis=0)
+    moving = segmentation.always_occluded | np.any(
+        [segmentation.mask(image.z) for image in images], axis=0
+    )
     square = np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)
     around = cv2.dilate(moving.astype(np.uint8), square) > 0
-    return moving, ~around & np.isfinite(segmentation.far.z) & (
-        segmentation.far.static_fraction > _MIN_STATIC
+    return moving, ~around & np.isfinite(segmentation.background.z) & (
+        segmentation.background.static_fraction > _MIN_STATIC
     )

@@ -36,7 +36,7 @@ from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.view_agreement import agreement_sums, move_points, project_by_lens
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import Recording, evenly
+from tofuse.recordings.recording import Recording, evenly_spaced
 
 MAX_COLUMNS = 320
 MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m
@@ -304,7 +304,7 @@ def map_consistency(
     if frames < 1:
         raise InputError(f"is {frames}", where="frames", remedy="use 1 or more")
     depth_unit_m = recording.metadata.get("depth_unit_m")
-    selected = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
+    selected = evenly_spaced(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
     images, used = [], []
     for k in selected:
         try:

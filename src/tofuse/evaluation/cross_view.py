@@ -20,7 +20,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import evenly
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
@@ -110,7 +110,7 @@ def cross_view_consistency(frames: Sequence[RangeFrame], poses: ArrayLike) -> Cr
     Uses at most 60 of them, evenly spaced. Frames without a pose (NaN) are left out.
     """
     T = np.asarray(poses, float)
-    rows = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), _MAX_VIEWS)
+    rows = evenly_spaced(np.flatnonzero(np.isfinite(T).all((1, 2))), _MAX_VIEWS)
     return compare_views([prepare_for_comparison(frames[k]) for k in rows], T[rows])
 
 

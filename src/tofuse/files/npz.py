@@ -44,8 +44,8 @@ def read_npz(
     path: str | Path,
     *,
     limit: int = _MAX_BYTES,
-    only: frozenset[str] | None = None,
-    without: str | None = None,
+    names: frozenset[str] | None = None,
+    exclude_prefix: str | None = None,
 ) -> Arrays:
     """Return the arrays of a file, by name.
 
@@ -53,9 +53,9 @@ def read_npz(
     ----------
     limit
         Largest total size in bytes.
-    only
+    names
         Names of the arrays to read; all unless given.
-    without
+    exclude_prefix
         Prefix of the names of arrays to skip.
 
     Raises
@@ -69,7 +69,7 @@ def read_npz(
             path.stat() if isinstance(path, Path) else Path(path).stat()
             raise InputError("is not a regular file", where=path, remedy="pass a file")
         with zipfile.ZipFile(path) as archive:
-            return _read(archive, limit, only, without)
+            return _read(archive, limit, names, exclude_prefix)
     except OSError as error:
         raise input_error(error, path) from error
     except (
@@ -95,7 +95,7 @@ def read_npz(
 
 
 def _read(
-    archive: zipfile.ZipFile, limit: int, only: frozenset[str] | None, without: str | None
+    archive: zipfile.ZipFile, limit: int, names: frozenset[str] | None, exclude_prefix: str | None
 ) -> Arrays:
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
@@ -103,8 +103,8 @@ def _read(
     selected = [
         m
         for m in members
-        if (only is None or m.filename.removesuffix(".npy") in only)
-        and (without is None or not m.filename.startswith(without))
+        if (names is None or m.filename.removesuffix(".npy") in names)
+        and (exclude_prefix is None or not m.filename.startswith(exclude_prefix))
     ]
     if sum(m.file_size for m in selected) > limit:
         raise ValueError(f"its arrays have more than {limit >> 20} MiB")

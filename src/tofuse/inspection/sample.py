@@ -13,7 +13,7 @@ from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.pair_motion import Pair, aligned_pair
 from tofuse.inspection.planar import Distortion, Region, fit_distortion, regions_of
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.recordings.recording import Recording, evenly
+from tofuse.recordings.recording import Recording, evenly_spaced
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 
@@ -59,7 +59,7 @@ class Sample:
             Whether an object turns in front of a stationary camera.
         """
         n = len(recording)
-        first_of_pair = evenly(np.arange(max(n - 1, 1)), count)
+        first_of_pair = evenly_spaced(np.arange(max(n - 1, 1)), count)
         selected = np.unique(np.concatenate([first_of_pair, np.minimum(first_of_pair + 1, n - 1)]))
         frames: list[Frame] = []
         unreadable: list[UnreadableFrameError] = []

@@ -284,7 +284,7 @@ def _unlink(path: Path) -> None:
 def _header(path: Path) -> dict[str, Any]:
     """Return the header of a checkpoint; empty for other files."""
     try:
-        return _header_in(read_npz(path, limit=_MAX_HEADER_BYTES, only=frozenset({_HEADER})))
+        return _header_in(read_npz(path, limit=_MAX_HEADER_BYTES, names=frozenset({_HEADER})))
     except (InputError, StateError):
         return {}
 
@@ -304,11 +304,11 @@ def _write(path: Path, header: dict[str, Any], state: Any) -> None:
 
 
 def _read(path: Path, key: str) -> Any:
-    arrays = read_npz(path, limit=_MAX_BYTES, without=PIECE)
+    arrays = read_npz(path, limit=_MAX_BYTES, exclude_prefix=PIECE)
     if _header_in(arrays).get("key") != key:
         raise StateError("it is of another run")
 
     def piece(name: str) -> NDArray[Any]:
-        return read_npz(path, only=frozenset({name}))[name]
+        return read_npz(path, names=frozenset({name}))[name]
 
     return decode(arrays, piece)

@@ -46,7 +46,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import read_reference
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
-from tofuse.recordings.recording import Recording, evenly
+from tofuse.recordings.recording import Recording, evenly_spaced
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.card import bound, length
 from tofuse.results.folder import OutputFolder
@@ -245,7 +245,7 @@ class _Images:
 
     def support_at(self, poses: Float64) -> ViewSupport:
         """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
-        rows = evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
+        rows = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
         views = [(k, view) for k in rows if (view := self._view(k)) is not None]
         used_rows = [k for k, _ in views]
         return ViewSupport(compare_views([view for _, view in views], poses[used_rows]))

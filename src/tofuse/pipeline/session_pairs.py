@@ -12,7 +12,7 @@ from tofuse.arrays import Float64
 from tofuse.evaluation.changes import changes
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views
 from tofuse.posegraph.view_store import PosedView
-from tofuse.recordings.recording import evenly
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.session_words import MAX_STATED_PROBABILITY
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
@@ -45,7 +45,7 @@ class Model:
     def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
         """Return evenly spaced views of a session that have a pose in this model."""
         members = [v for v in views if session.has(v.index) and v.index in self.poses]
-        return [members[k] for k in evenly(np.arange(len(members)), _COMPARED)]
+        return [members[k] for k in evenly_spaced(np.arange(len(members)), _COMPARED)]
 
     def links(self, first: SessionRecord, second: SessionRecord) -> set[tuple[int, int]]:
         """Return frame pairs (i < j) of two sessions with accepted registrations."""

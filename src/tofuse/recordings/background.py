@@ -51,7 +51,7 @@ _MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class FarSurface:
+class BackgroundSurface:
     """The farthest surface at each pixel over frames of a stationary camera.
 
     Attributes
@@ -70,7 +70,7 @@ class FarSurface:
     static_fraction: Float32
 
 
-def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
+def background_surface(frames: Sequence[RangeFrame]) -> BackgroundSurface:
     """Find the farthest surface that each pixel observes in several frames.
 
     Parameters
@@ -97,7 +97,7 @@ def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
     sigma = _median(np.abs(z - depth), agree) / np.float32(MEDIAN_OF_NORMAL)
     missing = ~valid
     empty = 2 * np.count_nonzero(missing, axis=0) > count
-    return FarSurface(
+    return BackgroundSurface(
         np.where(empty, np.float32(np.inf), depth),
         np.where(empty, np.float32(0), sigma),
         np.where(empty, missing, agree | missing).mean(0, dtype=np.float32),
@@ -110,20 +110,20 @@ class MovingObject:
 
     Attributes
     ----------
-    far
+    background
         The farthest surface at each pixel.
     limit
         (H, W) float32 z in m below which a point is in front of the background. Infinite where the
         object always occludes it.
-    own
+    always_occluded
         (H, W) mask of the pixels at which the object always occludes the background.
     depth_range
         (min, max) z in m of the object.
     """
 
-    far: FarSurface
+    background: BackgroundSurface
     limit: Float32
-    own: Bool
+    always_occluded: Bool
     depth_range: tuple[float, float]
 
     def mask(self, z: Float32) -> Bool:
@@ -160,25 +160,27 @@ def moving_object(
         )
     if len({frame.depth.shape for frame in frames}) > 1:
         raise InputError("needs images of the same size", where=_OPTION, remedy=_CUT)
-    far = far_surface(frames)
-    background_z = _filled(far.z)
+    background = background_surface(frames)
+    background_z = _filled(background.z)
     observed = np.isfinite(background_z)
     limit = background_z.copy()
-    limit[observed] -= (sigmas * far.sigma + np.float32(relative) * background_z)[observed]
+    limit[observed] -= (sigmas * background.sigma + np.float32(relative) * background_z)[observed]
     z = np.stack([frame.z for frame in frames])
     z[~np.stack([frame.valid for frame in frames])] = 0
     front = np.stack([_without_speckle((image > 0) & (image < limit)) for image in z])
     frequency = front.mean(0)
     if observed.any():
-        _check_static(far, frequency)
+        _check_static(background, frequency)
     interior = np.stack([ndimage.binary_erosion(image, np.ones((3, 3))) for image in front])
     always_occluded = _always_occluded(
         ndimage.median_filter(background_z, 3), _filled(_median(z, interior)), frequency
     )
     limit[always_occluded] = np.inf
-    depths = np.concatenate([z[interior], far.z[always_occluded & observed & (far.z > 0)]])
+    depths = np.concatenate(
+        [z[interior], background.z[always_occluded & observed & (background.z > 0)]]
+    )
     low, high = np.percentile(depths, _DEPTH_PERCENTILES) if len(depths) else (0.0, np.inf)
-    segmentation = MovingObject(far, limit, always_occluded, (float(low), float(high)))
+    segmentation = MovingObject(background, limit, always_occluded, (float(low), float(high)))
     _check_complete([segmentation.mask(image) for image in z], z)
     return segmentation
 
@@ -210,9 +212,9 @@ def _median(values: Float32, where: Bool | None) -> Float32:
     return np.nan_to_num(median).astype(np.float32)
 
 
-def _check_static(far: FarSurface, frequency: Float64) -> None:
+def _check_static(background: BackgroundSurface, frequency: Float64) -> None:
     """Refuse images whose borders are not static, and those without a moving object."""
-    static = far.static_fraction >= _STATIC
+    static = background.static_fraction >= _STATIC
     borders = (static[0], static[-1], static[:, 0], static[:, -1])
     sides = sorted(float(border.mean()) for border in borders)
     # The object may extend beyond one border, for example if it stands on the floor.

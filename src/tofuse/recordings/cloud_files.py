@@ -18,7 +18,7 @@ from tofuse.geometry.quaternion import length, to_matrix
 from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
-from tofuse.recordings.reader import SURE, Sniff
+from tofuse.recordings.reader import CERTAIN, Sniff
 from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
 
 # The resolution of float32 is coarser than half a millimetre beyond.
@@ -218,7 +218,7 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     if is_folder(path) and is_file(path / "run.json"):
         return Sniff(0.1, "a result of tofuse, not a recording", "pass the recording itself")
     kinds = sorted({f.suffix.lower() for f in files})
-    return Sniff(SURE, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
+    return Sniff(CERTAIN, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
 
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:

@@ -22,7 +22,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 
 FINEST_UNIT_M = 1e-4
-FINEST_SIGMA_M = 1e-5
+MIN_SIGMA_UNIT_M = 1e-5
 _SAMPLED_FRAMES = 24
 _CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
@@ -135,7 +135,7 @@ def _writer(
     sigmas = [float(f.sigma_image.max()) for f in images if f.sigma_image is not None]
     sigma_unit = metadata.get("sigma_unit_m")
     if sigma_unit is None and sigmas:
-        sigma_unit = max(FINEST_SIGMA_M, _round_up(max(sigmas) / MAX_COUNTS))
+        sigma_unit = max(MIN_SIGMA_UNIT_M, _round_up(max(sigmas) / MAX_COUNTS))
     unit = metadata.get("depth_unit_m")
     if unit is None:
         farthest = max(float(f.depth.max()) for f in images)

@@ -12,7 +12,7 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_folder, list_folder
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, known, name_of
-from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.rig_folder import recordings_of, rig_file_in, rig_from
 from tofuse.recordings.rig_source import RigSource
@@ -157,7 +157,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     sniffs = _sniff(path)
     # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
-    confident = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, SURE)}
+    confident = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, CERTAIN)}
     if len(confident) == 1:
         return [_Located(path, readers()[next(iter(confident))])]
     if len(confident) > 1:
@@ -199,7 +199,7 @@ def _sniff(path: Path) -> dict[str, Sniff]:
 
 def is_recording(path: Path) -> bool:
     """Whether a reader recognises a file or folder as a recording of its format."""
-    return any(sniff.confidence >= SURE for sniff in _sniff(path).values())
+    return any(sniff.confidence >= CERTAIN for sniff in _sniff(path).values())
 
 
 def _recordings_in(path: Path) -> list[_Located]:
@@ -211,7 +211,7 @@ def _recordings_in(path: Path) -> list[_Located]:
         if not is_folder(folder):
             continue
         sniffs = _sniff(folder)
-        confident = [name for name, s in sniffs.items() if s.confidence >= SURE]
+        confident = [name for name, s in sniffs.items() if s.confidence >= CERTAIN]
         if confident:
             format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
     if not format_of:

@@ -14,7 +14,7 @@ from tofuse.arrays import Bool, Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.sources import FARTHEST_M
+from tofuse.recordings.sources import MAX_COORDINATE_M
 
 SAMPLES = 8
 # Largest distance of a point from its pixel's ray: errors of rounding to 0.1 mm and float32.
@@ -231,4 +231,4 @@ def _fits(points: Float32, mask: Bool, rays: Float32) -> bool:
 
 def _measured(points: Float32) -> Bool:
     """Mask of valid points; some programs write the origin instead of NaN for missing ones."""
-    return np.asarray((np.abs(points) < FARTHEST_M).all(-1) & (points[..., 2] > 0))
+    return np.asarray((np.abs(points) < MAX_COORDINATE_M).all(-1) & (points[..., 2] > 0))

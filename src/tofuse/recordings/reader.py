@@ -9,8 +9,8 @@ from typing import ClassVar, Protocol
 from tofuse.errors import InputError
 from tofuse.recordings.recording import Source
 
-SURE = 0.9
-UNSURE = 0.5
+CERTAIN = 0.9
+UNCERTAIN = 0.5
 PER_FRAME = "a camera per frame"
 
 
@@ -21,12 +21,12 @@ class Sniff:
     Attributes
     ----------
     confidence
-        0 to 1; a path is opened automatically from `SURE` on. 1 is for names and contents that
+        0 to 1; a path is opened automatically from `CERTAIN` on. 1 is for names and contents that
         no other format has.
     evidence
         The evidence for the format, for messages.
     remedy
-        What to do if the confidence is below `SURE`.
+        What to do if the confidence is below `CERTAIN`.
     """
 
     confidence: float

@@ -181,7 +181,7 @@ class Recording:
         Unreadable frames are replaced by their error.
         """
         items: list[Frame | UnreadableFrameError] = []
-        for k in evenly(np.arange(len(self)), count):
+        for k in evenly_spaced(np.arange(len(self)), count):
             try:
                 items.append(self[int(k)])
             except UnreadableFrameError as error:
@@ -256,7 +256,7 @@ class Recording:
             pool.shutdown(cancel_futures=True)
 
 
-def evenly(items: Intp, count: int) -> Intp:
+def evenly_spaced(items: Intp, count: int) -> Intp:
     """Return at most `count` of the items, evenly spaced, including the first and the last."""
     if len(items) == 0:
         return items

@@ -21,7 +21,7 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
 
-FARTHEST_M = 1e9  # larger coordinates are considered damaged
+MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
 
 
 class FileSource(ABC):
@@ -181,11 +181,11 @@ def cloud_frame(
     `shift` (3,) is subtracted from the points, in their own precision, and from the `origin` (3,).
     """
     # False for NaN; the squares of the remaining coordinates fit into float32.
-    measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
+    measured = np.asarray((np.abs(points) < MAX_COORDINATE_M).all(1))
     if shift is not None:
         with np.errstate(over="ignore", invalid="ignore"):
             points = points - shift
-        measured &= (np.abs(points) < FARTHEST_M).all(1)
+        measured &= (np.abs(points) < MAX_COORDINATE_M).all(1)
         origin = None if origin is None else origin - shift
     frame = CloudFrame(
         index,

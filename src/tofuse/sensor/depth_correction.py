@@ -112,7 +112,7 @@ class DepthCorrection:
             If the file can't be read, or a key is missing or has an invalid array.
         """
         try:
-            arrays = read_npz(path, limit=_MAX_BYTES, only=frozenset(KEYS))
+            arrays = read_npz(path, limit=_MAX_BYTES, names=frozenset(KEYS))
         except InputError as error:
             raise InputError(
                 error.problem,

@@ -15,8 +15,8 @@ from tofuse.files.reading import files_named, is_file, read_bytes
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
-from tofuse.recordings.sources import FARTHEST_M, FileSource
+from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -39,7 +39,7 @@ class Arducam:
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(UNSURE, evidence, remedy)
+        return Sniff(UNCERTAIN, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""
@@ -85,7 +85,7 @@ class ArducamSource(FileSource):
             index,
             float(self.timestamps[index]),
             self.camera,
-            np.where((depth > 0) & (depth < FARTHEST_M), depth, np.float32(0)),
+            np.where((depth > 0) & (depth < MAX_COORDINATE_M), depth, np.float32(0)),
             self.description.depth_kind,
             confidence_image=self._confidence(self.confidence[index]),
         )

@@ -15,7 +15,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
@@ -39,7 +39,7 @@ class Depth16:
         if is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(UNSURE, evidence, remedy)
+        return Sniff(UNCERTAIN, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""

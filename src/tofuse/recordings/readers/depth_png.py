@@ -13,7 +13,7 @@ from tofuse.files.images import read_header
 from tofuse.files.reading import files_with, is_file
 from tofuse.parts import part
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import SURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, ReaderOptions, Sniff
 
 
 @part("reader", "depth-png")
@@ -33,7 +33,7 @@ class DepthPng:
             return None
         if header.bits != 16 or header.channels != 1:
             return None
-        return Sniff(SURE, "a 16-bit PNG")
+        return Sniff(CERTAIN, "a 16-bit PNG")
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""

@@ -29,7 +29,7 @@ from tofuse.recordings.organised import (
     ray_origin_offset,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FARTHEST_M, to_float32
+from tofuse.recordings.sources import MAX_COORDINATE_M, to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
@@ -116,7 +116,7 @@ class Cells:
 def read_cells(path: Path) -> Cells:
     """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
     cells = _read(path)
-    plausible = np.asarray((np.abs(cells.points) < FARTHEST_M).all(1))
+    plausible = np.asarray((np.abs(cells.points) < MAX_COORDINATE_M).all(1))
     return replace(cells, points=np.where(plausible[:, None], cells.points, np.float32(np.nan)))
 
 

@@ -17,7 +17,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
 # Camera of an image, and its scale relative to the calibration, by the image size.
@@ -44,7 +44,7 @@ class Kinect2:
         if any(_calibration(path, name) is not None for name, _ in _VIEWS.values()):
             return Sniff(1.0, f"{len(files)} *_depth.png and calib_*.yaml")
         return Sniff(
-            UNSURE,
+            UNCERTAIN,
             f"{len(files)} *_depth.png but no calibration",
             "put kinect2_bridge's calib_ir.yaml and calib_color.yaml into the same folder",
         )

@@ -33,7 +33,7 @@ from tofuse.recordings.frames import (
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
-from tofuse.recordings.reader import SURE, UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, UNCERTAIN, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, combined
@@ -364,15 +364,15 @@ class Native:
             if "intrinsic_matrix" in text and '"schema"' not in text:
                 return None
             if images is None:
-                return Sniff(SURE, "a camera.json but neither depth/ nor cloud/")
+                return Sniff(CERTAIN, "a camera.json but neither depth/ nor cloud/")
             return Sniff(1.0, f"camera.json and {images}/")
         if images == "depth":
             return Sniff(
-                UNSURE,
+                UNCERTAIN,
                 "depth/ but no camera.json",
                 "write one (docs/formats.md), or use --format native --camera camera.json",
             )
-        return Sniff(SURE, "cloud/") if images == "cloud" else None
+        return Sniff(CERTAIN, "cloud/") if images == "cloud" else None
 
     def open(self, path: Path, options: ReaderOptions) -> NativeSource:
         """See `Reader.open`."""

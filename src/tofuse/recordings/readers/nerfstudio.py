@@ -21,7 +21,7 @@ from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose
+from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_matrix_pose
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -139,7 +139,7 @@ class NerfstudioSource(FileSource):
     def _depth(self, path: Path) -> Float32:
         if path.suffix.lower() == ".npy":
             table = _array(path) * np.float32(self.unit_m)
-            return np.where(np.abs(table) < FARTHEST_M, table, np.float32(0))
+            return np.where(np.abs(table) < MAX_COORDINATE_M, table, np.float32(0))
         return depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
 
 

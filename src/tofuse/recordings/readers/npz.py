@@ -25,7 +25,12 @@ from tofuse.recordings.camera_file import (
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, read_matrix_pose
+from tofuse.recordings.sources import (
+    MAX_COORDINATE_M,
+    FileSource,
+    check_timestamps,
+    read_matrix_pose,
+)
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
@@ -107,7 +112,7 @@ class NpzSource(FileSource):
             depth = self.depth[index].astype(np.float32) * np.float32(self.unit)
             if self.depth.dtype.kind != "f":
                 depth[self.depth[index] == 65535] = 0
-            depth = np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+            depth = np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
             images = {name: stack[index] for name, stack in self.images.items()}
             amplitude, sigma = (
                 np.nan_to_num(images[n].astype(np.float32), posinf=0, neginf=0)

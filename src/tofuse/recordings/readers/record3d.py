@@ -33,7 +33,7 @@ from tofuse.recordings.phones import (
 )
 from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of
-from tofuse.recordings.sources import FARTHEST_M, FileSource
+from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -315,4 +315,4 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
             where=where,
             remedy="export the recording again",
         )
-    return np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+    return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))

@@ -18,7 +18,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, read_json
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
@@ -53,7 +53,7 @@ class Redwood:
         if is_file(path / "camera.json"):
             return None
         return Sniff(
-            UNSURE,
+            UNCERTAIN,
             f"depth/ and {color}/ but no camera",
             "use --format redwood (a PrimeSense camera, millimetres), with --camera for another",
         )

@@ -40,7 +40,7 @@ from tofuse.recordings.ros_messages import (
     image,
     lens,
 )
-from tofuse.recordings.sources import FARTHEST_M, FileSource, cloud_frame
+from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, cloud_frame
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -339,7 +339,7 @@ class RosSource(FileSource):
             depth = counts.astype(np.float32) * np.float32(self._unit(counts.dtype.kind))
         if counts.dtype.kind == "u":
             depth[counts == 65535] = 0
-        return np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+        return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
 
     def _unit(self, kind: str) -> float:
         """Metres per count; floats are always in metres."""

@@ -15,8 +15,8 @@ from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
-from tofuse.recordings.sources import FARTHEST_M, FileSource, read_timestamps, tum_poses
+from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_timestamps, tum_poses
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -42,7 +42,7 @@ class Tiff:
         if not files:
             return None
         return Sniff(
-            UNSURE, f"{len(files)} .tif files", "use --format tiff and --camera camera.json"
+            UNCERTAIN, f"{len(files)} .tif files", "use --format tiff and --camera camera.json"
         )
 
     def open(self, path: Path, options: ReaderOptions) -> TiffSource:
@@ -108,7 +108,7 @@ class TiffSource(FileSource):
             depth = values.astype(np.float32) * np.float32(self.unit)
             if values.dtype == np.uint16:
                 depth[values == 65535] = 0
-            depth = np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+            depth = np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
         amplitude = None
         if self.amplitude:
             with np.errstate(all="ignore"):
