@@ -32,7 +32,7 @@ def surfaces_of(seen: Seen, step: int = 1) -> Surfaces:
 
 
 def everywhere(surfaces: Surfaces) -> np.ndarray:
-    return np.ones(surfaces.good.shape, bool)
+    return np.ones(surfaces.has_plane.shape, bool)
 
 
 def turned(angle_rad: float) -> np.ndarray:
@@ -127,7 +127,7 @@ def test_views_are_stored_by_motion_up_to_a_limit() -> None:
     known.add(surfaces, trusted, np.eye(4))
     one = len(known.patches)
     assert known.patches.shape[1] == PATCH
-    assert 100 < one < surfaces.good.sum() / 3
+    assert 100 < one < surfaces.has_plane.sum() / 3
     known.add(surfaces, trusted, turned(0.05))
     assert len(known.patches) == one
     known.add(surfaces, trusted, turned(0.15))

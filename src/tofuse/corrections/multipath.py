@@ -169,7 +169,7 @@ class MultipathCorrector(Corrector):
         estimate = self._last[1]
         centres = [
             np.minimum(np.arange(n) * estimate.step + estimate.step // 2, size - 1)
-            for n, size in zip(estimate.surfaces.good.shape, frame.valid.shape, strict=True)
+            for n, size in zip(estimate.surfaces.has_plane.shape, frame.valid.shape, strict=True)
         ]
         self._map.add(estimate.surfaces, frame.valid[np.ix_(*centres)], T_world_camera)
 

@@ -202,7 +202,7 @@ class MultipathModel:
             else:
                 fit_planes(nodes)
             surfaces = Surfaces.of(nodes, np.abs(1 + ratio))
-            if not (surfaces.good & (surfaces.albedo > 0)).any():
+            if not (surfaces.has_plane & (surfaces.albedo > 0)).any():
                 return None
             # The measured phase is that of the round trip; light leaves the surface halfway.
             phase = 2 * k * measured - k * surfaces.range_m
@@ -226,9 +226,9 @@ def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
 
 def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
     """Return I / D (Hn, Wn) at the nodes due to the sources (S, 9); 0 where no plane fits."""
-    good = surfaces.good
+    has_plane = surfaces.has_plane
     receivers = np.ascontiguousarray(
-        np.concatenate([surfaces.points[good], surfaces.normals[good]], 1).T, np.float32
+        np.concatenate([surfaces.points[has_plane], surfaces.normals[has_plane]], 1).T, np.float32
     )
 
     def chunk(a: int, b: int) -> Float32:
@@ -237,9 +237,9 @@ def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) ->
         return out
 
     total = np.sum(run_chunks(chunk, len(sources), chunks=4), axis=0, dtype=float)
-    light = (total[0] + 1j * total[1]) * np.exp(-1j * wave_number * surfaces.range_m[good])
-    ratio = np.zeros(good.shape, complex)
-    ratio[good] = light / surfaces.lit[good]
+    light = (total[0] + 1j * total[1]) * np.exp(-1j * wave_number * surfaces.range_m[has_plane])
+    ratio = np.zeros(has_plane.shape, complex)
+    ratio[has_plane] = light / surfaces.irradiance[has_plane]
     ratio /= np.maximum(1, np.abs(ratio) / _MAX_RATIO)
     return ratio
 

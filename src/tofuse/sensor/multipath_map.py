@@ -54,16 +54,16 @@ class ReflectorMap:
         T_world_camera
             (4, 4) pose of the view.
         """
-        lit = surfaces.good & (surfaces.albedo > 0)
-        if not lit.any():
+        illuminated = surfaces.has_plane & (surfaces.albedo > 0)
+        if not illuminated.any():
             return
         if self._T is not None:
             motion = se3.inverse(self._T) @ T_world_camera
-            min_distance = _DISTANCE * float(np.median(surfaces.range_m[lit]))
+            min_distance = _DISTANCE * float(np.median(surfaces.range_m[illuminated]))
             if se3.angle(motion) < _ANGLE and np.linalg.norm(motion[:3, 3]) < min_distance:
                 return
-        selected = np.zeros_like(lit)
-        selected[::2, ::2] = (lit & static)[::2, ::2]
+        selected = np.zeros_like(illuminated)
+        selected[::2, ::2] = (illuminated & static)[::2, ::2]
         points, normals, albedo = (
             values[selected] for values in (surfaces.points, surfaces.normals, surfaces.albedo)
         )
@@ -148,7 +148,7 @@ class OffscreenCells:
         wave_number
             Phase in rad per m of path.
         """
-        border = surfaces.good & (surfaces.albedo > 0)
+        border = surfaces.has_plane & (surfaces.albedo > 0)
         border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
         out = np.empty((len(self.rays), 9), np.float32)
         count = kernels.offscreen_sources(

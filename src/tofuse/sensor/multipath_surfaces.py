@@ -69,7 +69,7 @@ class Surfaces:
     ----------
     nodes
         As of `block_nodes`, with planes.
-    good
+    has_plane
         Whether a plane fits; the other attributes are undefined elsewhere.
     points, normals
         In m in the camera frame; unit, towards the camera.
@@ -77,21 +77,21 @@ class Surfaces:
         Radial range in m.
     area
         Of the block on the surface, m^2.
-    lit
+    irradiance
         Direct irradiance, relative to a surface facing the lamp at 1 m on the axis.
     radiosity
         Measured radiosity in counts: amplitude without the falloff of the lens.
     albedo
-        Direct radiosity (without indirect light) divided by `lit`, in counts.
+        Direct radiosity (without indirect light) divided by `irradiance`, in counts.
     """
 
     nodes: Float64
-    good: Bool
+    has_plane: Bool
     points: Float64
     normals: Float64
     range_m: Float64
     area: Float64
-    lit: Float64
+    irradiance: Float64
     radiosity: Float64
     albedo: Float64
 
@@ -105,17 +105,17 @@ class Surfaces:
             (Hn, Wn) current estimate of the factor by which multipath has raised the amplitude.
         """
         shape = nodes.shape[:2]
-        good = np.empty(shape, bool)
+        has_plane = np.empty(shape, bool)
         points, normals = np.empty((*shape, 3)), np.empty((*shape, 3))
         values = np.empty((5, *shape))
         kernels.surface_radiometry(
-            nodes, factor, FALLOFF, MIN_COSINE, good, points, normals, values
+            nodes, factor, FALLOFF, MIN_COSINE, has_plane, points, normals, values
         )
-        return cls(nodes, good, points, normals, *values)
+        return cls(nodes, has_plane, points, normals, *values)
 
     def bright_albedo(self) -> float:
         """Return the area-weighted 90 % quantile of the albedo in counts; 0 if unknown."""
-        valid = self.good & (self.albedo > 0)
+        valid = self.has_plane & (self.albedo > 0)
         if not valid.any():
             return 0.0
         albedo, area = self.albedo[valid], self.area[valid]
@@ -138,8 +138,8 @@ def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
     -------
     Sources as in `kernels.multipath.exchange`.
     """
-    out = np.empty((surfaces.good.size, 9), np.float32)
+    out = np.empty((surfaces.has_plane.size, 9), np.float32)
     count = kernels.visible_sources(
-        surfaces.good, surfaces.points, surfaces.normals, surfaces.area, radiosity, out
+        surfaces.has_plane, surfaces.points, surfaces.normals, surfaces.area, radiosity, out
     )
     return out[:count]
