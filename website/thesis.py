@@ -54,9 +54,9 @@ def tables() -> dict[str, str]:
 def named_part(text: str) -> str:
     """Kind, name and label of a part, for the table."""
     kind, name = text.split()
-    if name not in parts.known(kind):
+    if name not in parts.registered(kind):
         raise ValueError(f"there is no {kind} {name!r}")
-    return f"{kind} `{name}`, {parts.known(kind)[name].part_label}"  # type: ignore[attr-defined]
+    return f"{kind} `{name}`, {parts.registered(kind)[name].part_label}"  # type: ignore[attr-defined]
 
 
 def check_files(text: str) -> None:

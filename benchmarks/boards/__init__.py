@@ -62,7 +62,7 @@ def default_made(kind: str) -> dict[str, Any]:
     """All parts of a kind that need no options, with their defaults, by name."""
     _discover()
     out = {}
-    for name, cls in parts.known(kind).items():
+    for name, cls in parts.registered(kind).items():
         try:
             out[name] = cls()
         except TypeError:

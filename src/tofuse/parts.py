@@ -57,7 +57,7 @@ def discover(package: str) -> None:
         importlib.import_module(f"{package}.{info.name}")
 
 
-def known(kind: str) -> dict[str, type]:
+def registered(kind: str) -> dict[str, type]:
     """Return the registered parts of a kind, by name."""
     return dict(sorted(_registry.get(kind, {}).items()))
 
@@ -113,7 +113,7 @@ def from_dict(hint: Any, data: Any, *, where: str) -> Any:
         return _from_sequence(origin, args, data, where)
     if isinstance(hint, type) and getattr(hint, "part_kind", None):
         if not isinstance(data, Mapping):
-            remedy = f"write a table with a part, one of {list(known(hint.part_kind))}"  # type: ignore[attr-defined]
+            remedy = f"write a table with a part, one of {list(registered(hint.part_kind))}"  # type: ignore[attr-defined]
             raise InputError(f"is {data!r}", where=where, remedy=remedy)
         return _part_from_dict(hint, data, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -158,7 +158,7 @@ def _part_from_dict(interface: type, data: Mapping[str, Any], where: str) -> Any
     kind: str = interface.part_kind  # type: ignore[attr-defined]
     options = dict(data)
     name = options.pop("part", getattr(interface, "part_name", None))
-    choices = known(kind)
+    choices = registered(kind)
     if not isinstance(name, str) or name not in choices:
         raise InputError(
             f"there is no {kind} called {name!r}", where=where, remedy=f"use one of {list(choices)}"

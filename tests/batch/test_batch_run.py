@@ -99,7 +99,7 @@ def folder(tmp_path: Path) -> BatchFolder:
 def run(folder: BatchFolder, workers: Workers, jobs: Sequence[Job] = JOBS, **more) -> list[str]:
     notes: list[str] = []
     left = pending(jobs, folder, overwrite=more.pop("overwrite", False))
-    words = {"threads": 1, "retries": 2, "ended": lambda *_: None, "note": notes.append} | more
+    words = {"threads": 1, "retries": 2, "on_ended": lambda *_: None, "note": notes.append} | more
     run_batch(jobs, left, folder, workers, **words)
     return notes
 
@@ -175,7 +175,7 @@ def test_unwritten_record_is_listed(folder: BatchFolder) -> None:
 
 def test_table_is_updated_after_each_job(folder: BatchFolder) -> None:
     seen: list[int] = []
-    run(folder, Scripted(), ended=lambda *_: seen.append(len(table(folder))))
+    run(folder, Scripted(), on_ended=lambda *_: seen.append(len(table(folder))))
     assert seen == [1, 2, 3]
     assert 'http-equiv="refresh"' not in folder.html.read_text()
     (row, *_) = table(folder)
@@ -185,7 +185,7 @@ def test_table_is_updated_after_each_job(folder: BatchFolder) -> None:
 
 def test_page_refreshes_while_jobs_are_pending(folder: BatchFolder) -> None:
     pages: list[str] = []
-    run(folder, Scripted(), ended=lambda *_: pages.append(folder.html.read_text()))
+    run(folder, Scripted(), on_ended=lambda *_: pages.append(folder.html.read_text()))
     assert ['http-equiv="refresh"' in page for page in pages] == [True, True, False]
 
 

@@ -263,7 +263,7 @@ def test_temporal_removes_edges_and_keeps_surfaces() -> None:
 def every_filter() -> list[Filter]:
     parts.discover("tofuse.filters")
     box = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 3.0))
-    known = parts.known("filter")
+    known = parts.registered("filter")
     # Filters with a file or with a fit to a recording have tests of their own.
     others = {"mask", "background"}
     return [box if name == "box" else cls() for name, cls in known.items() if name not in others]

@@ -122,7 +122,7 @@ def test_views_without_overlap_are_unchanged(method):
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_methods_are_registered_as_refinements(method):
-    assert parts.known("refinement")[parts.name_of(method)] is type(method)
+    assert parts.registered("refinement")[parts.name_of(method)] is type(method)
     assert parts.from_dict(RefinementMethod, parts.to_dict(method), where="test") == method
 
 

@@ -287,7 +287,7 @@ def documented_parts() -> dict[str, dict[str, list[str]]]:
 def registered_parts() -> dict[str, dict[str, type]]:
     for package in PART_PACKAGES:
         parts.discover(package)
-    found = {kind: parts.known(kind) for kind in parts._registry}
+    found = {kind: parts.registered(kind) for kind in parts._registry}
     # Parts that other tests define do not belong to the package.
     ours = {
         kind: {n: c for n, c in known.items() if c.__module__.startswith("tofuse.")}

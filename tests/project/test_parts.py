@@ -57,8 +57,8 @@ def test_nested_parts_survive_round_trip() -> None:
 
 
 def test_labels_and_names() -> None:
-    assert parts.known("test-shape") == {"round": Round, "square": Square}
-    assert parts.known("no such kind") == {}
+    assert parts.registered("test-shape") == {"round": Round, "square": Square}
+    assert parts.registered("no such kind") == {}
     assert parts.name_of(Round()) == "round"
     assert (Round.part_label, Square.part_label) == ("validated", "experimental")
 
@@ -71,7 +71,7 @@ def test_duplicate_part_names_are_refused() -> None:
         class Other:
             pass
 
-    assert parts.known("test-shape")["round"] is Round
+    assert parts.registered("test-shape")["round"] is Round
 
 
 @pytest.mark.parametrize(

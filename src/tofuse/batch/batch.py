@@ -52,7 +52,7 @@ def run_batch(
     *,
     threads: int,
     retries: int,
-    ended: OnEnded,
+    on_ended: OnEnded,
     note: Callable[[str], None],
 ) -> None:
     """Run the `remaining` jobs, and update the table of all `jobs`.
@@ -69,7 +69,7 @@ def run_batch(
         Number of threads of each job.
     retries
         Number of restarts of a job whose process or worker was killed.
-    ended
+    on_ended
         Called with each job that has ended.
     note
         Called with messages for the user.
@@ -121,7 +121,7 @@ def run_batch(
             if folder.record(task.job) != record:
                 folder.write(task.job, record)
             write_table(jobs, folder)
-            ended(task.job, record)
+            on_ended(task.job, record)
         if (error := workers.lost()) is not None:
             write_table(jobs, folder)  # workers may have finished jobs meanwhile
             raise error

@@ -93,7 +93,7 @@ def _run(
         with progress_for(as_json=arguments.json) as progress:
             progress.stage("jobs", len(remaining))
 
-            def ended(job: Job, record: Record) -> None:
+            def on_ended(job: Job, record: Record) -> None:
                 progress.advance()
                 if arguments.json:
                     emit({"event": "job", "name": job.name, **asdict(record)})
@@ -105,7 +105,7 @@ def _run(
                 workers,
                 threads=threads,
                 retries=_RETRIES if arguments.retries is None else arguments.retries,
-                ended=ended,
+                on_ended=on_ended,
                 note=progress.note,
             )
     finally:

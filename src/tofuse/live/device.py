@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, Self
 
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
-from tofuse.parts import discover, from_dict, known
+from tofuse.parts import discover, from_dict, registered
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
@@ -153,7 +153,7 @@ def _read(text: str, kind: str, where: str) -> object:
 def devices() -> dict[str, type[Any]]:
     """Return the known kinds of camera by name."""
     discover("tofuse.live.devices")
-    return known("device")
+    return registered("device")
 
 
 def is_installed(device: type[Any]) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_folder, list_folder
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.parts import discover, known, name_of
+from tofuse.parts import discover, name_of, registered
 from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.rig_folder import recordings_of, rig_file_in, rig_from
@@ -38,7 +38,7 @@ _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
 def readers() -> dict[str, Reader]:
     """Return the readers by name."""
     discover("tofuse.recordings.readers")
-    return {name: cls() for name, cls in known("reader").items()}
+    return {name: cls() for name, cls in registered("reader").items()}
 
 
 def open_recording(
