@@ -17,7 +17,7 @@ from tofuse.files.obj import write_obj
 from tofuse.files.ply import read_ply
 from tofuse.fusion import atlas as atlas_module
 from tofuse.fusion.atlas import MARGIN, plain_atlas, unwrap
-from tofuse.fusion.colors import UNSEEN
+from tofuse.fusion.colors import NO_COLOR
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.geometry import se3
@@ -211,9 +211,9 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
     small = wall.decimated(400)
     assert set(np.unique(small.color).tolist()) == {0, 180}
     shown = baked(wall, 400, 256).image
-    assert set(np.unique(shown).tolist()) == {UNSEEN[0], 180}
+    assert set(np.unique(shown).tolist()) == {NO_COLOR[0], 180}
     small.save(tmp_path / "shown.glb")
-    assert set(np.unique(read_glb(tmp_path / "shown.glb").color).tolist()) == {UNSEEN[0], 180}
+    assert set(np.unique(read_glb(tmp_path / "shown.glb").color).tolist()) == {NO_COLOR[0], 180}
     small.save(tmp_path / "data.ply")
     assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
 

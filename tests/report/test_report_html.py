@@ -16,7 +16,7 @@ import pytest
 from report_results import lonely, make_room
 from tofuse.errors import OutputError
 from tofuse.fusion.cloud import Cloud, empty_cloud
-from tofuse.fusion.colors import UNSEEN, seen_colors
+from tofuse.fusion.colors import NO_COLOR, display_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3
@@ -389,8 +389,8 @@ def test_initial_view_shows_most_of_the_surface():
 
 def test_points_without_colour_are_not_black():
     colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
-    shown = seen_colors(colors)
-    assert shown[0].tolist() == list(UNSEEN)
+    shown = display_colors(colors)
+    assert shown[0].tolist() == list(NO_COLOR)
     np.testing.assert_array_equal(shown[1:], colors[1:])
 
 
@@ -403,7 +403,7 @@ def test_viewer_contains_model_cameras_and_loops(shown):
     points = np.array(scene["low"]) + unpack(model["points"], "<u2", 3) / 65535 * scene["extent"]
     np.testing.assert_allclose(points, result.cloud.points @ R.T, atol=1e-4)
     colors = unpack(model["colors"], "u1", 3)
-    np.testing.assert_array_equal(colors, seen_colors(result.cloud.color))
+    np.testing.assert_array_equal(colors, display_colors(result.cloud.color))
     normals = unpack(model["normals"], "i1", 3) / 127
     np.testing.assert_allclose(normals, result.cloud.normals @ R.T, atol=0.01)
     loops = unpack(scene["lines"]["loops"], "<f4", 3)

@@ -57,7 +57,7 @@ def test_colors_saturate_at_end_of_bar_and_turn_grey() -> None:
     colors = distance_colors(np.array([0, 0.005, 0.01, 0.03, 0.05, np.inf]), 0.01)
     assert len(np.unique(colors[:3], axis=0)) == 3
     assert (colors[3] == colors[2]).all()
-    assert (colors[4:] == thumbnails.GONE).all()
+    assert (colors[4:] == thumbnails.NO_MEASUREMENT).all()
 
 
 def decoded(data: dict, mode: str, which: str) -> np.ndarray:

@@ -191,9 +191,9 @@ def test_levels_without_triangles_keep_a_root(tmp_path, monkeypatch) -> None:
 def test_single_triangle_and_slivers_give_one_tile(tmp_path) -> None:
     one = waves(1).rows(np.array([True, False]))
     (level,) = levels(one)
-    assert level.places == ((0, 0, 0),)
+    assert level.tile_indices == ((0, 0, 0),)
     flat = replace(one, vertices=np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0]]))
-    assert len(list(levels(flat))[-1].places) <= 1
+    assert len(list(levels(flat))[-1].tile_indices) <= 1
     assert write_tiles(one, np.eye(3), tmp_path).overview is one
     assert level.mesh is one
 

@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from tofuse.report.policy import script_hashes, secured
-from tofuse.viewer.server import HOST, is_ours, page_headers
+from tofuse.viewer.server import HOST, is_same_origin, page_headers
 
 HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
     "our own page": (["127.0.0.1:8080"], ["http://127.0.0.1:8080"], True),
@@ -32,7 +32,7 @@ HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
 @pytest.mark.parametrize("name", HOSTS)
 def test_hosts_and_origins_that_are_answered(name: str) -> None:
     hosts, origins, ours = HOSTS[name]
-    assert is_ours(hosts, origins) is ours
+    assert is_same_origin(hosts, origins) is ours
 
 
 @pytest.fixture(scope="module")

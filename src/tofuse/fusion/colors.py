@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.arrays import Bool, UInt8
 
 # Displayed colour of points without a colour.
-UNSEEN = (142, 142, 142)
+NO_COLOR = (142, 142, 142)
 
 
 def has_color(colors: UInt8) -> Bool:
@@ -15,8 +15,8 @@ def has_color(colors: UInt8) -> Bool:
     return np.asarray(colors.any(1), np.bool_)
 
 
-def seen_colors(colors: UInt8) -> UInt8:
+def display_colors(colors: UInt8) -> UInt8:
     """Return colours (N, 3) with a neutral grey for unknown ones."""
     shown = colors.copy()
-    shown[~has_color(colors)] = UNSEEN
+    shown[~has_color(colors)] = NO_COLOR
     return shown

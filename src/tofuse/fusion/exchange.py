@@ -21,7 +21,7 @@ from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
 from tofuse.files.stl import write_stl
 from tofuse.files.usdz import write_usdz
-from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.colors import display_colors
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
 _R_GLTF_WORLD = np.diag([1.0, -1.0, -1.0])
@@ -102,7 +102,7 @@ def _for_display(mesh: GeometryRecord, R: Float64) -> GeometryRecord:
         mesh.points @ R.T,
         mesh.faces,
         None if mesh.normals is None else mesh.normals @ R.T,
-        None if mesh.color is None or mesh.texture is not None else seen_colors(mesh.color),
+        None if mesh.color is None or mesh.texture is not None else display_colors(mesh.color),
         mesh.uv,
         mesh.texture,
     )

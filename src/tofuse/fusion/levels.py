@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.arrays import Float64, Int64
 from tofuse.fusion.mesh import Mesh
 
-Place = tuple[int, int, int]
+TileIndex = tuple[int, int, int]
 
 # Edge of a tile in edges of its triangles: some 128^2 cells of two triangles for each surface
 # through it; 1 to 2 MB.
@@ -35,22 +35,22 @@ class Level:
         Edge of the cubes whose vertices are merged, m, which bounds the error; 0 for level 0.
     mesh
         The mesh of all tiles.
-    order, places, ends
-        (M,) faces sorted by tile; place of each tile, in tiles; (T,) end of its faces.
+    order, tile_indices, ends
+        (M,) faces sorted by tile; index of each tile along x, y, z; (T,) end of its faces.
     """
 
     number: int
     error_m: float
     mesh: Mesh
     order: Int64
-    places: tuple[Place, ...]
+    tile_indices: tuple[TileIndex, ...]
     ends: Int64
 
-    def tiles(self) -> Iterator[tuple[Place, Mesh]]:
+    def tiles(self) -> Iterator[tuple[TileIndex, Mesh]]:
         """Yield each tile, with separate vertices."""
         starts = np.concatenate([[0], self.ends])[:-1]
-        for place, start, end in zip(self.places, starts, self.ends, strict=True):
-            yield place, _submesh(self.mesh, self.order[start:end])
+        for index, start, end in zip(self.tile_indices, starts, self.ends, strict=True):
+            yield index, _submesh(self.mesh, self.order[start:end])
 
 
 def levels(mesh: Mesh) -> Iterator[Level]:
@@ -65,7 +65,7 @@ def levels(mesh: Mesh) -> Iterator[Level]:
             number, error, mesh, origin, _TRIANGLES_PER_EDGE * edge * 2**number
         )
         yield level
-        if len(level.places) <= 1:
+        if len(level.tile_indices) <= 1:
             return
         number += 1
         error = edge * 2.0**number
@@ -82,28 +82,28 @@ def _split_into_tiles(
         a, b, c = mesh.faces.T
         centroid = (coordinate[a] + coordinate[b] + coordinate[c]) / 3
         # Faces that merging moved outside stay with their neighbours.
-        place = np.maximum(np.floor((centroid - origin[axis]) / size), 0).astype(np.int64)
-        extents.append(int(place.max(initial=0)) + 1)
-        key = key * extents[-1] + place
+        index = np.maximum(np.floor((centroid - origin[axis]) / size), 0).astype(np.int64)
+        extents.append(int(index.max(initial=0)) + 1)
+        key = key * extents[-1] + index
     tile_keys, counts = np.unique(key, return_counts=True)
-    places = np.stack(np.unravel_index(tile_keys, extents), 1).tolist()
+    tile_indices = np.stack(np.unravel_index(tile_keys, extents), 1).tolist()
     return Level(
         number,
         error_m,
         mesh,
         np.argsort(key, kind="stable"),
-        tuple((i, j, k) for i, j, k in places),
+        tuple((i, j, k) for i, j, k in tile_indices),
         np.cumsum(counts),
     )
 
 
 def _submesh(mesh: Mesh, faces: Int64) -> Mesh:
     """Return a subset of the faces with their vertices."""
-    used, place = np.unique(mesh.faces[faces], return_inverse=True)
+    used, vertex_index = np.unique(mesh.faces[faces], return_inverse=True)
     return replace(
         mesh,
         vertices=mesh.vertices[used],
-        faces=place.reshape(-1, 3).astype(np.int32),
+        faces=vertex_index.reshape(-1, 3).astype(np.int32),
         normals=mesh.normals[used],
         color=None if mesh.color is None else mesh.color[used],
         sigma=mesh.sigma[used],

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.fusion.atlas import MARGIN, Atlas, unwrap
 from tofuse.fusion.cloud import grey_of
-from tofuse.fusion.colors import UNSEEN, has_color, seen_colors
+from tofuse.fusion.colors import NO_COLOR, display_colors, has_color
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
@@ -134,9 +134,9 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
         rgb = grey_of(intensity[:, 0].astype(float))
     colors = np.empty((len(points), 3), np.uint8)
     colors[observed] = rgb
-    colors[~observed] = UNSEEN
+    colors[~observed] = NO_COLOR
     if mesh.color is not None:
-        vertex_colors = texels.at_texels(seen_colors(mesh.color), ~observed)
+        vertex_colors = texels.at_texels(display_colors(mesh.color), ~observed)
         colors[~observed] = np.round(vertex_colors.clip(0, 255)).astype(np.uint8)
     fraction = float(observed.mean()) if len(observed) else 0.0
     return Textured(mesh, texels.atlas, texels.filled(colors), gains, fraction)
@@ -163,7 +163,7 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
     size = int(np.clip(np.ceil(np.sqrt(_TEXELS_PER_VERTEX * len(mesh))), _MIN_SIZE, size))
     texels = _Texels.of(decimated, size)
     if decimated is mesh:
-        colors = texels.at_texels(seen_colors(mesh.color))
+        colors = texels.at_texels(display_colors(mesh.color))
     else:
         nearest, distance2 = KdTree(mesh.vertices).neighbours(texels.points, _NEIGHBOURS)
         facing = np.einsum("nki,ni->nk", mesh.normals[nearest], texels.normals) > 0
@@ -173,7 +173,7 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
         colored = has_color(mesh.color)
         colored_weights = weights * colored[nearest]
         weights = np.where(colored_weights.any(1, keepdims=True), colored_weights, weights)
-        colors = np.einsum("nk,nki->ni", weights, seen_colors(mesh.color)[nearest].astype(float))
+        colors = np.einsum("nk,nki->ni", weights, display_colors(mesh.color)[nearest].astype(float))
         colors /= weights.sum(1, keepdims=True)
     image = texels.filled(np.round(colors.clip(0, 255)).astype(np.uint8))
     return Textured(decimated, texels.atlas, image, np.zeros((0, 3)), 0.0)

@@ -59,7 +59,7 @@ def render_pair(result: PairResult) -> str:
         pictures=[(mode, _TITLES[mode], pictures[mode]) for mode in MODES],
         source_color=_css(SOURCE),
         target_color=_css(TARGET),
-        none_color=_css(thumbnails.GONE),
+        none_color=_css(thumbnails.NO_MEASUREMENT),
         bar=color_bar(),
         ticks=[_mm(scene.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
         beyond=words.length(scene.max_distance_m),

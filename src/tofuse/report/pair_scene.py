@@ -131,7 +131,7 @@ def distance_colors(distance: Float64, cap_m: float) -> UInt8:
     """Return colours (N, 3) of distances in m; grey for points without a counterpart."""
     fraction = np.clip(distance / cap_m, 0, 1)
     colors = thumbnails.viridis(_MIN_COLOR + (1 - _MIN_COLOR) * fraction)
-    colors[distance > _UNMATCHED_CAPS * cap_m] = thumbnails.GONE
+    colors[distance > _UNMATCHED_CAPS * cap_m] = thumbnails.NO_MEASUREMENT
     return colors
 
 

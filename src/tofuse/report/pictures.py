@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from tofuse.kernels.threads import run_all
-from tofuse.report.thumbnails import GONE, REMOVED, encode, grey, viridis
+from tofuse.report.thumbnails import NO_MEASUREMENT, REMOVED, encode, grey, viridis
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
 
@@ -21,7 +21,7 @@ FATES = {
     samples.KEPT: ((38, 150, 140), "in the model"),
     samples.TRACKED: ((236, 170, 60), "tracking only"),
     samples.REMOVED: (REMOVED, "removed by a filter"),
-    samples.NOTHING: (GONE, "no measurement"),
+    samples.NOTHING: (NO_MEASUREMENT, "no measurement"),
 }
 
 
@@ -55,7 +55,7 @@ def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
     def render(frame: FrameSample) -> Pictures:
         depth = frame.depth.astype(float)
         picture = viridis((depth - low) / (high - low))
-        picture[depth == 0] = GONE
+        picture[depth == 0] = NO_MEASUREMENT
         images = {} if frame.color is None else {"color": encode(frame.color, jpeg=True)}
         images["range"] = encode(picture, jpeg=True)
         if frame.amplitude is not None:

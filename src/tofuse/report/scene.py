@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.colors import display_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import thumbnails
@@ -271,7 +271,7 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
 def _display_colors(mesh: Mesh | None) -> Mesh | None:
     if mesh is None or mesh.color is None:
         return mesh
-    return replace(mesh, color=seen_colors(mesh.color))
+    return replace(mesh, color=display_colors(mesh.color))
 
 
 def opening_yaw(scene: Scene) -> float:
@@ -437,7 +437,7 @@ def random_subset(count: int, max_count: int) -> Intp:
 
 def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
     if cloud.color is not None:
-        return seen_colors(cloud.color[sampled])
+        return display_colors(cloud.color[sampled])
     return height_colors(points)
 
 

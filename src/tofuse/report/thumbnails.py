@@ -11,7 +11,8 @@ from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.kernels.splat import nearest_points
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
-GONE = (128, 128, 132)  # no measurement: a grey that differs from both ends of the colour map
+# A grey that differs from both ends of the colour map.
+NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
 
@@ -106,7 +107,7 @@ def depth_image(
     low, high = limits
     step = 1 if width is None else -(-frame.z.shape[1] // width)
     image = viridis((frame.z[::step, ::step].astype(float) - low) / (high - low))
-    image[~frame.valid[::step, ::step]] = GONE
+    image[~frame.valid[::step, ::step]] = NO_MEASUREMENT
     if removed is not None:
         image[removed[::step, ::step]] = REMOVED
     return image

@@ -16,7 +16,7 @@ from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
-from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.colors import display_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import job_pool
@@ -154,7 +154,7 @@ def _write_mesh(
                 displayed.vertices,
                 displayed.faces,
                 normals=displayed.normals,
-                color=None if displayed.color is None else seen_colors(displayed.color),
+                color=None if displayed.color is None else display_colors(displayed.color),
             ),
             generator=generator,
             **upright,

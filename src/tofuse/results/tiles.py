@@ -13,8 +13,8 @@ from tofuse.files.atomic import make_folder
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb
 from tofuse.files.tileset import Tile, write_tileset
-from tofuse.fusion.colors import seen_colors
-from tofuse.fusion.levels import Level, Place, levels
+from tofuse.fusion.colors import display_colors
+from tofuse.fusion.levels import Level, TileIndex, levels
 from tofuse.fusion.mesh import Mesh
 from tofuse.results.folder import RESULT, TILESET
 
@@ -64,12 +64,12 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
         If something can't be written.
     """
     make_folder(folder)
-    finer: dict[Place, Tile] = {}
+    finer: dict[TileIndex, Tile] = {}
     overview_source = mesh
     number = tiles = 0
     for level in levels(mesh):
         number = level.number
-        tiles += len(level.places)
+        tiles += len(level.tile_indices)
         finer = _parents(_write_level(level, R_up_world, folder), finer, level.error_m)
         if not _fits(level.mesh):
             overview_source = level.mesh
@@ -109,11 +109,11 @@ def _fits(mesh: Mesh) -> bool:
     return size <= OVERVIEW_BYTES
 
 
-def _write_level(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Tile]:
-    """Write the tiles of a level; returns them by place."""
+def _write_level(level: Level, R_up_world: Float64, folder: Path) -> dict[TileIndex, Tile]:
+    """Write the tiles of a level; returns them by tile index."""
     out = {}
-    for place, mesh in level.tiles():
-        name = f"{level.number}-{place[0]}-{place[1]}-{place[2]}.glb"
+    for index, mesh in level.tiles():
+        name = f"{level.number}-{index[0]}-{index[1]}-{index[2]}.glb"
         points = (mesh.vertices @ R_up_world.T).astype(np.float32)
         write_glb(
             folder / name,
@@ -121,25 +121,25 @@ def _write_level(level: Level, R_up_world: Float64, folder: Path) -> dict[Place,
                 points,
                 mesh.faces,
                 normals=mesh.normals @ R_up_world.T,
-                color=None if mesh.color is None else seen_colors(mesh.color),
+                color=None if mesh.color is None else display_colors(mesh.color),
                 scalars={"sigma": mesh.sigma, "views": mesh.views},
             ),
             generator=f"tofuse {__version__}",
         )
         low, high = points.min(0).astype(float), points.max(0).astype(float)
-        out[place] = Tile(low, high, level.error_m, name, len(mesh.faces))
+        out[index] = Tile(low, high, level.error_m, name, len(mesh.faces))
     return out
 
 
 def _parents(
-    tiles: dict[Place, Tile], finer: dict[Place, Tile], error_m: float
-) -> dict[Place, Tile]:
+    tiles: dict[TileIndex, Tile], finer: dict[TileIndex, Tile], error_m: float
+) -> dict[TileIndex, Tile]:
     """Make tiles the parents of those of the next finer level, each within its box."""
     for (i, j, k), child in finer.items():
-        place = (i // 2, j // 2, k // 2)
-        if place not in tiles:
-            tiles[place] = Tile(child.low, child.high, error_m, None, 0)
-        parent = tiles[place]
+        index = (i // 2, j // 2, k // 2)
+        if index not in tiles:
+            tiles[index] = Tile(child.low, child.high, error_m, None, 0)
+        parent = tiles[index]
         parent.children.append(child)
         parent.low = np.minimum(parent.low, child.low)
         parent.high = np.maximum(parent.high, child.high)

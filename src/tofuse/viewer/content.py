@@ -16,7 +16,7 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import read_glb
 from tofuse.files.ply import read_ply
 from tofuse.files.tileset import Tile, read_tileset
-from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.colors import display_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.normal import OF_95_PERCENT
 from tofuse.report.pictures import Pictures
@@ -81,7 +81,7 @@ class Layer:
         if self.faces is None or self.normals is None or len(self.faces) <= faces:
             return self
         n = len(self.points)
-        color = None if self.color is None else seen_colors(self.color)
+        color = None if self.color is None else display_colors(self.color)
         sigma = np.zeros(n) if self.sigma is None else self.sigma
         views = np.zeros(n) if self.views is None else self.views
         simplified = Mesh(
@@ -326,7 +326,7 @@ def layer_colors(
         The layer whose range of values defines the scale; by default the same layer.
     """
     if coloring == "colour" and layer.color is not None:
-        return _shaded(seen_colors(layer.color), layer, up), None
+        return _shaded(display_colors(layer.color), layer, up), None
     values = _values(layer, coloring, up)
     if values is not None:
         scale_values = None if scale_of is None else _values(scale_of, coloring, up)

@@ -92,7 +92,7 @@ def _guarded() -> Iterator[list[int]]:
     def serve_guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
             host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
-            if not is_ours(host, origin):
+            if not is_same_origin(host, origin):
                 return Response(403, "Forbidden", Headers(), b"not from this machine\n")
             response: Response | None = None
             if process_request is not None:
@@ -112,7 +112,7 @@ def _guarded() -> Iterator[list[int]]:
         library.serve = original  # type: ignore[misc]
 
 
-def is_ours(hosts: Sequence[str], origins: Sequence[str]) -> bool:
+def is_same_origin(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     """Whether a request addresses this machine, and comes from this server's page or no page.
 
     Parameters
