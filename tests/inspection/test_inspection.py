@@ -474,20 +474,30 @@ def test_wraps_behind_rotating_object_do_not_affect_verdict(room_recording: Path
     assert turning.recording["findings"] == moving.recording["findings"]
 
 
-def test_corrected_focal_length_does_not_affect_verdict(room_recording: Path) -> None:
+@pytest.mark.parametrize(
+    ("code", "harmless", "severe"),
+    [
+        ("focal_length", (0.05, 0.0, 0.0, 0.0, 0.0), (0.0, 0.03, 0.0, 0.0, 0.0)),
+        ("other_intrinsics", (0.0, 0.0, 0.0, 0.02, 0.0), (0.05, 0.0, 0.0, 0.0, 0.0)),
+        ("lens_distortion", (0.0, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.02, 0.0, 0.0)),
+    ],
+)
+def test_corrected_intrinsics_do_not_affect_verdict(
+    room_recording: Path, code: str, harmless, severe
+) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     result = replace(result, recording={**result.recording, "warnings": []})
-    wrong = Finding("focal_length", "It is that of another camera.", "Use the right one.", {})
+    wrong = Finding(code, "It is that of another camera.", "Use the right one.", {})
 
-    def faults(focal: float, offset_m: float) -> list[str]:
-        corrected = SelfCalibration(focal, offset_m, 0.0, 0.0, 0.0, {}, (0.1, 0.01))
+    def faults(errors: tuple[float, ...]) -> list[str]:
+        corrected = SelfCalibration(*errors, {}, (0.1, 0.01))
         diagnostics = replace(result.diagnostics, calibrated=corrected)
         found = with_findings(replace(result, diagnostics=diagnostics), [wrong])
         assert found.recording["findings"] == [wrong.to_dict()]
         return [r.code for r in found.diagnostics.reasons if r.code == "faulty_recording"]
 
-    assert not faults(0.05, 0.0)
-    assert faults(0.0, 0.03)
+    assert not faults(harmless)
+    assert faults(severe)
 
 
 @pytest.mark.slow

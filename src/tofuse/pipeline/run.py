@@ -221,15 +221,20 @@ def with_findings(
 ) -> Reconstruction:
     """Return the result with the findings of an inspection, which may change the verdict.
 
-    Two faults are ignored: wrapped background behind a turning object, as it is removed, and a
-    focal length that self-calibration has corrected.
+    Two kinds of faults are ignored: wrapped background behind a turning object, as it is removed,
+    and intrinsics that self-calibration has corrected.
     """
     indices = [f.index for f in result.diagnostics.frames]
     full_range = ((indices[0], indices[-1]),)
     calibrated = result.diagnostics.calibrated
     harmless = {"phase_wrap"} if turning else set()
-    if calibrated is not None and calibrated.focal:
-        harmless.add("focal_length")
+    if calibrated is not None:
+        corrections = {
+            "focal_length": calibrated.focal,
+            "other_intrinsics": calibrated.center_x or calibrated.center_y,
+            "lens_distortion": calibrated.distortion,
+        }
+        harmless |= {code for code, correction in corrections.items() if correction}
     severe = [
         Reason("faulty_recording", full_range, f"{f.text} {f.remedy}")
         for f in findings
