@@ -13,10 +13,11 @@ from tofuse.geometry import se3
 from tofuse.pipeline.checks import Evidence, judge, ranges_with_status
 from tofuse.posegraph.accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.calibration_check import CalibrationCheck, Gap
+from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
+from tofuse.posegraph.loop_drift import Gap
 from tofuse.posegraph.refinement import Refinement
 from tofuse.registration.base import Registration
 from tofuse.results.types import Component, FrameRecord, Reason

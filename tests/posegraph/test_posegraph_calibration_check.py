@@ -11,9 +11,10 @@ from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
-from tofuse.posegraph.calibration_check import Gap, _Loop, check_calibration, longest_loop
+from tofuse.posegraph.calibration_check import check_calibration
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
+from tofuse.posegraph.loop_drift import Gap, Loop, longest_loop
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.view_store import SampledView
 
@@ -141,11 +142,11 @@ def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
         drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
         return np.concatenate([drifted[:-1], right[-1:]])
 
-    monkeypatch.setattr("tofuse.posegraph.calibration_check.align_pairs", drifting)
+    monkeypatch.setattr("tofuse.posegraph.loop_drift.align_pairs", drifting)
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
-    monkeypatch.setattr(_Loop, "error_by_views", lambda *args: -0.5 * args[-1])
+    monkeypatch.setattr(Loop, "error_by_views", lambda *args: -0.5 * args[-1])
     assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
-    monkeypatch.setattr(_Loop, "error_by_views", lambda *args: args[-1])
+    monkeypatch.setattr(Loop, "error_by_views", lambda *args: args[-1])
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert found.alarm
     assert found.best == "focal"
@@ -154,7 +155,7 @@ def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
 @pytest.mark.parametrize("true", [0.0, 0.06])
 def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
-    loop = _Loop.longest(views, refined, OPTIONS)
+    loop = Loop.longest(views, refined, OPTIONS)
     assert loop is not None
     assert loop.error_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
 

@@ -1,11 +1,11 @@
 """Self-calibration check: whether all views together indicate an error of the camera.
 
 A wrong focal length or principal point, neglected lens distortion or a depth offset bends the
-trajectory, and no single registration reveals it.
-But where views overlap, and above all where a path closes a loop, their residuals can't all be
-small. So each error is estimated separately, with all poses free. An error that makes the views
-more consistent is a proposal. It is an alarm if it exceeds the calibration error of usual
-cameras, and if it closes a loop that pairwise alignments of neighbours leave open.
+trajectory, and no single registration reveals it. But where views overlap, and above all where a
+path closes a loop, their residuals can't all be small. So each error is estimated separately, with
+all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
+exceeds the calibration error of usual cameras, and if it closes a loop that pairwise alignments of
+neighbours leave open.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
 effect.
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -26,12 +25,12 @@ from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import (
     AlignedViews,
     Refined,
-    align_pairs,
     align_views,
     refine,
     spread_evenly,
 )
-from tofuse.posegraph.pair_equations import RefineOptions, Round
+from tofuse.posegraph.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
+from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import aligned_motion
 from tofuse.posegraph.view_store import SampledView
@@ -50,17 +49,13 @@ _REVEALED_BY_LOOP = ("focal", "offset")
 # Significance of an error in standard deviations, for an alarm and for a full estimate; and the
 # fraction of the tolerance that one Newton step must reach for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
-# A loop is closed if its error is below this, m and rad.
-_MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
 # Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
 _MAX_SIGMA = 0.8
 # Change of the views' support that the sampling of points alone explains.
 _SUPPORT_NOISE = 0.003
-# Secant steps to the error that closes a loop: their maximum number; the first one, relative to the
-# tolerance; and the change at convergence, and an implausible error, relative to the first one.
-_MAX_SECANT_STEPS, _FIRST_STEP, _CONVERGENCE, _IMPLAUSIBLE = 4, 2.0, 0.05, 10.0
-# An error that only the drift over the loop reveals must exceed the tolerance by this factor; and
-# the fraction of it that the views must confirm, as they may measure another one.
+# An error that only the drift over the loop reveals must exceed the tolerance by this factor, with
+# which the search also begins; and the fraction of it that the views must confirm, as they may
+# measure another one.
 _LOOP_FACTOR, _MIN_CONFIRMED = 2.0, 0.5
 # Minimum number of views from which their spread is estimated.
 _MIN_VIEWS = 8
@@ -72,68 +67,9 @@ _INDEX = {
     "center_y": kernels.CENTER_Y,
     "distortion": kernels.DISTORTION,
 }
-# The solution may be far from the initial poses.
-_ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
 # This many pairs determine errors that all views share; larger sets are subsampled to about as
 # many, with every n-th point.
 _MAX_PAIRS, _POINT_STRIDE = 500, 3
-
-
-@dataclass(frozen=True)
-class Gap:
-    """A loop of views of which consecutive ones overlap, and the two ends too.
-
-    `before` and `after` are its closure errors (m, rad) by pairwise alignments, without and with
-    the estimated errors of the camera, and `change` is the motion from one to the other. `depth` is
-    that of the views, m.
-    """
-
-    i: int
-    j: int
-    before: tuple[float, float]
-    after: tuple[float, float]
-    depth: float = 0.0
-    change: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def remaining_m(self) -> float:
-        """Distance by which `after` moves points at the views' depth, m."""
-        return self._apparent_m(*self.after)
-
-    def _apparent_m(self, m: float, rad: float) -> float:
-        return m + self.depth * rad
-
-    @property
-    def closes(self) -> bool:
-        """Whether the estimated errors explain it: one part is halved, the other is not larger.
-
-        Or points at the views' depth move by less than half the distance. A gap of less than a
-        centimetre and half a degree is not significant, as not every error bends every path.
-        """
-        apparent = self._apparent_m(*self.before)
-        limit = self._apparent_m(*_MAX_CLOSURE_ERROR)
-        if self.depth and self.remaining_m < 0.5 * apparent and apparent > limit:
-            return True
-        parts = list(zip(self.before, self.after, _MAX_CLOSURE_ERROR, strict=True))
-        if any(b > max(a, limit) for a, b, limit in parts):
-            return False
-        return all(a < limit for a, _, limit in parts) or any(b < 0.5 * a for a, b, _ in parts)
-
-    @property
-    def significant(self) -> bool:
-        """Whether it is more than noise."""
-        return any(a >= limit for a, limit in zip(self.before, _MAX_CLOSURE_ERROR, strict=True))
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the estimated errors change it much without closing it, or widen it.
-
-        Errors of the camera hardly change the gap of a short loop, which does not reveal them.
-        """
-        before = self._apparent_m(*self.before)
-        changes = self._apparent_m(*self.change) > 0.5 * before
-        widens = self.remaining_m > before + self._apparent_m(*_MAX_CLOSURE_ERROR)
-        return self.significant and not self.closes and (changes or widens)
 
 
 @dataclass(frozen=True)
@@ -226,66 +162,25 @@ def check_calibration(
     views, refined, options, priors
         Of the joint alignment without errors of the camera, see `refine`.
     """
-    pairs, poses = refined.pairs, refined.poses
-    if not len(pairs) or len(views) < _MIN_VIEWS:
+    if not len(refined.pairs) or len(views) < _MIN_VIEWS:
         return CalibrationCheck()
-    sensitivity = response(views, poses, pairs, options, priors=priors)
-    estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
-    determined = [name for name, k in _INDEX.items() if _determined(name, sigma[k])]
-    motion = {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()}
-    motions = [np.array(motion[n]) * abs(float(estimate[_INDEX[n]])) for n in determined]
+    first = _FirstEstimates.of(views, refined, options, priors)
     without_error = CalibrationCheck(
-        focal_sigma=float(sigma[kernels.FOCAL]),
-        motion=motion,
-        moved=tuple(max(motions, key=lambda m: m[0], default=np.zeros(2)).tolist()),
+        focal_sigma=first.sigmas["focal"], motion=first.motion, moved=first.largest_motion
     )
-    likely = [
-        name
-        for name in determined
-        if abs(estimate[_INDEX[name]])
-        > max(_LIKELY * sigma[_INDEX[name]], _MIN_FIRST_STEP * TOLERANCES[name])
-    ]
-    sigmas = {name: float(sigma[_INDEX[name]]) for name in determined}
-    by_loop = partial(_check_by_loop, views, refined, sigmas, without_error, options)
+    likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
-        return by_loop()
-    sampled_views, sampled_pairs = list(views), pairs
-    if len(pairs) > _MAX_PAIRS:
-        sampled_views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
-        sampled_pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // len(pairs)))
-    coarse_to_fine = replace(options, rounds=_ROUNDS)
-
-    def refine_with(name: str) -> Refined:
-        # The overlaps are fixed; the poses are re-estimated.
-        error_index = [_INDEX[name]]
-        return refine(
-            sampled_views,
-            poses,
-            coarse_to_fine,
-            calibrate=error_index,
-            priors=priors,
-            pairs=sampled_pairs,
-        )
-
-    estimates = {name: refine_with(name) for name in likely}
+        return _check_by_loop(views, refined, first, without_error, options)
+    estimator = _Estimator.of(views, refined, options, priors)
+    estimates = {name: estimator.alone(name) for name in likely}
     joint: Refined | AlignedViews = estimates[likely[0]]
     if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
-        joint = align_views(
-            sampled_views,
-            poses,
-            coarse_to_fine,
-            calibrate=[_INDEX[name] for name in likely],
-            priors=priors,
-            pairs=sampled_pairs,
-        )
+        joint = estimator.together(likely)
     best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
-    large = any(
-        _large(name, result.errors[_INDEX[name]], sigma[_INDEX[name]])
-        for name, result in estimates.items()
-    )
-    best_index = _INDEX[best_name]
-    certain = abs(best.errors[best_index]) > _SIGNIFICANT * sigma[best_index]
+    errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
+    large = any(_large(name, error, first.sigmas[name]) for name, error in errors.items())
+    certain = abs(errors[best_name]) > _SIGNIFICANT * first.sigmas[best_name]
     improves = certain and _support_gain(best, views) > _SUPPORT_NOISE
     gap = None
     if large or improves:
@@ -293,25 +188,127 @@ def check_calibration(
     # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
     alarm = large and improves and gap is not None and gap.closes
     if alarm:  # alternative explanations
-        estimates |= {name: refine_with(name) for name in determined if name not in estimates}
-    elif (loop_check := by_loop()).alarm:
-        return loop_check
+        for name in first.determined:
+            if name not in errors:
+                errors[name] = float(estimator.alone(name).errors[_INDEX[name]])
+    else:
+        by_loop = _check_by_loop(views, refined, first, without_error, options)
+        if by_loop.alarm:
+            return by_loop
     support = float(best.before.of_views(len(views)).mean())
-    position, rotation = aligned_motion(poses, joint.poses)
+    position, rotation = aligned_motion(refined.poses, joint.poses)
     return replace(
         without_error,
         alarm=alarm,
-        errors={
-            name: float(estimates[name].errors[k])
-            for name, k in _INDEX.items()
-            if name in estimates
-        },
-        sigmas={name: sigmas[name] for name in _INDEX if name in estimates},
+        errors={name: errors[name] for name in _INDEX if name in errors},
+        sigmas={name: first.sigmas[name] for name in _INDEX if name in errors},
         support=(support, support + _support_gain(best, views)),
         gap=gap,
         best=best_name,
         moved=(_rms(position), _rms(rotation)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _FirstEstimates:
+    """Estimates of each error alone by one Newton step, by name.
+
+    Attributes
+    ----------
+    errors, sigmas
+        Estimates and standard deviations.
+    motion
+        As in `CalibrationCheck`.
+    """
+
+    errors: dict[str, float]
+    sigmas: dict[str, float]
+    motion: dict[str, tuple[float, float]]
+
+    @classmethod
+    def of(
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+    ) -> _FirstEstimates:
+        """Estimate all errors. The parameters are those of `check_calibration`."""
+        poses, pairs = refined.poses, refined.pairs
+        sensitivity = response(views, poses, pairs, options, priors=priors)
+        errors, sigmas = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
+        return cls(
+            {name: float(errors[k]) for name, k in _INDEX.items()},
+            {name: float(sigmas[k]) for name, k in _INDEX.items()},
+            {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()},
+        )
+
+    @property
+    def determined(self) -> list[str]:
+        """Errors that the views determine."""
+        return [name for name in _INDEX if _determined(name, self.sigmas[name])]
+
+    def is_likely(self, name: str) -> bool:
+        """Whether a full estimate may be significant."""
+        limit = max(_LIKELY * self.sigmas[name], _MIN_FIRST_STEP * TOLERANCES[name])
+        return abs(self.errors[name]) > limit
+
+    @property
+    def largest_motion(self) -> tuple[float, float]:
+        """Largest rms motion (m, rad) of the poses by one of the determined errors."""
+        motions = [
+            (m * abs(self.errors[name]), rad * abs(self.errors[name]))
+            for name, (m, rad) in self.motion.items()
+            if name in self.determined
+        ]
+        return max(motions, default=(0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    """Estimates errors from refined views: the overlaps are fixed, the poses are free.
+
+    Attributes
+    ----------
+    views, poses, pairs, options, priors
+        As for `refine`; of many pairs, a part.
+    """
+
+    views: Sequence[SampledView]
+    poses: Float64
+    pairs: Intp
+    options: RefineOptions
+    priors: Priors
+
+    @classmethod
+    def of(
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+    ) -> _Estimator:
+        """Select the pairs. The parameters are those of `check_calibration`."""
+        pairs, count = refined.pairs, len(refined.pairs)
+        if count > _MAX_PAIRS:
+            views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
+            pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
+        coarse_to_fine = replace(options, rounds=COARSE_TO_FINE)
+        return cls(views, refined.poses, pairs, coarse_to_fine, priors)
+
+    def alone(self, name: str) -> Refined:
+        """Estimate one error."""
+        return refine(
+            self.views,
+            self.poses,
+            self.options,
+            calibrate=[_INDEX[name]],
+            priors=self.priors,
+            pairs=self.pairs,
+        )
+
+    def together(self, names: Sequence[str]) -> AlignedViews:
+        """Estimate several errors."""
+        return align_views(
+            self.views,
+            self.poses,
+            self.options,
+            calibrate=[_INDEX[name] for name in names],
+            priors=self.priors,
+            pairs=self.pairs,
+        )
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
@@ -344,149 +341,10 @@ def _support_gain(refined: Refined, views: Sequence[SampledView]) -> float:
     return float(refined.after.of_views(n).mean() - refined.before.of_views(n).mean())
 
 
-def loop_gap(
-    views: Sequence[SampledView],
-    refined: Refined,
-    poses: Float64,
-    errors: Float64,
-    options: RefineOptions,
-) -> Gap | None:
-    """Closure errors of the longest loop, without and with errors of the camera; None without one.
-
-    Parameters
-    ----------
-    views, options
-        As for `refine`.
-    refined
-        Result without errors of the camera.
-    poses, errors
-        (N, 4, 4) and (ERRORS,) result with them.
-    """
-    loop = _Loop.longest(views, refined, options)
-    if loop is None:
-        return None
-    without = loop.closure_error(refined.poses, np.zeros(kernels.ERRORS))
-    return loop.gap(without, loop.closure_error(poses, errors))
-
-
-@dataclass(frozen=True, eq=False)
-class _Loop:
-    """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
-
-    views: Sequence[SampledView]
-    i: int
-    j: int
-    options: RefineOptions
-
-    @classmethod
-    def longest(
-        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions
-    ) -> _Loop | None:
-        """Return the longest loop of refined views; None if there is none."""
-        ends = longest_loop(refined.pairs)
-        return None if ends is None else cls(views, *ends, options)
-
-    @property
-    def depth(self) -> float:
-        """Median depth of the two ends, m."""
-        return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
-
-    def closure_error(self, poses: Float64, errors: Float64) -> Float64:
-        """Return the motion (4, 4) by which chained pairwise alignments fail to close the loop.
-
-        Parameters
-        ----------
-        poses
-            (N, 4, 4) T_world_camera, where the alignments start.
-        errors
-            (ERRORS,) assumed errors of the camera.
-        """
-        return self.align_chain(poses, errors)[0]
-
-    def align_chain(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
-        """Return `closure_error`, and the chain's poses (j - i + 1, 4, 4) relative to its first."""
-        i, j = self.i, self.j
-        chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
-        pairs = np.concatenate([chain, [[i, j]]])
-        T = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-        T = align_pairs(self.views, pairs, T, self.options, errors)
-        chained = [np.eye(4)]
-        for step in T[:-1]:
-            chained.append(chained[-1] @ step)
-        return np.asarray(se3.inverse(T[-1]) @ chained[-1], np.float64), np.array(chained)
-
-    def error_by_views(self, poses: Float64, error_index: int, error: float) -> float:
-        """Return an error of the camera as all views of the loop estimate it, starting from one.
-
-        A true error is confirmed, even if residuals at a wrong one are small. An error that only
-        closes the gap differs from the one that the views measure.
-
-        Parameters
-        ----------
-        poses
-            As for `closure_error`.
-        error_index, error
-            Index of the error, and its initial value.
-        """
-        errors = np.zeros(kernels.ERRORS)
-        errors[error_index] = error
-        chain = self.align_chain(poses, errors)[1]
-        options = replace(self.options, rounds=_ROUNDS)
-        views = self.views[self.i : self.j + 1]
-        aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
-        return float(aligned.errors[error_index])
-
-    def gap(self, before: Float64, after: Float64) -> Gap:
-        """Return the gap, given `closure_error` without and with errors of the camera."""
-        first, last = (self.views[k].index for k in (self.i, self.j))
-        change = se3.inverse(before) @ after
-        return Gap(first, last, _norms(before), _norms(after), self.depth, _norms(change))
-
-    def closing_error(
-        self, poses: Float64, uncorrected: Float64, error_index: int, step: float
-    ) -> tuple[float, Float64]:
-        """Return the error of the camera that closes the loop best, and `closure_error` with it.
-
-        Gauss-Newton on the gap at the views' depth, with derivatives by secants.
-
-        Parameters
-        ----------
-        poses
-            As for `closure_error`.
-        uncorrected
-            (4, 4) `closure_error` without errors of the camera.
-        error_index
-            Index of the error.
-        step
-            First secant step.
-        """
-        scale = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
-        errors = np.zeros(kernels.ERRORS)
-        previous_error, residual = 0.0, se3.log(uncorrected) * scale
-        error = step
-        for _ in range(_MAX_SECANT_STEPS):
-            errors[error_index] = error
-            closure = self.closure_error(poses, errors)
-            previous_residual, residual = residual, se3.log(closure) * scale
-            slope = (residual - previous_residual) / (error - previous_error)
-            previous_error = error
-            error -= float(slope @ residual) / max(float(slope @ slope), 1e-12)
-            if (
-                abs(error - previous_error) < _CONVERGENCE * step
-                or abs(error) > _IMPLAUSIBLE * step
-            ):
-                break
-        return previous_error, closure
-
-
-def _norms(T: Float64) -> tuple[float, float]:
-    return float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
-
-
 def _check_by_loop(
     views: Sequence[SampledView],
     refined: Refined,
-    sigmas: Mapping[str, float],
+    first: _FirstEstimates,
     without_error: CalibrationCheck,
     options: RefineOptions,
 ) -> CalibrationCheck:
@@ -501,12 +359,12 @@ def _check_by_loop(
     ----------
     views, refined, options
         As for `check_calibration`.
-    sigmas
-        Standard deviations of the errors that the views determine.
+    first
+        The first estimates.
     without_error
         The result if there is no error.
     """
-    loop = _Loop.longest(views, refined, options)
+    loop = Loop.longest(views, refined, options)
     if loop is None:
         return without_error
     poses = refined.start
@@ -514,8 +372,9 @@ def _check_by_loop(
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
     candidates: dict[str, tuple[float, Gap]] = {}
-    for name in (name for name in _REVEALED_BY_LOOP if name in sigmas):
-        step = _FIRST_STEP * TOLERANCES[name]
+    sigmas = first.sigmas
+    for name in (name for name in _REVEALED_BY_LOOP if name in first.determined):
+        step = _LOOP_FACTOR * TOLERANCES[name]
         error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
         if not (gap.closes and _large(name, error, sigmas[name], _LOOP_FACTOR)):
@@ -537,21 +396,6 @@ def _check_by_loop(
         gap=candidates[best][1],
         best=best,
     )
-
-
-def longest_loop(pairs: Intp) -> tuple[int, int] | None:
-    """The pair (i, j) furthest apart in time between which all consecutive views overlap."""
-    if not len(pairs):
-        return None
-    overlapping = np.zeros(int(pairs.max()) + 1, bool)
-    overlapping[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
-    breaks = np.concatenate([[0], np.cumsum(~overlapping)])
-    i, j = pairs.T
-    unbroken = (breaks[j] == breaks[i]) & (j > i + 1)
-    if not unbroken.any():
-        return None
-    k = int(np.argmax(np.where(unbroken, j - i, -1)))
-    return int(i[k]), int(j[k])
 
 
 def in_words(errors: Mapping[str, float]) -> list[str]:

@@ -20,10 +20,10 @@ from tofuse.posegraph.calibration_check import (
     CalibrationCheck,
     check_calibration,
     combine_checks,
-    loop_gap,
 )
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.joint_alignment import Refined, refine
+from tofuse.posegraph.loop_drift import loop_gap
 from tofuse.posegraph.pair_equations import RefineOptions
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.split_half import split_half_errors

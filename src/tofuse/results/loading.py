@@ -142,8 +142,15 @@ def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
         return None
     bounds = (data["stated_bound_m"], data["corrected_bound_m"])
     before, after = (np.inf if b is None else float(b) for b in bounds)
-    lens = (data.get(name, 0.0) for name in ("center_x", "center_y", "distortion"))
-    return SelfCalibration(data["focal"], data["offset_m"], *lens, data["sigma"], (before, after))
+    return SelfCalibration(
+        data["focal"],
+        data["offset_m"],
+        data.get("center_x", 0.0),
+        data.get("center_y", 0.0),
+        data.get("distortion", 0.0),
+        data["sigma"],
+        (before, after),
+    )
 
 
 def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
