@@ -189,16 +189,13 @@ class Assessment:
     def _calibration_error(self, check: CalibrationCheck | None) -> tuple[float, float]:
         """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
 
-        It is the gap of a loop that a better calibration would close, or the change of the poses
-        under the estimated calibration; plus the uncertainty of corrections.
+        It is the change of the poses under the estimated calibration, or the gap of a loop that a
+        better calibration would close, if larger; plus the uncertainty of corrections.
         """
         if check is None:
             return 0.0, 0.0
-        errors = [np.zeros(2)]
-        if check.alarm and check.gap is not None:
-            errors.append(np.array(check.gap.before))
-        else:
-            errors.append(np.array(check.moved))
+        gap = check.gap.before if check.alarm and check.gap is not None else (0.0, 0.0)
+        errors = [np.maximum(check.moved, gap)]
         for part in self.config.corrections:
             if isinstance(part, CameraErrors):
                 sigmas = part.sigmas

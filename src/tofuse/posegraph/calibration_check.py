@@ -98,8 +98,7 @@ class CalibrationCheck:
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
         Rms motion (m, rad) of the poses, after alignment, if the likely errors are corrected
-        together; if none is likely, the largest motion by the estimate of one that the views
-        determine.
+        together, or by the first estimate of an error that the views determine, if larger.
     """
 
     alarm: bool = False
@@ -197,6 +196,7 @@ def check_calibration(
             return by_loop
     support = float(best.before.of_views(len(views)).mean())
     position, rotation = aligned_motion(refined.poses, joint.poses)
+    joint_motion = (_rms(position), _rms(rotation))
     return replace(
         without_error,
         alarm=alarm,
@@ -205,7 +205,7 @@ def check_calibration(
         support=(support, support + _support_gain(best, views)),
         gap=gap,
         best=best_name,
-        moved=(_rms(position), _rms(rotation)),
+        moved=max(joint_motion, first.largest_motion),
     )
 
 
