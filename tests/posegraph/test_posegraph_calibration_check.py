@@ -11,7 +11,7 @@ from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
-from tofuse.posegraph.calibration_check import check_calibration
+from tofuse.posegraph.calibration_check import check_calibration, proposal
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
 from tofuse.posegraph.loop_drift import Gap, Loop, longest_loop
@@ -202,3 +202,15 @@ def test_kinect_loop_raises_alarm(shared_data):
     assert calibrated.calibrated is not None
     assert calibrated.calibrated.focal == pytest.approx(-0.05, abs=0.015)
     assert calibrated.accuracy.position_m < 0.1 * result.diagnostics.accuracy.position_m
+
+
+def test_proposal_names_two_alternatives_or_the_best() -> None:
+    errors = {"focal": -0.05, "distortion": -0.02}
+    assert proposal(errors, "focal") == (
+        "a focal length 5.3% larger or 2.0% more pincushion distortion at 45 degrees"
+    )
+    errors |= {"center_y": 0.03}
+    assert proposal(errors, "center_y") == (
+        "a principal point 3.0% of the focal length further up (or other calibration errors with a "
+        "similar effect)"
+    )

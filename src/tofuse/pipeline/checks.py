@@ -13,7 +13,7 @@ from tofuse.evaluation.cross_view import CrossViewConsistency
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, find_jumps
 from tofuse.posegraph.accuracy import Accuracy
-from tofuse.posegraph.calibration_check import in_words as camera_in_words
+from tofuse.posegraph.calibration_check import proposal
 from tofuse.posegraph.covariances import loop_errors
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import LoopRecord, Optimisation
@@ -474,7 +474,7 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
         return
     gap = check.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
-    correction = " or ".join(camera_in_words(check.errors))
+    correction = proposal(check.errors, check.best)
     text = (
         f"Odometry drift over loop {gap.i}-{gap.j} is {_length(m)}, {_angle(rad)}. "
         f"{correction[0].upper()}{correction[1:]} would reduce it to {_length(m_after)}, "
@@ -495,7 +495,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
             f"{_length(0.01 * check.motion['focal'][0])}."
         )
     elif check.unconfirmed:
-        correction = " or ".join(camera_in_words(check.unconfirmed))
+        correction = proposal(check.unconfirmed, check.best)
         qualifier = (
             "but no loop closure confirms it"
             if check.large

@@ -419,3 +419,12 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
         kind = "barrel" if errors["distortion"] > 0 else "pincushion"
         words.append(f"{abs(errors['distortion']):.1%} more {kind} distortion at 45 degrees")
     return words
+
+
+def proposal(errors: Mapping[str, float], best: str) -> str:
+    """Describe the corrections of `errors` as alternatives; of more than two, only `best`."""
+    alternatives = in_words(errors)
+    if len(alternatives) < 3 or best not in errors:
+        return " or ".join(alternatives)
+    (text,) = in_words({best: errors[best]})
+    return f"{text} (or other calibration errors with a similar effect)"

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.posegraph.calibration_check import in_words
+from tofuse.posegraph.calibration_check import proposal
 from tofuse.posegraph.refinement import Refinement
 from tofuse.report import plots, words
 from tofuse.report.subject import Figure, Subject, Values
@@ -236,11 +236,15 @@ def _camera_check(refinement: Refinement | None) -> str:
     if check is None:
         return text.strip()
     if check.errors:
-        verdict = "Check the calibration" if check.alarm else "This is not significant"
-        errors = " or ".join(in_words(check.errors))
-        text += f"Overlapping views would be more consistent with {errors}. {verdict}. "
+        verdict = "This is not significant"
+        if check.alarm:
+            verdict = "Check the calibration"
+        elif check.unconfirmed:
+            verdict = "The stated accuracy includes its effect"
+        correction = proposal(check.errors, check.best)
+        text += f"Overlapping views would be more consistent with {correction}. {verdict}. "
     elif not refinement.errors:
-        text += "No evidence of a focal-length or range-offset error. "
+        text += "No evidence of errors of the intrinsics or of the range. "
     if check.gap is not None:
         gap, (m, rad), (m_after, rad_after) = check.gap, check.gap.before, check.gap.after
         text += (
