@@ -15,8 +15,16 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable, ray_lengths
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
+# Options of each error and of its standard deviation, by the names of the calibration check.
+FIELDS = {
+    "focal": ("focal", "focal_sigma"),
+    "offset": ("offset_m", "offset_sigma_m"),
+    "center_x": ("center_x", "center_x_sigma"),
+    "center_y": ("center_y", "center_y_sigma"),
+    "distortion": ("distortion", "distortion_sigma"),
+}
 
-# Larger values indicate a wrong camera, not an error.
+
 @part("correction", "camera-errors")
 @dataclass(frozen=True)
 class CameraErrors(Bounded, Correction):
@@ -38,6 +46,7 @@ class CameraErrors(Bounded, Correction):
         Standard deviations of these, which the stated accuracy of poses includes.
     """
 
+    # Larger values indicate a wrong camera, not an error.
     focal: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
     offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
     center_x: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
@@ -65,23 +74,21 @@ class CameraErrors(Bounded, Correction):
             self.center_x * (1 + other.focal) + other.center_x,
             self.center_y * (1 + other.focal) + other.center_y,
             self.distortion + other.distortion,
-            other.focal_sigma if other.focal else self.focal_sigma,
-            other.offset_sigma_m if other.offset_m else self.offset_sigma_m,
-            other.center_x_sigma if other.center_x else self.center_x_sigma,
-            other.center_y_sigma if other.center_y else self.center_y_sigma,
-            other.distortion_sigma if other.distortion else self.distortion_sigma,
+            **{
+                sigma: getattr(other if getattr(other, error) else self, sigma)
+                for error, sigma in FIELDS.values()
+            },
         )
 
     @property
+    def errors(self) -> dict[str, float]:
+        """The errors by name, as in `FIELDS`."""
+        return {name: getattr(self, error) for name, (error, _) in FIELDS.items()}
+
+    @property
     def sigmas(self) -> dict[str, float]:
-        """The standard deviations of "focal", "offset", "center_x", "center_y", "distortion"."""
-        return {
-            "focal": self.focal_sigma,
-            "offset": self.offset_sigma_m,
-            "center_x": self.center_x_sigma,
-            "center_y": self.center_y_sigma,
-            "distortion": self.distortion_sigma,
-        }
+        """Their standard deviations by name."""
+        return {name: getattr(self, sigma) for name, (_, sigma) in FIELDS.items()}
 
     @classmethod
     def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:

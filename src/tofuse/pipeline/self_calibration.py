@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.corrections.camera_errors import CameraErrors
+from tofuse.corrections.camera_errors import FIELDS, CameraErrors
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.calibration_check import CalibrationCheck
@@ -27,21 +27,6 @@ from tofuse.results.verdict import ranked
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
-# Options of `CameraErrors` by the names of the errors; their standard deviations.
-_FIELDS = {
-    "focal": "focal",
-    "offset": "offset_m",
-    "center_x": "center_x",
-    "center_y": "center_y",
-    "distortion": "distortion",
-}
-_SIGMAS = {
-    "focal": "focal_sigma",
-    "offset": "offset_sigma_m",
-    "center_x": "center_x_sigma",
-    "center_y": "center_y_sigma",
-    "distortion": "distortion_sigma",
-}
 
 Reconstruct = Callable[[Config], Reconstruction]
 
@@ -82,18 +67,18 @@ def self_calibrated(
             correction.center_x,
             correction.center_y,
             correction.distortion,
-            {_FIELDS[check.best]: check.sigmas[check.best]},
+            {FIELDS[check.best][0]: check.sigmas[check.best]},
             (_bound(initial), _bound(candidate)),
         )
-        best = replace(candidate, diagnostics=_with_calibration(candidate, calibration))
+        diagnostics = _with_calibration(candidate, correction, calibration)
+        best = replace(candidate, diagnostics=diagnostics)
         applied = correction
     return best
 
 
 def in_words(correction: CameraErrors) -> str:
     """Describe a correction: "a focal length 4.5 % smaller"."""
-    errors = {name: getattr(correction, field) for name, field in _FIELDS.items()}
-    return " and ".join(errors_in_words({name: e for name, e in errors.items() if e}))
+    return " and ".join(errors_in_words({name: e for name, e in correction.errors.items() if e}))
 
 
 def _estimated_error(
@@ -107,12 +92,12 @@ def _estimated_error(
     if check is None:
         return None
     best = check.best
-    remaining = check.improves and best in check.unconfirmed and getattr(applied, _FIELDS[best])
+    remaining = check.improves and best in check.unconfirmed and applied.errors[best]
     if not (check.alarm or remaining):
         return None
-    values = {_FIELDS[best]: check.errors[best], _SIGMAS[best]: check.sigmas[best]}
+    error, sigma = FIELDS[best]
     try:
-        return check, CameraErrors(**values)
+        return check, CameraErrors(**{error: check.errors[best], sigma: check.sigmas[best]})
     except ValueError:
         return None  # implausibly large
 
@@ -155,11 +140,12 @@ def _support(result: Reconstruction) -> float:
     return refinement.support[0] if refinement is not None else 0.0
 
 
-def _with_calibration(result: Reconstruction, calibration: SelfCalibration) -> Diagnostics:
+def _with_calibration(
+    result: Reconstruction, correction: CameraErrors, calibration: SelfCalibration
+) -> Diagnostics:
     """Return the diagnostics with the self-calibration and its reason."""
     d = result.diagnostics
     indices = [f.index for f in d.frames]
-    correction = CameraErrors(*(getattr(calibration, field) for field in _FIELDS.values()))
     text = (
         f"The calibration of the camera was corrected: views agree with {in_words(correction)} "
         f"than stated.{_bound_change(*calibration.bound_m)}"

@@ -180,7 +180,8 @@ def check_calibration(
     errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
     large = any(_large(name, error, first.sigmas[name]) for name, error in errors.items())
     certain = abs(errors[best_name]) > _SIGNIFICANT * first.sigmas[best_name]
-    improves = certain and _support_gain(best, views) > _SUPPORT_NOISE
+    support, with_best = (float(s.of_views(len(views)).mean()) for s in (best.before, best.after))
+    improves = certain and with_best - support > _SUPPORT_NOISE
     gap = None
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
@@ -194,7 +195,6 @@ def check_calibration(
         by_loop = _check_by_loop(views, refined, first, without_error, options)
         if by_loop.alarm:
             return by_loop
-    support = float(best.before.of_views(len(views)).mean())
     position, rotation = aligned_motion(refined.poses, joint.poses)
     joint_motion = (_rms(position), _rms(rotation))
     return replace(
@@ -202,7 +202,7 @@ def check_calibration(
         alarm=alarm,
         errors={name: errors[name] for name in _INDEX if name in errors},
         sigmas={name: first.sigmas[name] for name in _INDEX if name in errors},
-        support=(support, support + _support_gain(best, views)),
+        support=(support, with_best),
         gap=gap,
         best=best_name,
         moved=max(joint_motion, first.largest_motion),
@@ -334,11 +334,6 @@ def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
     """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
     position, rotation = aligned_motion(poses, poses @ se3.exp(_DELTA * twists))
     return _rms(position) / _DELTA, _rms(rotation) / _DELTA
-
-
-def _support_gain(refined: Refined, views: Sequence[SampledView]) -> float:
-    n = len(views)
-    return float(refined.after.of_views(n).mean() - refined.before.of_views(n).mean())
 
 
 def _check_by_loop(
