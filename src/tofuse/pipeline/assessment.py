@@ -130,7 +130,9 @@ class Assessment:
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,
             components=components,
-            moving=tuple((e.record.index, e.moving_share) for e in posed if e.moving_share > 0),
+            moving=tuple(
+                (e.record.index, e.moving_fraction) for e in posed if e.moving_fraction > 0
+            ),
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
         )

@@ -34,7 +34,7 @@ class Entry:
         Number of its recording, if several are joined.
     T_odometry, gravity
         Measurements of external sensors: (4, 4), (4,).
-    moving_share
+    moving_fraction
         Fraction of its pixels on moving objects.
     """
 
@@ -43,7 +43,7 @@ class Entry:
     recording: int
     T_odometry: Float64 | None = None
     gravity: Float64 | None = None
-    moving_share: float = 0.0
+    moving_fraction: float = 0.0
 
     @property
     def has_pose(self) -> bool:
