@@ -7,6 +7,7 @@ import errno
 import json
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
@@ -426,7 +427,10 @@ def test_jobs_do_not_inherit_memory_limit_of_dask_workers(tmp_path, monkeypatch)
     seen: list[bytes] = []
 
     def on_start(process: subprocess.Popen[bytes]) -> None:
-        seen.append(Path(f"/proc/{process.pid}/environ").read_bytes())
+        environ = Path(f"/proc/{process.pid}/environ")
+        while not (content := environ.read_bytes()) and process.poll() is None:
+            time.sleep(0.001)  # Linux fills the file in a moment after Popen has returned
+        seen.append(content)
 
     record = work(Task(job, str(folder.path), 1), on_start)
     assert record.state == "failed"
