@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
@@ -46,8 +47,8 @@ TOLERANCES = {
 }
 # Errors that the drift over a loop can reveal; that by the others resembles any drift.
 _REVEALED_BY_LOOP = ("focal", "offset")
-# Significance of an error in standard deviations, for an alarm and for a full estimate; and the
-# fraction of the tolerance that one Newton step must reach for the latter.
+# Significance of an error in standard deviations of a normal distribution, for an alarm and for a
+# full estimate; and the fraction of the tolerance that one Newton step must reach for the latter.
 _SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
 # Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
 _MAX_SIGMA = 0.8
@@ -99,6 +100,9 @@ class CalibrationCheck:
     moved
         Rms motion (m, rad) of the poses, after alignment, if the likely errors are corrected
         together, or by the first estimate of an error that the views determine, if larger.
+    significance
+        Number of standard deviations that an estimate must exceed to be significant, see
+        `significance_of`.
     """
 
     alarm: bool = False
@@ -110,6 +114,7 @@ class CalibrationCheck:
     focal_sigma: float | None = None
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
+    significance: float = _SIGNIFICANT
 
     @property
     def undetermined(self) -> bool:
@@ -127,7 +132,7 @@ class CalibrationCheck:
             return {}
         if not self.large and not self.improves:
             return {}
-        return {n: e for n, e in self.errors.items() if abs(e) > _SIGNIFICANT * self._sigma(n)}
+        return {n: e for n, e in self.errors.items() if abs(e) > self._limit(n)}
 
     @property
     def improves(self) -> bool:
@@ -137,18 +142,28 @@ class CalibrationCheck:
     @property
     def large(self) -> dict[str, float]:
         """Significant errors that exceed the calibration error of usual cameras."""
-        return {n: e for n, e in self.errors.items() if _large(n, e, self._sigma(n))}
+        return {n: e for n, e in self.errors.items() if _large(n, e, self._limit(n))}
 
-    def _sigma(self, name: str) -> float:
-        return self.sigmas.get(name, np.inf)
+    def _limit(self, name: str) -> float:
+        return self.significance * self.sigmas.get(name, np.inf)
+
+
+def significance_of(view_count: int) -> float:
+    """Return the number of standard deviations that a significant error must exceed.
+
+    The probability of chance is that of four standard deviations of a normal distribution. Few
+    views determine their own scatter poorly, so that the estimate follows Student's t-distribution.
+    """
+    return -float(stdtrit(max(view_count - 1, 1), ndtr(-_SIGNIFICANT)))
 
 
 def _determined(name: str, sigma: float) -> bool:
     return sigma < _MAX_SIGMA * TOLERANCES[name]
 
 
-def _large(name: str, error: float, sigma: float, factor: float = 1.0) -> bool:
-    return abs(error) > max(factor * TOLERANCES[name], _SIGNIFICANT * sigma)
+def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
+    """Whether an error exceeds its tolerance, and the limit of significance."""
+    return abs(error) > max(factor * TOLERANCES[name], limit)
 
 
 def check_calibration(
@@ -164,8 +179,12 @@ def check_calibration(
     if not len(refined.pairs) or len(views) < _MIN_VIEWS:
         return CalibrationCheck()
     first = _FirstEstimates.of(views, refined, options, priors)
+    significance = significance_of(len(views))
     without_error = CalibrationCheck(
-        focal_sigma=first.sigmas["focal"], motion=first.motion, moved=first.largest_motion
+        focal_sigma=first.sigmas["focal"],
+        motion=first.motion,
+        moved=first.largest_motion,
+        significance=significance,
     )
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
@@ -178,8 +197,9 @@ def check_calibration(
     best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
     errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
-    large = any(_large(name, error, first.sigmas[name]) for name, error in errors.items())
-    certain = abs(errors[best_name]) > _SIGNIFICANT * first.sigmas[best_name]
+    limits = {name: significance * first.sigmas[name] for name in errors}
+    large = any(_large(name, error, limits[name]) for name, error in errors.items())
+    certain = abs(errors[best_name]) > limits[best_name]
     support, with_best = (float(s.of_views(len(views)).mean()) for s in (best.before, best.after))
     improves = certain and with_best - support > _SUPPORT_NOISE
     gap = None
@@ -267,7 +287,7 @@ class _Estimator:
     Attributes
     ----------
     views, poses, pairs, options, priors
-        As for `refine`; of many pairs, a part.
+        As for `refine`; of many pairs, a part. The poses are aligned without an error.
     """
 
     views: Sequence[SampledView]
@@ -285,8 +305,11 @@ class _Estimator:
         if count > _MAX_PAIRS:
             views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
             pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
-        coarse_to_fine = replace(options, rounds=COARSE_TO_FINE)
-        return cls(views, refined.poses, pairs, coarse_to_fine, priors)
+        # An estimate of camera errors does not model errors that patches share, so it can't be
+        # compared with the refined poses.
+        coarse_to_fine = replace(options, rounds=COARSE_TO_FINE, shared=0.0)
+        poses = align_views(views, refined.poses, coarse_to_fine, priors=priors, pairs=pairs).poses
+        return cls(views, poses, pairs, coarse_to_fine, priors)
 
     def alone(self, name: str) -> Refined:
         """Estimate one error."""
@@ -372,13 +395,11 @@ def _check_by_loop(
         step = _LOOP_FACTOR * TOLERANCES[name]
         error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
-        if not (gap.closes and _large(name, error, sigmas[name], _LOOP_FACTOR)):
+        limit = without_error.significance * sigmas[name]
+        if not (gap.closes and _large(name, error, limit, _LOOP_FACTOR)):
             continue
         confirmed = loop.error_by_views(poses, _INDEX[name], error)
-        if (
-            _large(name, confirmed, sigmas[name], _LOOP_FACTOR)
-            and confirmed / error > _MIN_CONFIRMED
-        ):
+        if _large(name, confirmed, limit, _LOOP_FACTOR) and confirmed / error > _MIN_CONFIRMED:
             candidates[name] = error, gap
     if not candidates:
         return without_error

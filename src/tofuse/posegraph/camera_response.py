@@ -45,7 +45,7 @@ class Response:
         )
 
     def sigma(self, pairs: Intp, view_count: int) -> Float64:
-        """(ERRORS,) standard deviations, from the spread between views (sandwich estimator).
+        """(ERRORS,) standard deviations, from the scatter between views (sandwich estimator).
 
         It includes noise that neighbouring pixels share and errors of single views, but not errors
         that all views have in common.
@@ -61,8 +61,9 @@ class Response:
         view_gradient = np.zeros((view_count, residual_gradient.shape[1]))
         for ends in pairs.T:
             np.add.at(view_gradient, ends, residual_gradient)
-        spread = np.sqrt((view_gradient**2).sum(0))
-        return np.asarray(spread / np.maximum(self.information.sum(0), 1e-12), np.float64)
+        # One degree of freedom is lost, as the estimate is that of the same views.
+        scatter = np.sqrt((view_gradient**2).sum(0) * view_count / max(view_count - 1, 1))
+        return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
 
 
 def _robust_curvature(limit: float) -> float:

@@ -35,7 +35,7 @@ from tofuse.posegraph.pose_priors import DAMPING, UNITS, WEAK, Priors, weak_prio
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.view_store import SampledView, overlaps
 
-_ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
+_ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
 # Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.
 _MAX_MOTION = 2.0
 # Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
@@ -271,7 +271,8 @@ def align_views(
             rescale(state, stage)
             motions.append(float(np.abs(step / UNITS).max()))
             motion_since_overlaps += motions[-1] if pairs is None else 0.0
-            if motions[-1] < options.convergence:
+            error_change = float(np.abs(error_step).max()) / _ERROR_UNIT
+            if max(motions[-1], error_change) < options.convergence:
                 break
     return AlignedViews(poses, errors, state, fixed_errors, tuple(motions))
 

@@ -15,7 +15,7 @@ from tofuse.posegraph.pair_equations import RefineOptions, Round
 from tofuse.posegraph.view_store import SampledView
 
 # Iterations of an estimate of camera errors, which may be far from the initial poses.
-COARSE_TO_FINE = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
+COARSE_TO_FINE = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(12, 0.0, 0.0))
 # A loop is closed if its error is below this, m and rad.
 _MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
 # Secant steps to the error that closes a loop: their maximum number; and the change at convergence,

@@ -57,7 +57,8 @@ class RefineOptions:
     robust, max_angle, photometric, max_sigma_m
         As in `ProjectiveOptions`.
     convergence
-        Iterations end when no view moves by more, in units of 1 cm and 1 degree.
+        Iterations end when no view moves by more, in units of 1 cm and 1 degree, and no error of
+        the camera changes by more, in units of 1 % and 1 cm.
     shared
         Depth errors that the pixels of a patch share, as a multiple of the disagreement of the
         patches; 0: none. Only in the last round, between views with albedo, and where no error of
