@@ -73,11 +73,13 @@ def test_facts_of_synthetic_frames() -> None:
     assert facts["duration"] == "1.00 s, 10.0 frames per second"
     assert facts["depth"] == "2.00 to 2.00 m, median 2.00 m"
     assert facts["valid points"] == "50%"
-    assert facts["images"].startswith("40 x 30, 52 x 40 degrees")
+    assert facts["images"].startswith("40 x 30, 53 x 41 degrees")
     assert facts["kind of depth"] == "z"
     assert facts["other images"] == "none"
     one = inspect_recording(of([image(2.0, depth_kind="range")])).facts
     assert (one["duration"], one["kind of depth"]) == ("a single frame", "radial range")
+    numbered = [replace(frame, timestamp=float(frame.index)) for frame in frames]
+    assert inspect_recording(of(numbered)).facts["duration"].startswith("unknown")
 
 
 def test_known_poses_are_counted() -> None:

@@ -259,8 +259,10 @@ def test_impossible_exports_are_refused(
 
 
 def test_recording_without_colour_or_amplitude_is_refused(tmp_path: Path) -> None:
+    result = made_result(tmp_path, PLAIN, color="none")
     with pytest.raises(InputError, match="neither colour nor amplitude"):
-        export(made_result(tmp_path, PLAIN, color="none"), ["nerfstudio"])
+        export(result, ["kitti", "nerfstudio"])
+    assert not (result / "trajectory.kitti.txt").exists()
 
 
 def test_only_own_folders_are_replaced(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.arrays import Float64
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.inspection.values import depths_of
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -20,7 +20,7 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
         "recording": recording.path,
         "format": recording.format,
         "frames": str(len(recording)),
-        "duration": _time(recording.timestamps),
+        "duration": _time(recording),
         **_view_facts(recording, frames[0]),
         **_depth_facts(frames),
         "reference poses": _coverage(recording.reference),
@@ -34,9 +34,12 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     return facts
 
 
-def _time(times: Float64) -> str:
+def _time(recording: Recording) -> str:
+    times = recording.timestamps
     if len(times) < 2:
         return "a single frame"
+    if np.array_equal(times, recording.indices):  # numbered by the reader
+        return "unknown, as there are no timestamps"
     step = float(np.median(np.diff(times)))
     rate = f", {1 / step:.1f} frames per second" if step > 0 else ""
     return f"{times[-1] - times[0]:.2f} s{rate}"
@@ -46,11 +49,8 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     if not isinstance(frame, RangeFrame):
         return {"views": f"clouds of about {len(frame)} points"}
     rays = frame.camera.rays()
-    x, y = (
-        np.degrees(np.arctan(rays[rays.shape[0] // 2, :, 0])),
-        np.degrees(np.arctan(rays[:, rays.shape[1] // 2, 1])),
-    )
-    width, height = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
+    width = _angle(rays[rays.shape[0] // 2, :, 0])
+    height = _angle(rays[:, rays.shape[1] // 2, 1])
     model = getattr(frame.camera, "model", type(frame.camera).__name__)
     channels = [
         name + ("" if name != "colour" or frame.color_registered else " (not registered)")
@@ -76,6 +76,15 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
         "kind of depth": "z" if frame.depth_kind == "z" else "radial range",
         "other images": ", ".join(channels) or "none",
     }
+
+
+def _angle(tangents: Float32) -> float:
+    """Angle between the outer edges of a row or column of pixels with the given centres, degrees."""
+    valid = tangents[np.isfinite(tangents)].astype(float)
+    if len(valid) < 2:
+        return 0.0
+    first, last = 1.5 * valid[[0, -1]] - 0.5 * valid[[1, -2]]
+    return float(np.degrees(abs(np.arctan(last) - np.arctan(first))))
 
 
 def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:

@@ -298,8 +298,9 @@ def export(
                     "already exists", where=path, remedy="pass --overwrite to replace it"
                 )
         result = _Result(folder, faces, every, pinhole)
-        for name, path in files.items():
-            FORMATS[name][1](result, path)
+        # Images first: only they can be missing after a complete run.
+        for name in sorted(files, key=lambda name: name not in FOLDERS):
+            FORMATS[name][1](result, files[name])
     return list(files.values())
 
 
