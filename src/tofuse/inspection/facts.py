@@ -79,7 +79,7 @@ def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
 
 
 def _angle(tangents: Float32) -> float:
-    """Angle between the outer edges of a row or column of pixels with the given centres, degrees."""
+    """Angle between the outer edges of a line of pixels with the given centres, degrees."""
     valid = tangents[np.isfinite(tangents)].astype(float)
     if len(valid) < 2:
         return 0.0
