@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.kernels.neighbourhood import is_steeper, largest_angle, window_median
+from tofuse.kernels.neighbourhood import is_steeper, largest_angle
 
 
 def angle_twin(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -49,10 +49,3 @@ def test_is_steeper_matches_twin(threshold: float) -> None:
     far = np.abs(expected - threshold) > 1e-4
     assert (out == (expected > threshold))[far].all()
     assert 5 < out.sum() < (z > 0).sum()
-
-
-def test_window_median_writes_only_its_rows() -> None:
-    z = np.float32([[1, 2, 3], [4, 0, 6], [7, 8, 9]])
-    out = np.full((3, 3), -1, np.float32)
-    window_median(z, 1, 1, 2, out)
-    assert out.tolist() == [[-1, -1, -1], [4, 5, 6], [-1, -1, -1]]
