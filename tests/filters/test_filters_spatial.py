@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofuse import parts
-from tofuse.filters.angle import NeighbourhoodAngle, neighbourhood_angle
+from tofuse.filters.angle import NeighbourhoodAngle
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.neighbours import NeighbourFraction, mean_neighbour_distance
 from tofuse.geometry import se3
@@ -39,29 +39,38 @@ def line(z: Any, focal: float = 1.0) -> RangeFrame:
 # Neighbourhood angle -------------------------------------------------------------------------
 
 
-def test_angle_of_known_triangles() -> None:
-    # Camera at O, p = (0, 0, 1), n = (1, 0, 1): at p a right angle, at n 45 degrees.
-    angle = neighbourhood_angle(line([1, 1]))
-    assert angle[0] == pytest.approx([math.pi / 2, math.pi / 4], abs=1e-6)
-    # p = (0, 0, 1), n = (2, 0, 2): from p, O is at -z and n at (2, 0, 1)/sqrt(5):
-    # cos = -1/sqrt(5), obtuse; at n the camera is at 45 degrees, p at atan2(2, 1) from -z.
-    angle = neighbourhood_angle(line([1, 2]))
-    assert angle[0, 0] == pytest.approx(math.acos(-1 / math.sqrt(5)), abs=1e-6)
-    assert angle[0, 1] == pytest.approx(math.atan2(2, 1) - math.pi / 4, abs=1e-6)
+def is_kept(f: RangeFrame, threshold: float) -> bool:
+    """Whether the first pixel's largest angle to a neighbour is at most the threshold, rad."""
+    return bool(NeighbourhoodAngle(threshold).mask(f, ())[0, 0])
+
+
+def test_angle_of_known_triangle() -> None:
+    # Camera at O, p = (0, 0, 1), n = (2, 0, 2): from p, O is at -z and n at (2, 0, 1)/sqrt(5).
+    angle, f = math.acos(-1 / math.sqrt(5)), line([1, 2])
+    assert is_kept(f, angle + 1e-5)
+    assert not is_kept(f, angle - 1e-5)
+    # At n the camera is at 45 degrees and p at atan2(2, 1) from -z: an acute angle.
+    assert NeighbourhoodAngle(math.pi / 2).mask(f, ())[0].tolist() == [False, True]
 
 
 def test_angle_agrees_with_equation_2_6() -> None:
     rng = np.random.default_rng(0)
+    obtuse = 0
     for _ in range(200):
         z = rng.uniform(0.5, 5, 2)
         f = line(z, focal=float(rng.uniform(1, 50)))
         p, n = f.point_image[0].astype(float)
         phi = math.acos(p @ n / np.linalg.norm(p) / np.linalg.norm(n))
         sine = np.linalg.norm(n) / np.linalg.norm(n - p) * math.sin(phi)
-        xi = float(neighbourhood_angle(f)[0, 0])
-        assert math.sin(xi) == pytest.approx(sine, abs=1e-4)
         # Beyond 90 degrees if n is further away than the foot of the perpendicular to O p at p.
-        assert (xi > math.pi / 2) == (n @ p > p @ p)
+        if n @ p > p @ p:
+            angle = math.pi - math.asin(sine)
+            assert is_kept(f, min(angle + 1e-3, math.pi))
+            assert not is_kept(f, angle - 1e-3)
+            obtuse += 1
+        else:
+            assert is_kept(f, math.pi / 2)
+    assert 50 < obtuse < 150
 
 
 def test_angle_removes_jump_edges_and_keeps_slopes() -> None:
@@ -85,8 +94,7 @@ def test_angle_removes_jump_edges_and_keeps_slopes() -> None:
 def test_angle_ignores_invalid_neighbours() -> None:
     z = np.zeros((5, 5))
     z[2, 2] = 1.0
-    assert neighbourhood_angle(frame(z)).max() == 0
-    assert NeighbourhoodAngle().mask(frame(z), ()).all()
+    assert NeighbourhoodAngle(math.pi / 2).mask(frame(z), ()).all()
 
 
 # Nearest neighbours --------------------------------------------------------------------------
