@@ -29,11 +29,10 @@ def objective(graph: PoseGraph, poses: Float64) -> float:
     return graph.with_poses(poses).chi2()
 
 
-@pytest.mark.parametrize("rotation", ["tangent", "quaternion", "cosines"])
-def test_result_is_minimum_in_every_direction(rotation):
+def test_result_is_minimum_in_every_direction():
     """At the solution no small motion of any pose lowers the objective, and slopes are zero."""
     graph, _, _ = walk(20, 10)
-    done = minimise(graph, Settings("none", rotation=rotation, tolerance=1e-14))
+    done = minimise(graph, Settings("none", tolerance=1e-14))
     least = done.graph.chi2()
     assert least == pytest.approx(done.objective[-1])
     assert least < 0.1 * graph.chi2()
