@@ -38,7 +38,6 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.corrections.multipath import Multipath
-from tofuse.evaluation.surface_error import Surface, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.layout import Layout
@@ -50,6 +49,7 @@ from tofuse.fusion.stored_views import StoredViews
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan
 from tofuse.pipeline.config import Config, from_method
