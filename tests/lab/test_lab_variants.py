@@ -22,6 +22,7 @@ from tofuse.lab.methods.variants import (
     SymmetricIcp,
     Tricp,
 )
+from tofuse.pipeline.config import PACKAGES
 from tofuse.registration.base import Registrar
 from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import MaxDistance
@@ -150,7 +151,8 @@ def test_named_variants_register():
 
 
 def test_variants_are_configurable_by_name():
-    parts.discover("tofuse.lab.methods")
+    for package in PACKAGES:
+        parts.discover(package)
     for name, data in {
         "point-to-plane": {"resolution": 0.05},
         "symmetric": {"points": 500},
