@@ -289,7 +289,8 @@ def main(arguments: list[str] | None = None) -> int:
         seconds = result.diagnostics.seconds["fusion"]
         print(f"fusion took {1e3 * seconds / len(frames):.0f} ms/frame in total")
     with threads(1):
-        volume = Volume.around(views, made.poses, fitting_voxel(views), Fusion())
+        layout = Layout.of(views, made.poses, fitting_voxel(views))
+        volume = Volume.of(layout, layout.single_region())
         print(f"voxels of {1e3 * volume.voxel_m:.1f} mm, {len(volume.keys):,} blocks")
         for turn in range(options.repeat):
             started = time.process_time()
