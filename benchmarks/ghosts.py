@@ -69,7 +69,7 @@ class Walk:
     Attributes
     ----------
     scene, camera
-        Names in `simulation.scene.SCENES` and `sensor.models.CAMERAS`.
+        Names in `simulation.scene.SCENES` and `simulation.models.CAMERAS`.
     seed
         Random seed of scene, path and noise.
     every

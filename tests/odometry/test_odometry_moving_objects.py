@@ -14,6 +14,7 @@ from tofuse.kernels import moving_objects as kernels
 from tofuse.kernels.rigid_motions import distance_and_angle
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.odometry.moving_objects import (
@@ -28,7 +29,6 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.sensor.models import camera_model
 
 FRAMES = 18
 NEAR = 1.3  # m
