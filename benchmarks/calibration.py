@@ -22,11 +22,11 @@ from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import calibrated
 from tofuse.recordings.recording import Recording
-from tofuse.sensor.models import CameraModel, camera_model
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath")

@@ -19,6 +19,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numba
+
+from tofuse.kernels.ahead import DTYPES
+
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
 ALONE = (
@@ -26,6 +30,7 @@ ALONE = (
     "from tofuse.cli import main; sys.exit(main())"
 )
 BOTH = "import sys; from tofuse.cli import main; sys.exit(main())"
+_NAMES = {name: short for short, name in DTYPES.items()} | {"bool": "b1"}
 
 
 def seconds(program: str, recording: Path, cache: str) -> float:
@@ -55,14 +60,31 @@ def print_table(recording: Path) -> None:
     print(f"| compiled with a second process | {helped:.1f} |")
 
 
+def signature_line(name: str, types: tuple[Any, ...]) -> str:
+    """Line of the list for a kernel, "module.function", and types of its arguments."""
+    return " ".join([name, *(_text_of(kind) for kind in types)])
+
+
+def _text_of(kind: Any) -> str:
+    kinds = numba.types
+    if isinstance(kind, kinds.BaseNamedTuple):
+        named = kind.instance_class
+        fields = ",".join(_text_of(field) for field in kind.types)
+        return f"{named.__module__.rsplit('.', 1)[1]}.{named.__name__}({fields})"
+    if isinstance(kind, kinds.UniTuple):
+        return f"{kind.count}x{_text_of(kind.dtype)}"
+    if isinstance(kind, kinds.Array):
+        mark = "" if kind.mutable else "!"
+        return f"{mark}{_NAMES[str(kind.dtype)]}:{kind.ndim}{kind.layout}"
+    return _NAMES[str(kind)]
+
+
 def called(recordings: list[Path]) -> list[str]:
     """Lines of the list, in the order in which runs call the kernels."""
     lines: dict[str, None] = {}
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NUMBA_CACHE_DIR"] = cache
         from numba.core import event
-
-        from tofuse.kernels import ahead
 
         depth = 0
 
@@ -72,7 +94,7 @@ def called(recordings: list[Path]) -> list[str]:
                 kernel = event.data["dispatcher"].py_func
                 if depth == 0 and kernel.__module__.startswith("tofuse.kernels."):
                     name = f"{kernel.__module__.rsplit('.', 1)[1]}.{kernel.__name__}"
-                    lines.setdefault(ahead.signature_line(name, event.data["args"]))
+                    lines.setdefault(signature_line(name, event.data["args"]))
                 depth += 1
 
             def on_end(self, event: Any) -> None:

@@ -28,6 +28,7 @@ from tofuse.corrections.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
 from tofuse.recordings.correction_file import corrected_depth
@@ -37,7 +38,6 @@ from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, ali
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import FitStatistics
-from tofuse.sensor.models import camera_model
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
 PAIRS = ((0, 1), (1, 2), (0, 2))

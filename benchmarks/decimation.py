@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64
-from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.files.ply import read_ply
 from tofuse.fusion.mesh import Mesh
 from tofuse.kernels.kdtree import KdTree
+from tofuse.lab.experiments.surface_error import Surface, distances
 
 _POINTS = 400_000
 _SAMPLES = 4_000_000  # of the surface to which distances are measured

@@ -35,6 +35,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model, noise_of
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import Scene, build
 from tofuse.recordings.correction_file import corrected_depth
@@ -42,8 +43,6 @@ from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import covariance
-from tofuse.sensor.models import CameraModel, camera_model
-from tofuse.sensor.noise import of_camera
 
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree
@@ -92,7 +91,7 @@ def true_information(
     contrast, gain = model.modulation_contrast, model.counts_per_electron
     returned = albedo * cosine / distance**2 * model.transmission
     amplitude = np.maximum(model.signal_electrons * contrast * gain * returned, 1e-3)
-    law = of_camera(model).amplitude
+    law = noise_of(model).amplitude
     assert law is not None
     sigma = np.sqrt(law.floor**2 + law.shot**2 / amplitude + law.dark**2 / amplitude**2)
 

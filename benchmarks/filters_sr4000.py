@@ -16,14 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.filters.amplitude import Amplitude
 from tofuse.filters.angle import NeighbourhoodAngle
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.confidence import Confidence
 from tofuse.filters.distance import Distance
-from tofuse.filters.median import Median
-from tofuse.filters.neighbours import NeighbourDistance, NeighbourFraction
-from tofuse.filters.temporal import TemporalDeviation, z_deviation
+from tofuse.filters.neighbours import NeighbourFraction
+from tofuse.lab.methods.filters_amplitude import Amplitude
+from tofuse.lab.methods.filters_median import Median
+from tofuse.lab.methods.filters_neighbour_distance import NeighbourDistance
+from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 

@@ -38,7 +38,6 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.corrections.multipath import Multipath
-from tofuse.evaluation.surface_error import Surface, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.layout import Layout
@@ -50,6 +49,7 @@ from tofuse.fusion.stored_views import StoredViews
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan
 from tofuse.pipeline.config import Config, from_method
@@ -289,7 +289,8 @@ def main(arguments: list[str] | None = None) -> int:
         seconds = result.diagnostics.seconds["fusion"]
         print(f"fusion took {1e3 * seconds / len(frames):.0f} ms/frame in total")
     with threads(1):
-        volume = Volume.around(views, made.poses, fitting_voxel(views), Fusion())
+        layout = Layout.of(views, made.poses, fitting_voxel(views))
+        volume = Volume.of(layout, layout.single_region())
         print(f"voxels of {1e3 * volume.voxel_m:.1f} mm, {len(volume.keys):,} blocks")
         for turn in range(options.repeat):
             started = time.process_time()

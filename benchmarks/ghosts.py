@@ -27,13 +27,13 @@ import numpy as np
 
 import sequences
 from tofuse.arrays import Bool, Float64
-from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.evaluation.trajectory import align
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.tsdf import fuse_surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.experiments.surface_error import Surface, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan, write
 from tofuse.pipeline.adaptation import adapted
@@ -69,7 +69,7 @@ class Walk:
     Attributes
     ----------
     scene, camera
-        Names in `simulation.scene.SCENES` and `sensor.models.CAMERAS`.
+        Names in `simulation.scene.SCENES` and `simulation.models.CAMERAS`.
     seed
         Random seed of scene, path and noise.
     every

@@ -37,7 +37,7 @@ from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.search import SearchOptions, search
+from tofuse.registration.search import Search
 from tofuse.results.types import Reconstruction
 
 
@@ -146,7 +146,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
         mapped(frames, 30)
         ends = [prepare_view(frames[k], Keyframes().views.surface) for k in (0, -1)]
-        search(ends[0], ends[1], SearchOptions())
+        search = Search.of(ends[0], ends[1])
+        assert search is not None
+        search.exhaustive()
         for count in options.frames:
             result, watch = mapped(frames, count)
             print(row(result, watch), flush=True)

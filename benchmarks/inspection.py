@@ -29,12 +29,12 @@ from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths, scaled
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import Plan
 from tofuse.lab.simulation.scene import SCENES, build
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import CameraModel, camera_model
 
 Frames = list[RangeFrame]
 

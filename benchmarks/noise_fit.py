@@ -21,6 +21,7 @@ from tofuse.calibration.noise_estimation import NoiseFit, estimate_noise
 from tofuse.files.images import read_image
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
 from tofuse.recordings.frames import RangeFrame
@@ -28,7 +29,6 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.still import average_still
-from tofuse.sensor.models import CAMERAS, camera_model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ZENSE = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)

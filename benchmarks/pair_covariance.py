@@ -44,11 +44,11 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registration
-from tofuse.sensor.models import camera_model
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
 POINTS = 20_000

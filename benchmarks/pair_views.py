@@ -14,10 +14,10 @@ import numpy as np
 
 import unusual
 from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import CameraModel, camera_model
 from unusual import Unusual
 
 VIEWS = 14

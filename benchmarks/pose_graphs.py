@@ -27,11 +27,11 @@ from threadpoolctl import threadpool_limits
 from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import quaternion, se3
+from tofuse.lab.methods.charts import Cosines, Quaternion, descend
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios
 from tofuse.lab.simulation.laps import drifting_laps
 from tofuse.posegraph.castellani import Castellani
-from tofuse.posegraph.charts import Quaternion
 from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt, minimise
@@ -251,9 +251,11 @@ def convergence(figure: Path | None) -> None:
     """Print and plot the convergence of the objective."""
     graph, _ = make_graph("walk", 0, 0.0, noise=8.0)
     curves: dict[str, list[float]] = {}
-    for rotation in ("tangent", "quaternion", "cosines"):
-        settings = Settings("none", rotation=rotation, tolerance=1e-13)
-        curves[f"Levenberg-Marquardt, {rotation}"] = list(minimise(graph, settings).objective)
+    own = minimise(graph, Settings("none", tolerance=1e-13))
+    curves["Levenberg-Marquardt, tangent"] = list(own.objective)
+    for name, chart in (("quaternion", Quaternion()), ("cosines", Cosines())):
+        log = descend(graph, chart, tolerance=1e-13).log
+        curves[f"Levenberg-Marquardt, {name}"] = [float(chi2.sum()) for chi2, _ in log]
     curves["Lu-Milios"] = list(LuMilios(tolerance=1e-13).optimise(graph).objective)
     curves["generic solver (L-BFGS), quaternion"] = general_solver(graph)
     minimum = min(min(c) for c in curves.values())

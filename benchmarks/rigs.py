@@ -33,6 +33,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wander
 from tofuse.posegraph.view_store import SampledView
@@ -43,7 +44,6 @@ from tofuse.rigs.check import compare
 from tofuse.rigs.hand_eye import Track, hand_eye
 from tofuse.rigs.inputs import Camera, open_cameras
 from tofuse.rigs.joint import View, disagreements, refine_together
-from tofuse.sensor.models import CameraModel, camera_model
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "azure_kinect_rig"
 STILL = Effects(multipath=False, scatter=0.0, smear=False)

@@ -21,11 +21,11 @@ from tofuse.files.images import read_image
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
-from tofuse.sensor.models import CAMERAS, camera_model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"

@@ -24,12 +24,12 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation import scene as simulated
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.passing import Kind, Passing
 from tofuse.lab.simulation.record import plan, write
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import camera_model
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 
@@ -67,7 +67,7 @@ class Scene:
     Attributes
     ----------
     camera
-        Name in `sensor.models.CAMERAS`.
+        Name in `simulation.models.CAMERAS`.
     first, frames
         First raw frame, and number of frames.
     elsewhere

@@ -19,6 +19,7 @@ from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths, sensor
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.record import Plan
 from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
@@ -26,7 +27,6 @@ from tofuse.lab.simulation.scenes.furniture import chair, plant
 from tofuse.lab.simulation.texture import Material
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import CameraModel, camera_model
 
 WALL = Material("wall", 0.65, 0.1, "noise", (0.5, 0.5, 0.5))
 GROUND = Material("ground", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))

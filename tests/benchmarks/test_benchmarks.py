@@ -14,7 +14,8 @@ from tofuse.evaluation.consistency import map_consistency
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady
 from tofuse.kernels import steps
-from tofuse.posegraph.build import Measured, chain
+from tofuse.lab.experiments.peaks import chain
+from tofuse.posegraph.build import Measured
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 

@@ -17,6 +17,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import calibrated
@@ -24,7 +25,6 @@ from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.depth_correction import DepthCorrection
-from tofuse.sensor.models import camera_model
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(64, 48, 60.0, 60.0, 31.5, 23.5)

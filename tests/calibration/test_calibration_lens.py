@@ -20,13 +20,13 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole, Rational
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import camera_model
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 TRUE = camera_model("sr4000").camera

@@ -16,6 +16,7 @@ from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
@@ -24,7 +25,6 @@ from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import camera_model
 from tofuse.sensor.noise import NOISE, NoiseModel
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)

@@ -15,7 +15,6 @@ import pytest
 from tofuse.corrections.scattering import LensScattering
 from tofuse.errors import InputError
 from tofuse.filters.background import Background
-from tofuse.filters.mask import Mask
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.lab.simulation.scenes import box
@@ -168,21 +167,3 @@ def test_given_scattering_needs_no_fit_and_requires_amplitude() -> None:
     for options in ({"fractions": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
         with pytest.raises(ValueError, match=r"fractions|widths|period_m"):
             LensScattering(**options)
-
-
-def test_mask_is_read_from_image(tmp_path) -> None:
-    frame = shown("box").frames[0]
-    image = np.zeros(frame.depth.shape, np.uint8)
-    image[30:40, 50:60] = 1
-    path = tmp_path / "mask.png"
-    cv2.imwrite(str(path), image)
-    assert (Mask(str(path)).mask(frame, ()) == (image > 0)).all()
-    cv2.imwrite(str(tmp_path / "color.png"), np.dstack([image, 0 * image, 0 * image]))
-    assert (Mask(str(tmp_path / "color.png")).mask(frame, ()) == (image > 0)).all()
-    cv2.imwrite(str(tmp_path / "small.png"), image[:10])
-    (tmp_path / "text.png").write_text("no image")
-    for name, why in (("small", "176 x 10"), ("text", "not an image"), ("none", "can't be read")):
-        with pytest.raises(InputError, match=why):
-            Mask(str(tmp_path / f"{name}.png")).mask(frame, ())
-    with pytest.raises(ValueError, match="empty"):
-        Mask("")

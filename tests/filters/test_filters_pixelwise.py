@@ -1,4 +1,4 @@
-"""Filters of single points: confidence, amplitude, distance, box, foreground."""
+"""Filters of single points: confidence, distance, foreground."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import pytest
 
 from tofuse import parts
 from tofuse.errors import InputError
-from tofuse.filters.amplitude import Amplitude
 from tofuse.filters.base import Filter, Removal, apply_filters
 from tofuse.filters.confidence import Confidence
-from tofuse.filters.distance import Box, Distance
+from tofuse.filters.distance import Distance
 from tofuse.filters.foreground import Foreground, otsu
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.frames import CloudFrame, RangeFrame
@@ -44,24 +43,9 @@ def test_confidence_level_is_rescaled(highest: int, level: int) -> None:
 def test_views_without_channel_are_kept() -> None:
     f = frame(np.ones((2, 3)))
     cloud = CloudFrame.of(np.ones((5, 3)))
-    for item in (Confidence(7), Amplitude(100.0, 200.0)):
-        assert item.mask(f, ()).all()
-        assert item.mask(cloud, ()).shape == (5,)
-        assert item.mask(cloud, ()).all()
-
-
-def test_amplitude_window_and_saturation() -> None:
-    counts = np.array([[0, 99, 100, 150], [200, 201, 65534, 65535]], np.float32)
-    f = frame(np.ones((2, 4)), amplitude_image=counts)
-    assert np.array_equal(Amplitude(100, 200).mask(f, ()), (counts >= 100) & (counts <= 200))
-    assert np.array_equal(Amplitude().mask(f, ()), counts < 65535)
-    counts[0, 0] = np.nan
-    assert not Amplitude().mask(f, ())[0, 0]
-
-
-def test_amplitude_of_a_cloud() -> None:
-    cloud = CloudFrame(0, 0.0, np.ones((3, 3), np.float32), amplitude=np.float32([1, 5, 65535]))
-    assert Amplitude(2).mask(cloud, ()).tolist() == [False, True, False]
+    assert Confidence(7).mask(f, ()).all()
+    assert Confidence(7).mask(cloud, ()).shape == (5,)
+    assert Confidence(7).mask(cloud, ()).all()
 
 
 def test_distance_distinguishes_z_and_range() -> None:
@@ -77,18 +61,6 @@ def test_distance_distinguishes_z_and_range() -> None:
 def test_cloud_distance_is_from_origin() -> None:
     cloud = CloudFrame(0, 0.0, np.float32([[0, 0, -5], [10, 0, 0]]), origin=np.array([9.0, 0, 0]))
     assert Distance(0.0, 2.0).mask(cloud, ()).tolist() == [False, True]
-
-
-def test_box_keeps_or_removes_inside() -> None:
-    points = np.float32([[0, 0, 1], [1, 1, 2], [1.001, 1, 2], [0, 0, 3]])
-    cloud = CloudFrame.of(points)
-    box = Box((-1.0, -1.0, 1.0), (1.0, 1.0, 2.0))
-    assert box.mask(cloud, ()).tolist() == [True, True, False, False]
-    cut = Box((-1.0, -1.0, 1.0), (1.0, 1.0, 2.0), "inside")
-    assert cut.mask(cloud, ()).tolist() == [False, False, True, True]
-    f = frame(np.full((3, 3), 1.5))
-    wide = Box((-9.0, -9.0, 1.0), (9.0, 9.0, 2.0))
-    assert wide.mask(f, ()).all()
 
 
 def test_foreground_is_separated_at_gap() -> None:
@@ -139,17 +111,10 @@ def test_otsu_maximises_between_class_variance() -> None:
         (Confidence, {"minimum": 8, "highest": 256}),
         (Confidence, {"minimum": True}),
         (Confidence, {"minimum": NAN}),
-        (Amplitude, {"minimum": NAN}),
-        (Amplitude, {"minimum": 5.0, "maximum": 5.0}),
-        (Amplitude, {"maximum": float("inf")}),
         (Distance, {"minimum": -0.1}),
         (Distance, {"maximum": NAN}),
         (Distance, {"minimum": 2.0, "maximum": 1.0}),
         (Distance, {"measure": "y"}),
-        (Box, {"lower": (0.0, 0.0, 0.0), "upper": (1.0, 0.0, 1.0)}),
-        (Box, {"lower": (0.0, 0.0, NAN), "upper": (1.0, 1.0, 1.0)}),
-        (Box, {"lower": (0.0, 0.0), "upper": (1.0, 1.0)}),
-        (Box, {"lower": (0.0,) * 3, "upper": (1.0,) * 3, "remove": "all"}),
         (Foreground, {"limit": 0.0}),
         (Foreground, {"separability": 1.5}),
     ],

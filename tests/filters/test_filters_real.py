@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.confidence import Confidence
-from tofuse.filters.temporal import TemporalDeviation, z_deviation
+from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.evaluation.surface_error import Surface, distances
 from tofuse.fusion import mesh as mesh_module
 from tofuse.fusion.edge_collapse import collapse_edges
 from tofuse.fusion.mesh import Mesh
 from tofuse.kernels.kdtree import KdTree
+from tofuse.lab.experiments.surface_error import Surface, distances
 
 
 def hills(count: int = 120, seed: int = 0) -> Mesh:

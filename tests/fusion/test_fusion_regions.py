@@ -21,6 +21,7 @@ from tofuse.kernels import tsdf
 from tofuse.kernels.blocks import EDGE, block_key, block_of
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.states import decode, encode
+from whole_volume import volume_around
 
 COLUMNS = ("vertices", "faces", "normals", "color", "sigma", "views")
 
@@ -194,7 +195,7 @@ def test_progress_advances_once_per_view(room) -> None:
 
 def test_view_counts_saturate() -> None:
     view = RangeView.of(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)))
-    volume = Volume.around([view], EYE[None], 0.05, Fusion())
+    volume = volume_around([view], EYE[None], 0.05)
     volume.add([view], EYE[None])
     near = volume.seen > 0
     volume.seen[near] = tsdf.MAX_SEEN

@@ -14,7 +14,7 @@ from tofuse.fusion import layout
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import DECODED, RangeView, with_camera_correction
-from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
+from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.fusion.upright import upright
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole, ray_lengths
@@ -32,6 +32,7 @@ from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
+from whole_volume import volume_around
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def edges_of(faces):
 
 def test_exact_zero_level_is_closed_across_blocks() -> None:
     frames, poses = around_a_ball()
-    volume = Volume.around([RangeView.of(f) for f in frames], poses, 0.012, Fusion())
+    volume = volume_around([RangeView.of(f) for f in frames], poses, 0.012)
     r = np.linalg.norm(voxels_of(volume), axis=-1)
     volume.distance[:] = r - 0.3
     volume.weight[:] = 1e6
@@ -152,7 +153,7 @@ def test_distances_match_slow_sum_over_views() -> None:
         wall = plane_range(T, np.array([0, 0, 1.0]), 2.0)
         ball = sphere_range(T, np.array([0, 0, 1.2]), 0.3 if k < 2 else 0.0)
         views.append(RangeView.of(frame_of(np.minimum(wall, ball), noise=rng)))
-    volume = Volume.around(views, poses, 0.01, Fusion())
+    volume = volume_around(views, poses, 0.01)
     volume.add(views, poses)
     assert (volume.free > 0).sum() > 10
     volume.surface()  # applies free-space violations
@@ -171,8 +172,8 @@ def test_distances_match_slow_sum_over_views() -> None:
 
 def test_blocks_lie_near_surfaces_for_any_number_of_views(ball) -> None:
     views, poses, _ = ball
-    once = Volume.around(views, poses, 0.012, Fusion())
-    twice = Volume.around([*views, *views], np.concatenate([poses, poses]), 0.012, Fusion())
+    once = volume_around(views, poses, 0.012)
+    twice = volume_around([*views, *views], np.concatenate([poses, poses]), 0.012)
     np.testing.assert_array_equal(once.keys, twice.keys)
     assert (np.diff(once.keys) > 0).all()
     corners = np.array([[(k >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)] for k in once.keys])
@@ -208,7 +209,7 @@ def test_noisy_views_make_one_surface_not_several() -> None:
         noisy = np.where(view.strength > 0, code, 0).astype(np.uint8)
         views.append(replace(view, strength=noisy))
     poses = np.array([EYE] * 7)
-    volume = Volume.around(views, poses, 0.03, Fusion())
+    volume = volume_around(views, poses, 0.03)
     assert volume.reach_m < 0.1
     volume.add(views, poses)
     z = volume.surface().vertices[:, 2]
@@ -216,7 +217,7 @@ def test_noisy_views_make_one_surface_not_several() -> None:
     assert np.abs(z - 3).max() < 0.05
     # What is significantly behind is kept: precise views do not measure it.
     sure = [replace(v, strength=np.where(v.strength > 0, 200, 0).astype(np.uint8)) for v in views]
-    volume = Volume.around(sure, poses, 0.03, Fusion())
+    volume = volume_around(sure, poses, 0.03)
     volume.add(sure, poses)
     assert (np.abs(volume.surface().vertices[:, 2] - 3.13) < 0.01).sum() > 500
 
@@ -601,11 +602,11 @@ def test_round_robin_views_make_nearly_same_surface(monkeypatch) -> None:
         frame.depth[30 + k % 12, 40 + k % 7] = 0.6
     views = [RangeView.of(f) for f in frames]
     options = Fusion(voxel_m=0.012, island=0)
-    turned = Volume.around(views, poses, 0.012, options)
+    turned = volume_around(views, poses, 0.012)
     assert turned.free_space_stride == 2
     found = fuse_surface(views, poses, options)
     monkeypatch.setattr(layout, "_MAX_STRIDE", 1)
-    full = Volume.around(views, poses, 0.012, options)
+    full = volume_around(views, poses, 0.012)
     assert full.free_space_stride == 1
     assert len(turned.keys) > 0.97 * len(full.keys)  # isolated pixels may be skipped
     assert np.isin(turned.keys, full.keys).all()

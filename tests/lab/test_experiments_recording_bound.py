@@ -10,8 +10,8 @@ import pytest
 from tofuse.lab.experiments.recording_bound import phase_noise, seen_by, trajectory_bounds
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import plan
-from tofuse.sensor.models import camera_model
 
 NOISE = Effects.none(shot_noise=True, ambient=1.0)
 

@@ -7,9 +7,10 @@ import pytest
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.lab.experiments.peaks import chain
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
-from tofuse.posegraph.build import Measured, build_graph, chain
+from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import minimise
 from tofuse.posegraph.robust import Settings

@@ -17,12 +17,13 @@ from tofuse.lab.methods.variants import (
     GeneralizedIcp,
     Iccp,
     Icpif,
+    InTurn,
     PointToPlaneIcp,
     SymmetricIcp,
     Tricp,
 )
+from tofuse.pipeline.config import PACKAGES
 from tofuse.registration.base import Registrar
-from tofuse.registration.coarse_to_fine import InTurn
 from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Random
@@ -150,6 +151,8 @@ def test_named_variants_register():
 
 
 def test_variants_are_configurable_by_name():
+    for package in PACKAGES:
+        parts.discover(package)
     for name, data in {
         "point-to-plane": {"resolution": 0.05},
         "symmetric": {"points": 500},

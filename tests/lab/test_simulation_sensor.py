@@ -13,10 +13,10 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import Rendered, render
 from tofuse.lab.simulation.scene import Hits, Sequence, build
 from tofuse.recordings.correction_file import corrected_depth
-from tofuse.sensor.models import CAMERAS, camera_model
 
 SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
 # Without blur, so that sums over sub-rays are exact.

@@ -12,6 +12,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.odometry import hypotheses, keyframe_map
@@ -19,7 +20,6 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
-from tofuse.sensor.models import camera_model
 
 MODEL = camera_model("sr4000")
 BAD = 4  # index of the corrupted frame

@@ -10,13 +10,13 @@ import pytest
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import camera_model
 
 WIDTH, HEIGHT = 54, 42
 

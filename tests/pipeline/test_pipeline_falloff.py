@@ -11,6 +11,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
 from tofuse.pipeline.adaptation import adapted
@@ -21,7 +22,6 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.sensor.models import camera_model
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ import pytest
 import tofuse
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
-from tofuse.filters.temporal import TemporalDeviation
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
+from tofuse.lab.methods.filters_temporal import TemporalDeviation
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.parts import part
 from tofuse.pipeline.config import changed, from_method

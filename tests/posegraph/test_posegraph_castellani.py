@@ -8,7 +8,8 @@ import pytest
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import quaternion, se3
-from tofuse.posegraph.build import Measured, build_graph, chain
+from tofuse.lab.experiments.peaks import chain
+from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.castellani import Castellani, Problem, free_vertices, normalisation_factors
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import PoseGraph

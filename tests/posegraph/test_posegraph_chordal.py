@@ -93,9 +93,7 @@ def test_nothing_to_solve():
 def test_optimiser_finds_the_minimum_where_descent_from_odometry_does_not():
     graph, truth = drifting_laps(30, 12, 60.0)
     n = len(truth)
-    problem = Problem(
-        graph.edges, graph.measurements, graph.information, first_only(n), None, "tangent"
-    )
+    problem = Problem(graph.edges, graph.measurements, graph.information, first_only(n), None)
     alone = GraduatedNonConvexity(problem, graph.poses, graph.loop, Settings())
     assert not alone.fits_all()
     alone.select()

@@ -12,7 +12,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.simulation.peaks import peaks_views
-from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
+from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import Confirmation, LoopDetector, PriorLoop, mean_error
 from tofuse.posegraph.nearby import Nearby, yaw
@@ -264,19 +264,6 @@ def test_invalid_line_is_named(tmp_path, line, problem):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         read_loops(tmp_path / "nowhere.txt")
-
-
-def test_chain_is_product_of_motions():
-    rng = np.random.default_rng(0)
-    relative = se3.exp(rng.normal(size=(9, 6)))
-    T = np.eye(4)
-    for k, pose_k in enumerate(accumulate(relative)):
-        np.testing.assert_allclose(pose_k, T, atol=1e-12)
-        T = T @ relative[k] if k < 9 else T
-    graph = chain(relative, [Measured(0, 9, np.eye(4), np.eye(6) * 3)])
-    np.testing.assert_allclose(graph.residuals()[:-1], 0, atol=1e-9)
-    assert graph.loop.tolist() == [False] * 9 + [True]
-    np.testing.assert_array_equal(graph.information[-1], np.eye(6) * 3)
 
 
 def test_edges_refer_to_frames_with_pose():

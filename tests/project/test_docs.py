@@ -26,6 +26,7 @@ from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.lab import demo
+from tofuse.lab.simulation.models import CAMERAS
 from tofuse.pipeline.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
@@ -36,7 +37,6 @@ from tofuse.results.pair import FILES as PAIR_FILES
 from tofuse.results.pair import pair_json
 from tofuse.results.types import Component
 from tofuse.results.verdict import REASONS
-from tofuse.sensor.models import CAMERAS
 from written_run_json import run_json
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

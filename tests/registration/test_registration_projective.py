@@ -10,12 +10,12 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, points_of
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.sensor.models import camera_model
 
 OPTIONS = ProjectiveOptions()
 MODEL = camera_model("sr4000")

@@ -23,16 +23,21 @@ from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import (
     DISTINCT_M,
     Candidate,
+    Search,
     SearchOptions,
     _distinct,
     are_distinct_poses,
-    search,
 )
 from tofuse.registration.surface_options import SurfaceOptions
 
 
 def view(*arguments, **options):
     return prepare_view(seen(*arguments, **options), SurfaceOptions())
+
+
+def search(source, target, options=None):
+    views = Search.of(source, target, options)
+    return None if views is None else views.exhaustive()
 
 
 @pytest.fixture(scope="module")
@@ -292,15 +297,12 @@ def test_floor_is_found_below_table():
 def test_floor_is_found_by_camera_on_its_side():
     T = camera(0.0, 0.0, 0.0) @ se3.exp([0, 0, 0, 0, 0, np.pi / 2])
     views = view(T, seed=1), view(T, seed=2)
-    floors = find_floors(views)
+    floors = find_floors(*views)
     assert floors is not None
     down = T[:3, :3].T @ [0, 1, 0]
     for floor in floors:
         assert floor.height == pytest.approx(1.0, abs=0.02)
         assert np.degrees(np.arccos(floor.normal @ down)) < 1
-    # Known gravity takes precedence.
-    wrong = np.array([0.0, 0.0, 1.0])
-    assert find_floors(views, gravity=(wrong, wrong)) is None
 
 
 def test_lowest_plane_has_most_points_and_few_below():
@@ -334,7 +336,7 @@ def test_best_of_distinct_poses_are_kept():
 
 def test_no_floor_is_found_in_view_of_wall():
     level = view(camera(0.0, 2.4, 0.0, pitch=0.0), boxes=[])
-    assert find_floors((level, level)) is None
+    assert find_floors(level, level) is None
 
 
 def test_rough_planes_fill_noisy_regions():
@@ -367,14 +369,6 @@ def test_large_step_is_found_without_guess(pair, mode):
     assert found.mode == ("planar" if mode in ("planar", "auto") else "full")
     assert [c.score for c in found.candidates] == sorted(c.score for c in found.candidates)[::-1]
     assert found.agreement.violation < 0.01
-
-
-def test_known_gravity_is_used(pair):
-    down = tuple(T[:3, :3].T @ [0, 1, 0] for T in (B, A))
-    found = search(*pair, SearchOptions(mode="planar"), gravity=down)
-    assert error(found.T_target_source, TRUE)[0] < 0.02
-    aside = np.array([1.0, 0.0, 0.0])
-    assert search(*pair, SearchOptions(mode="planar"), gravity=(aside, aside)) is None
 
 
 def test_single_box_is_ambiguous_by_90_degrees():

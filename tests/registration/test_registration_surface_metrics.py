@@ -18,7 +18,7 @@ from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Alignment, Matches, Points
 from tofuse.registration.metrics import PointToPoint
-from tofuse.registration.pairs import loss_weights
+from tofuse.registration.pairs import cross_information, loss_weights, surface_pairs
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
@@ -240,9 +240,9 @@ def test_cross_information_of_wall_is_not_inflated_by_noise():
     data, model = Points.of(source, n), Points.of(target, n)
     j, d2 = KdTree(model.points).nearest(data.points)
     alignment = Alignment(data, model, 0.05, np.eye(4), data.points)
-    metric = PointToPlane()
-    plain = metric.information(Matches(n, j, np.sqrt(d2)), alignment)
-    cross = metric.cross_information(Matches(n, j, np.sqrt(d2)), alignment)
+    pairs = surface_pairs(Matches(n, j, np.sqrt(d2)), alignment, source=True)
+    plain, variance = PointToPlane().fit(pairs)
+    cross = cross_information(pairs, variance)
     assert plain[0, 0] > 100
     assert abs(cross[0, 0]) < 0.1 * plain[0, 0]
     assert cross[2, 2] == pytest.approx(plain[2, 2], rel=0.05)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.view_descriptor import dissimilarity, mutual_dissimilarity, view_descriptor
-from tofuse.sensor.models import camera_model
 
 
 @pytest.fixture(scope="module")

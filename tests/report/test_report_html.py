@@ -27,7 +27,7 @@ from tofuse.report import plots, thumbnails
 from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
-from tofuse.report.packing import pack, unpack
+from tofuse.report.packing import pack
 from tofuse.report.pictures import draw
 from tofuse.report.scene import (
     MAX_FACES,
@@ -40,6 +40,7 @@ from tofuse.report.scene import (
 from tofuse.report.subject import Subject
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import Component, FrameRecord, Reason
+from unpacked import unpack
 
 
 @cache

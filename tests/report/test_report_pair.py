@@ -10,7 +10,6 @@ from tofuse.geometry import se3
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.report import thumbnails
-from tofuse.report.packing import unpack
 from tofuse.report.pair_scene import (
     MAX_POINTS,
     distance_colors,
@@ -20,6 +19,7 @@ from tofuse.report.pair_scene import (
     render_modes,
 )
 from tofuse.results.pair import LocalView, PairResult
+from unpacked import unpack
 
 T = se3.exp([0.1, -0.05, 0.02, 0.02, 0.1, -0.05])
 

@@ -19,8 +19,7 @@ from tofuse.kernels.unwrap import STEPS, pass_messages
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.recordings.frames import RangeFrame
-from tofuse.sensor.frequencies import combined
-from tofuse.sensor.models import SPEED_OF_LIGHT
+from tofuse.sensor.frequencies import SPEED_OF_LIGHT, combined
 from tofuse.sensor.unwrap import (
     UnwrapOptions,
     _Blocks,

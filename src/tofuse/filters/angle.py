@@ -9,11 +9,11 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float32
+from tofuse.arrays import Bool
 from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
 from tofuse.geometry.cameras import unknown_rays
-from tofuse.kernels.neighbourhood import is_steeper, largest_angle
+from tofuse.kernels.neighbourhood import is_steeper
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -53,18 +53,3 @@ class NeighbourhoodAngle(Bounded, Filter):
             rays, cosine2 = frame.camera.rays(), np.float32(math.cos(self.threshold) ** 2)
             run_chunks(lambda a, b: is_steeper(z, rays, cosine2, a, b, steep), len(z))
         return np.logical_not(steep, out=steep)
-
-
-def neighbourhood_angle(frame: RangeFrame) -> Float32:
-    """Return the neighbourhood angle xi (H, W) in rad; 0 at points without a valid neighbour.
-
-    Eq 2.6 takes the arcsine of ``|p_n| sin(phi) / |p_n - p_i|``, by the law of sines the sine of
-    the angle at p_i in the triangle of the camera, p_i and one of its eight neighbours p_n. An
-    arcsine does not distinguish an angle from its supplement, while the method needs those near 180
-    degrees. Therefore the interior angle is computed from its sine and cosine, and the largest over
-    the neighbours is returned.
-    """
-    out = np.zeros(frame.depth.shape, np.float32)
-    points, valid = frame.point_image, frame.valid
-    run_chunks(lambda a, b: largest_angle(points, valid, a, b, out), len(out))
-    return out

@@ -16,32 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 
 # Upper limit of k, which bounds the memory.
-_MAX_NEIGHBOURS = 1000
-
-
-@part("filter", "neighbour_distance")
-@dataclass(frozen=True)
-class NeighbourDistance(Bounded, Filter):
-    """Remove points whose k nearest neighbours are on average too far away (section 2.8).
-
-    Attributes
-    ----------
-    threshold
-        Largest mean distance that is kept, m.
-    k
-        Number of neighbours.
-    """
-
-    threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.05
-    k: Annotated[int, Bounds(1, _MAX_NEIGHBOURS)] = 3
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
-        """See `Filter.mask`."""
-        return _to_frame_mask(
-            frame, mean_neighbour_distance(frame.points, self.k) <= self.threshold
-        )
+MAX_NEIGHBOURS = 1000
 
 
 @part("filter", "neighbour_fraction")
@@ -61,7 +36,7 @@ class NeighbourFraction(Bounded, Filter):
     """
 
     fraction: Annotated[float, Bounds(0, 1)] = 0.5
-    k: Annotated[int, Bounds(1, _MAX_NEIGHBOURS)] = 3
+    k: Annotated[int, Bounds(1, MAX_NEIGHBOURS)] = 3
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -72,7 +47,9 @@ class NeighbourFraction(Bounded, Filter):
         kept = len(distance) - int(self.fraction * len(distance) + 1e-6)
         keep = np.zeros(len(distance), bool)
         keep[np.argsort(distance, kind="stable")[:kept]] = True
-        return _to_frame_mask(frame, keep)
+        mask = np.zeros(frame.valid.shape, bool)
+        mask[frame.valid] = keep
+        return mask
 
 
 def mean_neighbour_distance(points: Float32, k: int) -> Float64:
@@ -87,10 +64,3 @@ def mean_neighbour_distance(points: Float32, k: int) -> Float64:
     # The nearest neighbour is the point itself, or a duplicate of it, at distance 0.
     _, squares = KdTree(points).neighbours(points, k + 1)
     return np.sqrt(squares[:, 1:]).mean(1)
-
-
-def _to_frame_mask(frame: Frame, keep: Bool) -> Bool:
-    """Scatter the values of the valid points to the shape of the frame."""
-    mask = np.zeros(frame.valid.shape, bool)
-    mask[frame.valid] = keep
-    return mask

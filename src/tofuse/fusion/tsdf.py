@@ -99,12 +99,6 @@ class Volume:
         return index_of(self.keys)
 
     @classmethod
-    def around(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Volume:
-        """Return the empty volume of all blocks near the surfaces of views at poses (N, 4, 4)."""
-        layout = Layout.of(views, poses, voxel_m)
-        return cls.of(layout, layout.single_region())
-
-    @classmethod
     def of(cls, layout: Layout, region: Region) -> Volume:
         """Return the empty volume of a region of a layout."""
         blocks = len(region.rows)

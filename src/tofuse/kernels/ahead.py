@@ -29,7 +29,8 @@ _MAX_HELPERS = 3
 # Net number of new objects after which Python collects garbage.
 _COLLECT_AFTER = 100_000
 _LIST = Path(__file__).with_name("signatures.txt")
-_DTYPES = {
+# Names of element types in the list.
+DTYPES = {
     "b1": "boolean",
     "i1": "int8",
     "i4": "int32",
@@ -40,7 +41,6 @@ _DTYPES = {
     "f8": "float64",
     "c16": "complex128",
 }
-_NAMES = {name: short for short, name in _DTYPES.items()} | {"bool": "b1"}
 
 
 @contextmanager
@@ -122,11 +122,6 @@ def compiled_marker() -> Path:
     return Path(jit.cache_folder()) / f"compiled-{digest.hexdigest()[:16]}"
 
 
-def signature_line(name: str, types: tuple[Any, ...]) -> str:
-    """Return the line of the list for a kernel, "module.function", and types of arguments."""
-    return " ".join([name, *(_text_of(kind) for kind in types)])
-
-
 def _type_of(text: str) -> Any:
     kinds: Any = numba.types
     if found := re.fullmatch(r"(\d+)x(.+)", text):
@@ -135,24 +130,10 @@ def _type_of(text: str) -> Any:
         named = getattr(import_module(f"tofuse.kernels.{found[1]}"), found[2])
         return kinds.BaseTuple.from_types([_type_of(field) for field in found[3].split(",")], named)
     short, _, shape = text.lstrip("!").partition(":")
-    dtype = getattr(kinds, _DTYPES[short])
+    dtype = getattr(kinds, DTYPES[short])
     if not shape:
         return dtype
     return kinds.Array(dtype, int(shape[0]), shape[1], readonly=text.startswith("!"))
-
-
-def _text_of(kind: Any) -> str:
-    kinds: Any = numba.types
-    if isinstance(kind, kinds.BaseNamedTuple):
-        named = kind.instance_class
-        fields = ",".join(_text_of(field) for field in kind.types)
-        return f"{named.__module__.rsplit('.', 1)[1]}.{named.__name__}({fields})"
-    if isinstance(kind, kinds.UniTuple):
-        return f"{kind.count}x{_text_of(kind.dtype)}"
-    if isinstance(kind, kinds.Array):
-        mark = "" if kind.mutable else "!"
-        return f"{mark}{_NAMES[str(kind.dtype)]}:{kind.ndim}{kind.layout}"
-    return _NAMES[str(kind)]
 
 
 if __name__ == "__main__":

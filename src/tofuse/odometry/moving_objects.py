@@ -140,13 +140,9 @@ class Moving:
     agreement
         Fraction of these that agree; 0 without any. Low after masking: the pose is wrong, or
         moving objects are not segmented yet.
-    agreement_unmasked
-        The same over all comparisons, masked or not; the masks explain the difference.
     scale
         Robust scale of the residuals outside of the previous mask, in sigmas of noise and
         `_MODEL_ERROR`.
-    scale_ratio
-        The same over its median in earlier frames. Well above 1: the pose is wrong.
     segments
         Connected components of `view`.
     reliable
@@ -161,9 +157,7 @@ class Moving:
     fraction: float
     compared: int
     agreement: float
-    agreement_unmasked: float
     scale: float
-    scale_ratio: float
     segments: int
     reliable: bool
     pair_update: PairUpdate
@@ -338,7 +332,6 @@ class MovingObjects:
         cells, segments = self._segmented(replace(cells, tracked=tracked), evidence, detect)
         reference_cells, _ = self._segmented(reference_cells, reference_evidence, detect)
         counts = _counts(outcome, cells.moving) + _counts(reference_outcome, reference_cells.moving)
-        counts_unmasked = _counts(outcome, None) + _counts(reference_outcome, None)
         mask = _pixels(cells.moving, view.z.shape, _stride(view))
         valid = view.z > 0
         return Moving(
@@ -347,9 +340,7 @@ class MovingObjects:
             fraction=_fraction(mask & valid, valid),
             compared=int(counts.sum()),
             agreement=float(counts[0] / max(counts.sum(), 1)),
-            agreement_unmasked=float(counts_unmasked[0] / max(counts_unmasked.sum(), 1)),
             scale=scale,
-            scale_ratio=scale / max(typical_scale, 1e-6),
             segments=segments,
             reliable=reliable,
             pair_update=PairUpdate(
@@ -538,12 +529,10 @@ def _robust_scale(ratios: Float32) -> float:
     return scale
 
 
-def _counts(outcome: UInt8, mask: Bool | None) -> Int64:
-    """Return the numbers of comparisons that agree, and of free-space violations."""
-    outcomes = [outcome == kernels.AGREES, outcome == kernels.IN_FRONT]
-    if mask is not None:
-        outcomes = [selected & ~mask for selected in outcomes]
-    return np.array([np.count_nonzero(selected) for selected in outcomes])
+def _counts(outcome: UInt8, mask: Bool) -> Int64:
+    """Return the numbers of comparisons that agree, and of free-space violations, not masked."""
+    outcomes = (outcome == kernels.AGREES, outcome == kernels.IN_FRONT)
+    return np.array([np.count_nonzero(selected & ~mask) for selected in outcomes])
 
 
 def _fraction(mask: Bool, valid: Bool) -> float:

@@ -186,7 +186,7 @@ class Checkpoints(Stages):
 
     def discard(self) -> None:
         """Remove all checkpoints."""
-        _remove_states(self.folder)
+        remove_states(self.folder)
 
     def finish(self) -> None:
         """Remove all checkpoints, as there is a result."""
@@ -215,13 +215,8 @@ class Checkpoints(Stages):
         return self.folder / f"{stage}.state"
 
 
-def discard_states(out: Path) -> None:
-    """Remove the checkpoints of an interrupted run from its output folder."""
-    _remove_states(out / CHECKPOINT)
-
-
-def _remove_states(folder: Path) -> None:
-    """Remove states, and no other files in the folder."""
+def remove_states(folder: Path) -> None:
+    """Remove the checkpoints in a folder, no other files, and the folder if it is then empty."""
     if folder.is_symlink() or not folder.is_dir():
         return
     for file in folder.iterdir():

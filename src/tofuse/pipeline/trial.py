@@ -115,11 +115,6 @@ class Trial:
         return self._pooled[1]
 
     @property
-    def relative_error(self) -> float:
-        """Standard error relative to the strength."""
-        return self.error / self.strength if self.strength > 0 else float("inf")
-
-    @property
     def is_significant(self) -> bool:
         """Whether the error is significant, and stronger than the effect of other errors."""
         n = len(self.predicted)

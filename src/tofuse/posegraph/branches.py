@@ -45,8 +45,8 @@ class Branches:
     graph
         Of N vertices and M edges.
     kept
-        (N,) mask of vertices that belong to no branch. Those with gravity or anchors don't either,
-        and loop edges are in no branch.
+        (N,) mask of vertices that belong to no branch. Those with gravity don't either, and
+        loop edges are in no branch.
     eigenvalues
         (M, 6) of the information of the edges, ascending; computed unless given.
 
@@ -62,9 +62,8 @@ class Branches:
     def __init__(self, graph: PoseGraph, kept: Bool, eigenvalues: Float64 | None = None) -> None:
         self._graph = graph
         kept = kept.copy()
-        for single in (graph.gravity, graph.anchors):
-            if single is not None:
-                kept[single.vertices] = True
+        if graph.gravity is not None:
+            kept[graph.gravity.vertices] = True
         if eigenvalues is None:
             eigenvalues = np.asarray(np.linalg.eigvalsh(graph.information), np.float64)
         rigid = ~graph.loop & (eigenvalues[:, 0] > _CONSTRAINED * eigenvalues[:, -1])

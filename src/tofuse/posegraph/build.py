@@ -9,7 +9,6 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.geometry import se3
 from tofuse.posegraph.graph import PoseGraph
 
 
@@ -63,23 +62,3 @@ def build_graph(
         information=np.array([e.information for e in edges], float).reshape(m, 6, 6),
         loop=np.arange(m) >= len(sequence),
     )
-
-
-def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
-    """Build the graph of a sequence of n - 1 consecutive motions T_(k-1)_k, and loops.
-
-    The poses are the products of the motions; ids count from 0, and the information of the
-    sequence is the identity.
-    """
-    sequence = [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
-    return build_graph(range(len(relative) + 1), accumulate(relative), sequence, loops)
-
-
-def accumulate(relative: Float64) -> Float64:
-    """Return poses (n, 4, 4), the identity first, of n - 1 motions T_(k-1)_k (eqs 2.9-3.2)."""
-    poses = np.empty((len(relative) + 1, 4, 4))
-    poses[0] = np.eye(4)
-    for k, T in enumerate(relative):
-        # Rounding errors would accumulate over thousands of products.
-        poses[k + 1] = se3.orthonormalise(poses[k] @ T)
-    return poses

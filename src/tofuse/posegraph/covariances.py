@@ -162,6 +162,4 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
 
 
 def _problem(graph: PoseGraph, fixed: Bool) -> Problem:
-    return Problem(
-        graph.edges, graph.measurements, graph.information, fixed, graph.gravity, "tangent"
-    )
+    return Problem(graph.edges, graph.measurements, graph.information, fixed, graph.gravity)

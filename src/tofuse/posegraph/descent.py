@@ -10,7 +10,6 @@ import numpy as np
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
-from tofuse.posegraph.charts import CHARTS, Chart, Rotation
 from tofuse.posegraph.graph import ROUNDING, Gravity
 from tofuse.posegraph.sparse import Factor, PairSystem
 
@@ -29,24 +28,22 @@ class Problem:
         information: Float64,
         fixed: Bool,
         gravity: Gravity | None,
-        rotation: Rotation,
     ) -> None:
         self.fixed, self.information, self.gravity = fixed, information, gravity
         self.pairs, self.measurements = pairs, measurements
-        self.chart: Chart = CHARTS[rotation]()
         self._Z_inverse = se3.inverse(measurements)
         n = len(fixed)
         all_pairs, all_fixed = pairs, fixed
-        self._unary: tuple[Float64, Float64] | None = None
+        self.unary: tuple[Float64, Float64] | None = None
         if gravity is not None:
             world = np.full(len(gravity.vertices), n)
             all_pairs = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
             all_fixed = np.append(fixed, gravity.world is not None)
             block = np.zeros((n + 1, 6, 6))
             block[n] = np.eye(6)
-            self._unary = block, np.zeros((n + 1, 6))
+            self.unary = block, np.zeros((n + 1, 6))
         self.all_pairs = all_pairs
-        self.system = PairSystem(len(all_fixed), all_pairs, all_fixed, size=self.chart.size)
+        self.system = PairSystem(len(all_fixed), all_pairs, all_fixed)
 
     def start(self, poses: Float64) -> Float64:
         """Return the initial poses, followed by that of the vertical if there is gravity."""
@@ -107,39 +104,31 @@ class Problem:
                 Jt = Jt * robust.weight("geman-mcclure", x, self.gravity.gate)[:, None, None]
             H = np.concatenate([H, Jt @ J])
             g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
-        basis = self.chart.basis(poses)
-        if basis is None:
-            return self.system.relative(H, g, T_i_j, self._unary)
-        return self._in_chart(H, g, T_i_j, *basis)
+        return self.assembled(poses, T_i_j, H, g)
 
-    def _in_chart(
-        self, H: Float64, g: Float64, T_i_j: Float64, P: Float64, normal_projector: Float64
+    def assembled(
+        self, poses: Float64, T_i_j: Float64, H: Float64, g: Float64
     ) -> tuple[Any, Float64]:
-        i, j = self.all_pairs.T
-        A = se3.adjoint(se3.inverse(T_i_j)) @ P[i]
-        At, Pt = np.swapaxes(A, 1, 2), np.swapaxes(P, 1, 2)
-        HA, HP = H @ A, H @ P[j]
-        scale = float(np.mean(np.diagonal(H, axis1=1, axis2=2)))
-        block = scale * normal_projector
-        if self._unary is not None:
-            block = block + Pt @ self._unary[0] @ P
-        unary = block, np.zeros(block.shape[:2])
-        column = g[..., None]
-        return self.system.assemble(
-            At @ HA, -At @ HP, Pt[j] @ HP, -(At @ column)[..., 0], (Pt[j] @ column)[..., 0], unary
-        )
+        """Return the normal equations (matrix, gradient) of the unknowns of `retract`.
+
+        Parameters
+        ----------
+        poses
+            (n, 4, 4), the linearisation point.
+        T_i_j, H, g
+            (m, 4, 4) relative poses, (m, 6, 6) matrix and (m, 6) gradient of each edge.
+        """
+        return self.system.relative(H, g, T_i_j, self.unary)
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """Return the poses after (n, 6) steps."""
+        return poses @ se3.exp(step)
 
     def factor(self, poses: Float64, weights: Float64) -> Factor | None:
-        """Factorise the undamped normal equations in the tangent chart; None if singular."""
-        in_tangent = self
-        if self.chart.size != 6:
-            in_tangent = Problem(
-                self.pairs, se3.inverse(self._Z_inverse), self.information, self.fixed,
-                self.gravity, "tangent",
-            )  # fmt: skip
-        all_poses = poses if len(poses) == len(in_tangent.system.fixed) else in_tangent.start(poses)
-        matrix, gradient = in_tangent.linearised(all_poses, *in_tangent.errors(all_poses), weights)
-        return in_tangent.system.factor(matrix, gradient)
+        """Factorise the undamped normal equations; None if singular."""
+        all_poses = poses if len(poses) == len(self.system.fixed) else self.start(poses)
+        matrix, gradient = self.linearised(all_poses, *self.errors(all_poses), weights)
+        return self.system.factor(matrix, gradient)
 
 
 def vertical(observed: Float64, gravity: Gravity) -> Float64:
@@ -222,7 +211,7 @@ class Descent:
             return None
         previous = self.state()
         fixed = self.problem.system.fixed
-        stepped = self.problem.chart.retract(self.poses, step)
+        stepped = self.problem.retract(self.poses, step)
         self.poses = np.where(fixed[:, None, None], self.poses, stepped)
         self._evaluate()
         new_value = self._value(total)

@@ -42,27 +42,6 @@ class Gravity:
 
 
 @dataclass(frozen=True, eq=False)
-class Anchors:
-    """Poses in another frame, such as that of odometry: weighted edges to its origin.
-
-    The pose of that frame in the world is unknown, and is estimated with the others.
-
-    Attributes
-    ----------
-    vertices
-        (a,) positions of the poses.
-    poses
-        (a, 4, 4) T_frame_vertex.
-    information
-        (a, 6, 6) of the right perturbation, order (tx ty tz rx ry rz).
-    """
-
-    vertices: Intp
-    poses: Float64
-    information: Float64
-
-
-@dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses and measured relative poses, as arrays.
 
@@ -80,7 +59,7 @@ class PoseGraph:
         (M, 6, 6) information of ``log(Z^-1 T_i^-1 T_j)``, order (tx ty tz rx ry rz), SI units.
     loop
         (M,) True for edges that close a loop, False for odometry.
-    gravity, anchors
+    gravity
         Measurements of single poses, or None. g2o files don't contain them.
     """
 
@@ -91,7 +70,6 @@ class PoseGraph:
     information: Float64
     loop: Bool
     gravity: Gravity | None = None
-    anchors: Anchors | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.ids), len(self.edges)
@@ -107,9 +85,8 @@ class PoseGraph:
                 raise InputError(
                     f"{name} has shape {getattr(self, name).shape}, not {shape}", where="pose graph"
                 )
-        for single in (self.gravity, self.anchors):
-            if single is not None and not np.isin(single.vertices, np.arange(n)).all():
-                raise InputError("a direction or anchor names no vertex", where="pose graph")
+        if self.gravity is not None and not np.isin(self.gravity.vertices, np.arange(n)).all():
+            raise InputError("a direction of gravity names no vertex", where="pose graph")
         if m and (self.edges.min() < 0 or self.edges.max() >= n):
             raise InputError("an edge names a vertex that is not there", where="pose graph")
         if m and (self.edges[:, 0] == self.edges[:, 1]).any():
@@ -141,7 +118,7 @@ class PoseGraph:
         """
         number = np.full(len(self.ids), -1)
         number[vertices] = np.arange(len(vertices))
-        gravity, anchors = self.gravity, self.anchors
+        gravity = self.gravity
         if gravity is not None:
             kept = number[gravity.vertices] >= 0
             gravity = replace(
@@ -149,11 +126,6 @@ class PoseGraph:
                 vertices=number[gravity.vertices[kept]],
                 directions=gravity.directions[kept],
                 sigma=gravity.sigma[kept],
-            )
-        if anchors is not None:
-            kept = number[anchors.vertices] >= 0
-            anchors = Anchors(
-                number[anchors.vertices[kept]], anchors.poses[kept], anchors.information[kept]
             )
         return PoseGraph(
             self.ids[vertices],
@@ -163,7 +135,6 @@ class PoseGraph:
             self.information[edges],
             self.loop[edges],
             gravity if gravity is not None and len(gravity.vertices) else None,
-            anchors if anchors is not None and len(anchors.vertices) else None,
         )
 
     def residuals(self) -> Float64:

@@ -28,9 +28,9 @@ _NEGATIVE = -1e-9  # of the largest eigenvalue: information with a smaller one i
 class LevenbergMarquardt(Bounded, Optimiser):
     """Weighted least squares on SE(3), robust against false loops.
 
-    Edges of odometry, gravity and anchors have their full weight; loop edges that of the robust
-    kernel. The iteration starts from the poses in the graph. Connected parts are solved separately;
-    the first vertex of each stays where it is. If a part can't be improved, its poses stay.
+    Edges of odometry and gravity have their full weight; loop edges that of the robust kernel. The
+    iteration starts from the poses in the graph. Connected parts are solved separately; the first
+    vertex of each stays where it is. If a part can't be improved, its poses stay.
 
     Attributes
     ----------
@@ -80,10 +80,10 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
         history = history if after < before else (before,)
         if after < before:
             moved[vertices] = True
-            poses[core] = se3.orthonormalise(solution.poses[: len(core)])
+            poses[core] = se3.orthonormalise(solution.poses)
             # Exactly as before, without rounding errors.
             poses[vertices[0]] = graph.poses[vertices[0]]
-        weights[kept[used]] = solution.weights[: used.sum()]
+        weights[kept[used]] = solution.weights
         weights[kept[~used]] = _weights_of(graph.with_poses(poses), kept, used, weights, settings)
         histories.append(history)
         parts.append(
@@ -103,23 +103,12 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
 
 
 def _solve(graph: PoseGraph, settings: Settings) -> Solution:
-    """Solve a connected graph; anchors are edges to one additional vertex, the last."""
-    poses, pairs, loop = graph.poses, graph.edges, graph.loop
-    measured, information = graph.measurements, graph.information
-    if graph.anchors is not None:
-        ends, Z = graph.anchors.vertices, graph.anchors.poses
-        frame = poses[ends[0]] @ se3.inverse(Z[0])
-        poses = np.concatenate([poses, frame[None]])
-        anchor_edges = np.stack([np.full(len(ends), len(graph.ids)), ends], axis=1)
-        pairs = np.concatenate([pairs, anchor_edges])
-        measured = np.concatenate([measured, Z])
-        information = np.concatenate([information, graph.anchors.information])
-        loop = np.append(loop, np.zeros(len(ends), bool))
-    fixed = np.zeros(len(poses), bool)
+    """Solve a connected graph, of which the first vertex is fixed."""
+    fixed = np.zeros(len(graph.ids), bool)
     fixed[0] = True
     return solve(
-        poses, pairs, measured, information,
-        loop=loop, fixed=fixed, gravity=graph.gravity, settings=settings,
+        graph.poses, graph.edges, graph.measurements, graph.information,
+        loop=graph.loop, fixed=fixed, gravity=graph.gravity, settings=settings,
     )  # fmt: skip
 
 
@@ -143,14 +132,10 @@ def _weights_of(
 def connected_components(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
     """Positions of the vertices and of the edges of each connected part.
 
-    Anchors connect their vertices; gravity does not, as it leaves four of six directions free.
+    Gravity does not connect vertices, as it leaves four of six directions free.
     """
     n = len(graph.ids)
-    pairs = graph.edges
-    if graph.anchors is not None and len(graph.anchors.vertices):
-        first = np.full(len(graph.anchors.vertices), graph.anchors.vertices[0])
-        pairs = np.concatenate([pairs, np.stack([first, graph.anchors.vertices], axis=1)])
-    label = parts_of(n, pairs)
+    label = parts_of(n, graph.edges)
     of_edge = label[graph.edges[:, 0]]
     count = int(label.max()) + 1 if n else 0
     return [(np.flatnonzero(label == k), np.flatnonzero(of_edge == k)) for k in range(count)]

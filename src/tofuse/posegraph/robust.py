@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.posegraph.charts import Rotation
 
 Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable", "truncated"]
 
@@ -33,8 +32,6 @@ class Settings:
     max_inflation
         Largest factor on the loops' standard deviations, as stated information is often too large;
         estimated from the quartile of the loops' errors. Only for "truncated".
-    rotation
-        Parametrisation of rotations, see `tofuse.posegraph.charts`.
     tolerance
         Iterations stop when a step lowers the objective by a smaller fraction.
     max_iterations
@@ -44,7 +41,6 @@ class Settings:
     robust: Robust = "truncated"
     gate: float = 100.0
     max_inflation: float = 3.0
-    rotation: Rotation = "tangent"
     tolerance: float = 1e-6
     max_iterations: int = 100
 

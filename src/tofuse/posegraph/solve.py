@@ -90,7 +90,7 @@ def solve(
     pairs = np.asarray(pairs, np.intp).reshape(-1, 2)
     loop = np.zeros(len(pairs), bool) if loop is None else np.asarray(loop, bool)
     fixed = first_of_parts(len(poses), pairs) if fixed is None else np.asarray(fixed, bool)
-    problem = Problem(pairs, measurements, information, fixed, gravity, settings.rotation)
+    problem = Problem(pairs, measurements, information, fixed, gravity)
     if settings.robust == "truncated" and loop.any():
         selection = truncated_least_squares(problem, poses, loop, settings)
         log = selection.descent.log

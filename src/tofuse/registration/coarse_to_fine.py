@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds, NotEmpty
+from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
@@ -34,34 +34,6 @@ _MAX_ROUGHNESS, _ROUGHNESS_SAMPLE = 0.25, 1500
 _COARSENING = 1.5
 # Minimum extent of the scene, in resolutions of the finest level.
 _MIN_EXTENT = 10
-
-
-@part("registration", "in-turn")
-@dataclass(frozen=True)
-class InTurn(Bounded, Registrar):
-    """A sequence of registrations, each starting from the result of the previous one.
-
-    Attributes
-    ----------
-    stages
-        At least one.
-    """
-
-    stages: Annotated[tuple[Registrar, ...], NotEmpty()]
-
-    @property
-    def takes(self) -> frozenset[str]:
-        """Kinds of view that all stages work on."""
-        return frozenset.intersection(*(stage.takes for stage in self.stages))
-
-    def register(
-        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
-    ) -> Registration:
-        """See `Registrar.register`; the result is that of the last stage."""
-        registration = self.stages[0].register(source, target, guess, rng)
-        for stage in self.stages[1:]:
-            registration = stage.register(source, target, registration.T_target_source, rng)
-        return registration
 
 
 @part("registration", "coarse-to-fine", label="validated")

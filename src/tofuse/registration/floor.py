@@ -33,46 +33,35 @@ _MIN_INLIERS, _MAX_BELOW = 0.04, 0.02
 _BELOW = 3.0
 # Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
 _DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-# Maximum angle between the floor's normal and down, rad: for any attitude of the camera, and if
-# gravity is known.
-_MAX_TILT, _KNOWN_TILT = 0.9, np.radians(10.0)
+# Minimum cosine between the floor's normal and down: any usual attitude of the camera.
+_MIN_COSINE = float(np.cos(0.9))
 
 
-def find_floors(
-    views: tuple[PreparedView, PreparedView],
-    gravity: tuple[Float64, Float64] | None = None,
-) -> tuple[Floor, Floor] | None:
-    """Find the floor in two views of one camera, on the same side of both images, or None.
-
-    Parameters
-    ----------
-    views
-        Prepared views.
-    gravity
-        (3,) direction of gravity in the frames of the two views, if known; the planes' normals
-        must then be within 10 degrees of it.
-    """
-    max_tilt = _MAX_TILT if gravity is None else _KNOWN_TILT
-    for down in [gravity] if gravity is not None else [(d, d) for d in _DOWN]:
-        first = find_floor(views[0], down[0], max_tilt)
-        second = first and find_floor(views[1], down[1], max_tilt)
+def find_floors(source: PreparedView, target: PreparedView) -> tuple[Floor, Floor] | None:
+    """Find the floor in two views of one camera, on the same side of both images, or None."""
+    for down in _DOWN:
+        first = find_floor(source, down)
+        second = first and find_floor(target, down)
         if first is not None and second is not None:
             return first, second
     return None
 
 
-def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -> Floor | None:
-    """Find the largest plane perpendicular to `down` (3,) without points below it, or None.
+def find_floor(view: PreparedView, down: Float64) -> Floor | None:
+    """Find the largest plane about perpendicular to `down`, without points below it, or None.
 
-    Its normal is within `max_tilt`, rad, of `down`.
+    Parameters
+    ----------
+    view
+        The prepared view.
+    down
+        (3,) unit vector, the approximate direction of gravity in the camera's frame.
     """
     sampled = sampled_points(view, _POINTS)
     p, n = sampled.points.astype(float), sampled.normals.astype(float)
     if len(p) < 20:
         return None
-    down = np.asarray(down, float) / np.linalg.norm(down)
-    min_cosine = np.cos(max_tilt)
-    facing = np.flatnonzero(n @ down > min_cosine)
+    facing = np.flatnonzero(n @ down > _MIN_COSINE)
     if len(facing) < _MIN_INLIERS * len(p):
         return None
     hypotheses = facing[:: max(1, len(facing) // _HYPOTHESES)]
@@ -89,7 +78,7 @@ def find_floor(view: PreparedView, down: Float64, max_tilt: float = _MAX_TILT) -
         if inliers.sum() < max(20, _MIN_INLIERS * len(p)):
             return None
     below = np.count_nonzero(p @ normal > height + _BELOW * band)
-    if below > _MAX_BELOW * len(p) or normal @ down < min_cosine or height <= 0:
+    if below > _MAX_BELOW * len(p) or normal @ down < _MIN_COSINE or height <= 0:
         return None
     return Floor(normal, height, float(inliers.mean()))
 

@@ -151,31 +151,6 @@ class Match:
         return self.score - (max(self.candidates[1].score, 0.0) if self.runner_up else 0.0)
 
 
-def search(
-    source: PreparedView,
-    target: PreparedView,
-    options: SearchOptions | None = None,
-    *,
-    gravity: tuple[Float64, Float64] | None = None,
-) -> Match | None:
-    """Search the pose between two views with a wide baseline.
-
-    Parameters
-    ----------
-    source, target
-        Prepared views.
-    gravity
-        (3,) direction of gravity in the source's and in the target's frame, if known.
-
-    Returns
-    -------
-    Match or None
-        None if a view has too few planes.
-    """
-    views = Search.of(source, target, options)
-    return None if views is None else views.exhaustive(gravity)
-
-
 @dataclass(frozen=True, eq=False)
 class Search:
     """Two views prepared for the search.
@@ -220,12 +195,12 @@ class Search:
         comparison = Comparison.of(source, target, agreement)
         return cls(source, target, comparison, options, distinct_m, s, t)
 
-    def exhaustive(self, gravity: tuple[Float64, Float64] | None = None) -> Match | None:
-        """Search the full grid; see `search`."""
+    def exhaustive(self) -> Match | None:
+        """Search the grids of the mode; None if that is "planar" and a view shows no floor."""
         s, t, options = self.resampled_source, self.resampled_target, self.options
         candidates: list[Candidate] = []
         if options.mode != "full":
-            floors = find_floors((self.source, self.target), gravity)
+            floors = find_floors(self.source, self.target)
             if floors is not None:
                 candidates = self._refined(
                     planar_poses(

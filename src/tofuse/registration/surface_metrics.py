@@ -19,7 +19,6 @@ from tofuse.registration.interfaces import Alignment, Matches, Metric
 from tofuse.registration.pairs import (
     Loss,
     SurfacePairs,
-    cross_information,
     loss_weights,
     shared_weights,
     solve,
@@ -43,15 +42,6 @@ class SurfaceMetric(Metric, Protocol):
         """
         pairs = _independent_pairs(matches, alignment)
         return pairs.to_origin(self.fit(pairs)[0])
-
-    def cross_information(self, matches: Matches, alignment: Alignment) -> Float64:
-        """Return the information (6, 6) in which independent noise of the normals cancels.
-
-        Of the right perturbation in the source's frame, as `information`; not positive definite
-        where noise exceeds the information of the surface.
-        """
-        pairs = _independent_pairs(matches, alignment)
-        return pairs.to_origin(cross_information(pairs, self.fit(pairs)[1]))
 
     def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.unobservable`."""

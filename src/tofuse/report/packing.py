@@ -36,16 +36,6 @@ def pack(array: NDArray[Any]) -> str:
     return base64.b64encode(packed).decode()
 
 
-def unpack(text: str, dtype: str, columns: int) -> NDArray[Any]:
-    """Return the array (N, C) that `pack` packed, as the page's script does."""
-    kind = np.dtype(dtype)
-    raw = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
-    planes = raw.reshape(columns, kind.itemsize, -1).transpose(2, 0, 1)
-    differences = np.ascontiguousarray(planes).view(f"<u{kind.itemsize}")[..., 0]
-    words = np.cumsum(differences, axis=0, dtype=f"u{kind.itemsize}")
-    return np.ascontiguousarray(words).view(kind)
-
-
 def quantized(points: Float64, low: Float64, extent: Float64) -> UInt16:
     """Quantise points (N, 3) to 16 bits in a box with corner `low` (3,) and size `extent` (3,)."""
     return np.round((points - low) / extent * 65535).astype("<u2")

@@ -113,11 +113,6 @@ def depth_image(
     return image
 
 
-def amplitude_image(frame: RangeFrame) -> UInt8 | None:
-    """Amplitude as grey, stretched and with the gamma of a screen; None if not recorded."""
-    return None if frame.amplitude_image is None else grey(frame.amplitude_image)
-
-
 def grey(amplitude: Float32) -> UInt8:
     """Stretch amplitude (H, W) to grey (H, W, 3), with the gamma of a screen."""
     valid = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)

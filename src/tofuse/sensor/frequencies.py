@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 
+SPEED_OF_LIGHT = 299_792_458.0  # m/s
 # Largest rms disagreement of the frequencies, as a fraction of the shortest period.
 DISAGREEMENT = 0.1
 

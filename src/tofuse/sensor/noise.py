@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, Self
 
@@ -31,7 +31,6 @@ from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels import noise as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import from_dict, to_dict
-from tofuse.sensor.models import CAMERAS, SPEED_OF_LIGHT, CameraModel
 
 Law = Literal["range", "amplitude", "confidence", "camera"]
 
@@ -44,8 +43,6 @@ _CODES = {
 }
 # Maximum sigma in m; larger values are probably in millimetres.
 _MAX_SIGMA_M = 5.0
-# Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
-_TYPICAL_AMBIENT = 0.15
 _NO_IMAGE = np.empty((0, 0), np.float32)
 
 
@@ -298,43 +295,57 @@ def _check_finite(model: Any, where: str) -> None:
             raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="use a number")
 
 
-def of_camera(model: CameraModel) -> NoiseModel:
-    """Derive the noise model of a modulated camera from its electronics.
-
-    From the phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` of bucket differences D, each with the
-    variance of its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
-    S, contrast m, ambient electrons E and read noise R; ``sigma_r = sigma_phase period / (2 pi)``.
-    The law over the range alone is that of a grey wall (albedo 0.4).
-    """
-    per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
-    ambient = _TYPICAL_AMBIENT * model.ambient_electrons
-    dark_electrons2 = (2 * model.read_noise_electrons**2 + ambient) / 2
-    shot = per_rad * math.sqrt(gain / (2 * model.modulation_contrast))
-    dark = per_rad * gain * math.sqrt(dark_electrons2)
-    falloff = model.falloff if model.amplitude_kind == "range_compensated" else 0.0
-    wall = 0.4 * model.signal_electrons * model.modulation_contrast * gain
-    return NoiseModel(
-        model.name,
-        RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
-        AmplitudeLaw(shot, dark, model.depth_unit_m / math.sqrt(12), falloff),
-        ceiling_m=SPEED_OF_LIGHT / (2 * (model.unwrap_hz or model.modulation_hz)) / math.sqrt(12),
-    )
-
-
-# Noise of each family of cameras. That of modulated cameras follows from their electronics (see
-# `sensor.models`: the SR4000's is fitted to a real recording, the others have the scale stated by
-# their makers); docs/noise.md states the sources of the other numbers.
+# Noise of each family of cameras. That of the first five follows from their electronics, by
+# `tofuse.lab.simulation.models.noise_of` (a test compares them): the SR4000's is fitted to a real
+# recording, the others have the scale stated by their makers. docs/noise.md states the sources of
+# the other numbers.
 NOISE: dict[str, NoiseModel] = {
     model.name: model
     for model in (
-        replace(
-            of_camera(CAMERAS["sr4000"]),
-            confidence=ConfidenceLaw((0.6, 0.20, 0.13, 0.094, 0.062, 0.041, 0.028, 0.016)),
+        NoiseModel(
+            "sr4000",
+            RangeLaw(a=0.0021324099655231693, b=0.00382317908289003),
+            AmplitudeLaw(
+                shot=0.15915494309189537,
+                dark=2.3546327036097847,
+                floor=2.8867513459481293e-05,
+                falloff=4.0,
+            ),
+            ConfidenceLaw((0.6, 0.20, 0.13, 0.094, 0.062, 0.041, 0.028, 0.016)),
+            ceiling_m=1.4433756729740645,
         ),
-        of_camera(CAMERAS["kinect2"]),
-        of_camera(CAMERAS["azure-nfov"]),
-        of_camera(CAMERAS["pico-flexx"]),
-        of_camera(CAMERAS["ifm-o3r"]),
+        NoiseModel(
+            "kinect2",
+            RangeLaw(a=0.0006945997474067945, b=0.0012238444427074412),
+            AmplitudeLaw(
+                shot=0.05964181449046179, dark=0.975503822378152, floor=5.7735026918962585e-05
+            ),
+            ceiling_m=5.4089142602287374,
+        ),
+        NoiseModel(
+            "azure-nfov",
+            RangeLaw(a=0.0005893874299221687, b=0.0008695790154781212),
+            AmplitudeLaw(
+                shot=0.02385672579618471, dark=0.11476647344371813, floor=0.0002886751345948129
+            ),
+            ceiling_m=2.884754272121993,
+        ),
+        NoiseModel(
+            "pico-flexx",
+            RangeLaw(a=0.002480693695628617, b=0.00658911277394305),
+            AmplitudeLaw(
+                shot=0.05940419769966313, dark=0.5889829590671571, floor=7.216878364870322e-05
+            ),
+            ceiling_m=2.1549459204098556,
+        ),
+        NoiseModel(
+            "ifm-o3r",
+            RangeLaw(a=0.0012030820534330766, b=0.0024885608246149353),
+            AmplitudeLaw(
+                shot=0.05964181449046179, dark=0.7897981570141338, floor=4.4048329863710466e-05
+            ),
+            ceiling_m=4.32713140818299,
+        ),
         NoiseModel("pico-zense", RangeLaw(0.0, 0.013)),
         NoiseModel(
             "iphone", RangeLaw(0.003, 0.0012), confidence=ConfidenceLaw((0.04, 0.015, 0.005), 1.0)

@@ -1,1 +1,1 @@
-"""Reproduction of chapters 4 and 5 of the thesis."""
+"""Reproduction of chapters 4 and 5 of the thesis, and measures of errors."""

@@ -25,9 +25,9 @@ from tofuse.lab.simulation.peaks import (
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.methods import default
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.build import Measured, chain
+from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.castellani import Castellani
-from tofuse.posegraph.graph import Optimiser
+from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.plane_refinement import Planes
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.recording import ArraySource, Recording
@@ -88,6 +88,27 @@ class PeaksRun:
     poses_sequential: Float64
     poses_optimised: Float64
     truth: Float64
+
+
+def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
+    """Build the graph of a sequence of consecutive motions, and loops.
+
+    The poses are the products of the motions (eqs 2.9-3.2); ids count from 0, and the information
+    of the sequence is the identity.
+
+    Parameters
+    ----------
+    relative
+        (n - 1, 4, 4) motions T_(k-1)_k.
+    loops
+        Measurements between frames that are not consecutive.
+    """
+    poses = [np.eye(4)]
+    for T in relative:
+        # Rounding errors would accumulate over thousands of products.
+        poses.append(se3.orthonormalise(poses[-1] @ T))
+    sequence = [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
+    return build_graph(range(len(poses)), np.array(poses), sequence, loops)
 
 
 def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:

@@ -17,8 +17,8 @@ from tofuse.arrays import Bool, Float64, Int64
 from tofuse.geometry import se3
 from tofuse.lab.simulation import optics
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.record import Plan
-from tofuse.sensor.models import CameraModel
 
 # Unknowns of a view: its pose, and the logarithm of its exposure.
 _UNKNOWNS = 7

@@ -73,9 +73,10 @@ def case_section(result: CaseResult) -> dict[str, Any]:
 
 
 def _picture(frame: Any) -> str:
-    image = thumbnails.amplitude_image(frame)
-    if image is None:
+    if frame.amplitude_image is None:
         image = thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+    else:
+        image = thumbnails.grey(frame.amplitude_image)
     return thumbnails.data_uri(image, jpeg=True)
 
 

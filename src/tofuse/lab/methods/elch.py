@@ -30,7 +30,7 @@ class Elch(Optimiser):
     Positions are interpolated linearly and orientations by slerp, with separate distances: the
     traces of the edges' covariances of translation and of rotation. A pose off the loop moves with
     the pose of the loop to which it is connected. A closed loop is an edge of the graph for later
-    ones. The first vertex of each connected component is fixed. Gravity and anchors are not used.
+    ones. The first vertex of each connected component is fixed. Gravity is not used.
     """
 
     def optimise(self, graph: PoseGraph) -> Optimisation:

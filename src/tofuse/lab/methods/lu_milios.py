@@ -37,7 +37,7 @@ class LuMilios(Optimiser):
 
     Edges are weighted by their information, without damping or robust kernel. The first vertex of
     each connected component is fixed. Returns the best poses of all iterations; the input if no
-    step lowers the error. Gravity and anchors are not used.
+    step lowers the error. Gravity is not used.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ class Stochastic(Bounded, Optimiser):
     converges to least squares. Rotations are distributed along the shortest rotation, as in TORO.
     Edges are processed by length, the longest first. The first vertex of each connected component
     is fixed. Initial progress is fast, final convergence slow: follow it by `levenberg-marquardt`.
-    Gravity and anchors are not used.
+    Gravity is not used.
 
     Attributes
     ----------

@@ -9,14 +9,13 @@ from typing import Annotated, Protocol
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.bounds import Bounded, Bounds, NotEmpty
 from tofuse.lab.methods.compatibility import Trimmed
 from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
 from tofuse.lab.methods.symmetric import Symmetric
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.coarse_to_fine import InTurn
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
 from tofuse.registration.metrics import PointToPoint
@@ -45,6 +44,34 @@ class Variant(Registrar, Protocol):
     ) -> Registration:
         """See `Registrar.register`."""
         return self.parts().register(source, target, guess, rng)
+
+
+@part("registration", "in-turn")
+@dataclass(frozen=True)
+class InTurn(Bounded, Registrar):
+    """A sequence of registrations, each starting from the result of the previous one.
+
+    Attributes
+    ----------
+    stages
+        At least one.
+    """
+
+    stages: Annotated[tuple[Registrar, ...], NotEmpty()]
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view that all stages work on."""
+        return frozenset.intersection(*(stage.takes for stage in self.stages))
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; the result is that of the last stage."""
+        registration = self.stages[0].register(source, target, guess, rng)
+        for stage in self.stages[1:]:
+            registration = stage.register(source, target, registration.T_target_source, rng)
+        return registration
 
 
 def _surface_icp(

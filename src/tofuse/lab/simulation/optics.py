@@ -12,8 +12,9 @@ from tofuse.arrays import Bool, Float64, Int32
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import run_chunks
 from tofuse.lab.kernels import phasor
+from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene
-from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
+from tofuse.sensor.frequencies import SPEED_OF_LIGHT
 
 # Offset in m of secondary rays from their surface, against self-intersection.
 _LIFT = 1e-4

@@ -19,10 +19,10 @@ from tofuse.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.mesh import Mesh
+from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Body, Scene, Sequence
 from tofuse.lab.simulation.scenes.torso import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.lab.simulation.texture import Material
-from tofuse.sensor.models import CameraModel
 
 Kind = Literal["person", "box"]
 

@@ -19,6 +19,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, enter
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.lab.simulation.render import Rendered, render
@@ -27,7 +28,6 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.depth_correction import DepthCorrection
-from tofuse.sensor.models import CameraModel, camera_model
 
 # Called with the number of frames done and the total.
 Progress = Callable[[int, int], None]
@@ -196,7 +196,7 @@ def simulate(
     out
         The folder; created if missing, must be empty.
     camera
-        One of `sensor.models.CAMERAS`.
+        One of `simulation.models.CAMERAS`.
     seed
         Of scene and noise.
     effects

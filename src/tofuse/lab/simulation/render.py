@@ -10,10 +10,10 @@ from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt16
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene, Sequence
 from tofuse.recordings.depth_counts import INVALID_DEPTH, depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.sensor.models import CameraModel
 
 _DEFAULT = Effects()
 _NOTABLE_M = 0.003

@@ -12,12 +12,12 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path, look_at, rotation
 from tofuse.lab.simulation.record import Plan
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.models import CameraModel, camera_model
 
 _DEFAULT = Effects()
 

@@ -17,9 +17,10 @@ import numpy as np
 
 from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt8
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel
 from tofuse.recordings.frames import SATURATED_AMPLITUDE
 from tofuse.sensor.depth_correction import DepthCorrection
-from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
+from tofuse.sensor.frequencies import SPEED_OF_LIGHT
 
 TAPS = 4
 

@@ -36,8 +36,7 @@ from tofuse.recordings.native import LENS_COLUMNS
 from tofuse.recordings.reader import CERTAIN, UNCERTAIN, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.depth_correction import DepthCorrection
-from tofuse.sensor.frequencies import DISAGREEMENT, combined
-from tofuse.sensor.models import SPEED_OF_LIGHT
+from tofuse.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 

@@ -7,6 +7,7 @@ scaled to that stated by their makers.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -16,8 +17,11 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
+from tofuse.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.sensor.noise import AmplitudeLaw, NoiseModel, RangeLaw
 
-SPEED_OF_LIGHT = 299_792_458.0
+# Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
+_TYPICAL_AMBIENT = 0.15
 
 
 @dataclass(frozen=True)
@@ -263,3 +267,26 @@ def camera_model(name: str) -> CameraModel:
             f"there is no camera called {name!r}", where="camera", remedy=f"use one of {[*CAMERAS]}"
         )
     return CAMERAS[name]
+
+
+def noise_of(model: CameraModel) -> NoiseModel:
+    """Derive the noise model of a modulated camera from its electronics.
+
+    From the phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` of bucket differences D, each with the
+    variance of its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
+    S, contrast m, ambient electrons E and read noise R; ``sigma_r = sigma_phase period / (2 pi)``.
+    The law over the range alone is that of a grey wall (albedo 0.4).
+    """
+    per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
+    ambient = _TYPICAL_AMBIENT * model.ambient_electrons
+    dark_electrons2 = (2 * model.read_noise_electrons**2 + ambient) / 2
+    shot = per_rad * math.sqrt(gain / (2 * model.modulation_contrast))
+    dark = per_rad * gain * math.sqrt(dark_electrons2)
+    falloff = model.falloff if model.amplitude_kind == "range_compensated" else 0.0
+    wall = 0.4 * model.signal_electrons * model.modulation_contrast * gain
+    return NoiseModel(
+        model.name,
+        RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
+        AmplitudeLaw(shot, dark, model.depth_unit_m / math.sqrt(12), falloff),
+        ceiling_m=model.ambiguity_m / math.sqrt(12),
+    )

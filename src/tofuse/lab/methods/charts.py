@@ -1,19 +1,21 @@
-"""Parametrisations of rotations in least squares: tangent, quaternion, direction cosines.
+"""Parametrisations of rotations in pose graphs: quaternions and direction cosines (chapter 8).
 
 A chart defines the number of parameters of a pose, the derivative of the pose by them, and the
-retraction after a step. All treat the position alike.
+retraction after a step. All treat the position alike. The optimiser's own unknowns are right
+perturbations of the poses.
 """
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import quaternion, se3
-
-Rotation = Literal["tangent", "quaternion", "cosines"]
+from tofuse.posegraph.descent import Descent, Problem
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.sparse import PairSystem, first_of_parts
 
 
 class Chart(Protocol):
@@ -21,31 +23,16 @@ class Chart(Protocol):
 
     size: int
 
-    def basis(self, poses: Float64) -> tuple[Float64, Float64] | None:
+    def basis(self, poses: Float64) -> tuple[Float64, Float64]:
         """Return the derivatives of a pose's right perturbation by its parameters.
 
-        (n, 6, size), and the (n, size, size) projectors on directions that leave the manifold;
-        None if the parameters are the perturbation.
+        (n, 6, size), and the (n, size, size) projectors on directions that leave the manifold.
         """
         ...
 
     def retract(self, poses: Float64, step: Float64) -> Float64:
         """Return the poses after (n, size) steps, projected onto SE(3)."""
         ...
-
-
-class Tangent:
-    """Six parameters, the right perturbation: T exp(d)."""
-
-    size = 6
-
-    def basis(self, poses: Float64) -> None:
-        """See `Chart.basis`."""
-        return
-
-    def retract(self, poses: Float64, step: Float64) -> Float64:
-        """See `Chart.retract`."""
-        return poses @ se3.exp(step)
 
 
 class Quaternion:
@@ -111,8 +98,56 @@ def _retracted(poses: Float64, slide: Float64, R: Float64) -> Float64:
     return out
 
 
-CHARTS: dict[Rotation, type[Chart]] = {
-    "tangent": Tangent,
-    "quaternion": Quaternion,
-    "cosines": Cosines,
-}
+class ChartProblem(Problem):
+    """The least squares problem of a pose graph, in the parameters of a chart.
+
+    The first vertex of each connected part is fixed.
+    """
+
+    def __init__(self, graph: PoseGraph, chart: Chart) -> None:
+        fixed = first_of_parts(len(graph.ids), graph.edges)
+        super().__init__(graph.edges, graph.measurements, graph.information, fixed, graph.gravity)
+        self.chart = chart
+        fixed = self.system.fixed
+        self.system = PairSystem(len(fixed), self.all_pairs, fixed, size=chart.size)
+
+    def assembled(
+        self, poses: Float64, T_i_j: Float64, H: Float64, g: Float64
+    ) -> tuple[Any, Float64]:
+        """See `Problem.assembled`."""
+        P, normal_projector = self.chart.basis(poses)
+        i, j = self.all_pairs.T
+        A = se3.adjoint(se3.inverse(T_i_j)) @ P[i]
+        At, Pt = np.swapaxes(A, 1, 2), np.swapaxes(P, 1, 2)
+        HA, HP = H @ A, H @ P[j]
+        scale = float(np.mean(np.diagonal(H, axis1=1, axis2=2)))
+        block = scale * normal_projector
+        if self.unary is not None:
+            block = block + Pt @ self.unary[0] @ P
+        unary = block, np.zeros(block.shape[:2])
+        column = g[..., None]
+        return self.system.assemble(
+            At @ HA, -At @ HP, Pt[j] @ HP, -(At @ column)[..., 0], (Pt[j] @ column)[..., 0], unary
+        )
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """See `Problem.retract`."""
+        return self.chart.retract(poses, step)
+
+
+def descend(graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 100) -> Descent:
+    """Minimise the squared errors of all edges and of gravity in the parameters of a chart.
+
+    Parameters
+    ----------
+    graph
+        With the initial poses.
+    chart
+        The parametrisation.
+    tolerance, iterations
+        Stopping rule, see `Descent.run`.
+    """
+    problem = ChartProblem(graph, chart)
+    descent = Descent(problem, problem.start(graph.poses))
+    descent.run(lambda x: x, np.ones_like, tolerance, iterations)
+    return descent

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
-from tofuse.evaluation.surface_error import Surface, compare_surfaces, distances
+from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 
 SQUARE = Surface(
     np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]])

@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.arrays import Bool, Float32
 from tofuse.bounds import Bounded, Bounds
 from tofuse.filters.base import Filter
-from tofuse.kernels.neighbourhood import window_median
 from tofuse.kernels.threads import run_chunks
+from tofuse.lab.kernels.window_median import window_median
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 

@@ -1,0 +1,41 @@
+"""Outlier removal by a threshold on the distance to the nearest neighbours in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from tofuse.arrays import Bool
+from tofuse.bounds import Bounded, Bounds
+from tofuse.filters.base import Filter
+from tofuse.filters.neighbours import MAX_NEIGHBOURS, mean_neighbour_distance
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+
+
+@part("filter", "neighbour_distance")
+@dataclass(frozen=True)
+class NeighbourDistance(Bounded, Filter):
+    """Remove points whose k nearest neighbours are on average too far away (section 2.8).
+
+    Attributes
+    ----------
+    threshold
+        Largest mean distance that is kept, m.
+    k
+        Number of neighbours.
+    """
+
+    threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.05
+    k: Annotated[int, Bounds(1, MAX_NEIGHBOURS)] = 3
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        mask = np.zeros(frame.valid.shape, bool)
+        mask[frame.valid] = mean_neighbour_distance(frame.points, self.k) <= self.threshold
+        return mask

@@ -1,0 +1,14 @@
+"""A volume that is not divided into regions."""
+
+from __future__ import annotations
+
+from tofuse.arrays import Float64
+from tofuse.fusion.layout import Layout
+from tofuse.fusion.stored_views import Views
+from tofuse.fusion.tsdf import Volume
+
+
+def volume_around(views: Views, poses: Float64, voxel_m: float) -> Volume:
+    """The empty volume of all blocks near the surfaces of views at poses (N, 4, 4)."""
+    layout = Layout.of(views, poses, voxel_m)
+    return Volume.of(layout, layout.single_region())
