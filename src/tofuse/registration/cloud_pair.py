@@ -22,13 +22,13 @@ from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
-from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.consensus import are_distinct
+from tofuse.registration.fpfh import candidates
 from tofuse.registration.icp import Icp
 from tofuse.registration.pose_probability import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.remapping import Remapping
-from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
@@ -284,12 +284,8 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
     """
     poses, failure = [], None
     try:
-        candidates = (
-            Fpfh(signed=views.has_free_space)
-            .candidates(views.source, views.target, views.rng)
-            .poses
-        )
-        poses += [views.refined(c.T_target_source) for c in candidates[:_MAX_REFINED]]
+        found = candidates(views.source, views.target, signed=views.has_free_space)
+        poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
     if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):

@@ -1,19 +1,17 @@
 """Robust estimation of a rigid motion from point pairs with outliers.
 
-Two methods. RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws random triples
-until one of them is free of outliers with the required confidence. With few inliers, such as one
-in fifty, that takes too many samples; but inliers preserve distances, so that they are pairwise
-compatible. The second method groups the pairs that share the most compatible pairs (second-order
-compatibility: Chen et al. 2022, "SC2-PCR"), and is deterministic.
+Inliers preserve distances, so that they are pairwise compatible. The pairs that share the most
+compatible pairs are grouped (second-order compatibility: Chen et al. 2022, "SC2-PCR"), and each
+group gives a motion. This is deterministic, and one inlier in fifty pairs is enough.
 
 Residuals are normalised by each pair's own standard deviation.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -22,28 +20,18 @@ from tofuse.arrays import Bool, Float64, Int64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.registration.base import Registration
 
-Method = Literal["samples", "compatible"]
-
-_SAMPLE_SIZE = 3
-_BATCH = 256
-# Minimum ratio of a sampled triangle's area to its squared side: thin ones don't constrain the
-# rotation.
-_MIN_AREA_RATIO = 0.1
+# Number of pairs that determine a motion.
+MIN_PAIRS = 3
 # Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
 # motion of a minimal sample is inaccurate.
 _INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
 # Maximum number of distinct motions that are refined before the best is selected.
 _MAX_REFINED = 20
-# Minimum side of a sampled triangle, in standard deviations of its length.
-_MIN_SIDE_SIGMAS = 4.0
 # Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility).
 _CONSENSUS_SIZE = 20
 # Maximum number of pairs in the compatibility matrix, whose memory is quadratic.
 _MAX_COMPATIBLE_PAIRS = 2000
-# A direction is constrained if its sigma is at most 1 cm, or 1 degree.
-_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 
 
 @dataclass(frozen=True)
@@ -52,27 +40,18 @@ class ConsensusOptions(Bounded):
 
     Attributes
     ----------
-    method
-        "samples": RANSAC; "compatible": second-order compatibility.
     sigmas
         Inlier threshold, in standard deviations of the pair.
     inliers
         Minimum number of inliers of a motion.
-    confidence
-        Probability that at least one of the drawn samples is free of outliers.
-    most_samples
-        Maximum number of samples.
     seeds
         Maximum number of seeds of consensus sets.
     distinct_m, distinct_rad
         Motions that differ by more are distinct hypotheses.
     """
 
-    method: Method = "samples"
     sigmas: Annotated[float, Bounds(0, 1000, exclusive=True)] = 3.0
     inliers: Annotated[int, Bounds(3, 1_000_000)] = 6
-    confidence: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.999
-    most_samples: Annotated[int, Bounds(1, 1_000_000)] = 5000
     seeds: Annotated[int, Bounds(1, 1_000_000)] = 100
     distinct_m: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.1
     distinct_rad: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.0873
@@ -102,6 +81,9 @@ class Pairs:
         return Pairs(self.source[selection], self.target[selection], self.variance[selection])
 
 
+Motions = Callable[[Pairs], Float64]
+
+
 @dataclass(frozen=True, eq=False)
 class Consensus:
     """A motion and its inliers.
@@ -129,15 +111,18 @@ class Consensus:
         return int(np.count_nonzero(self.inliers))
 
 
-def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> list[Consensus]:
+def consensus(
+    pairs: Pairs, options: ConsensusOptions, motions: Motions | None = None
+) -> list[Consensus]:
     """Return the rigid motions with the largest consensus, distinct ones only, the best first.
 
     Parameters
     ----------
     pairs
         Putative correspondences.
-    rng
-        Source of the random samples.
+    motions
+        Function that returns the motions (k, 4, 4) to choose from; None for those of sets of
+        pairwise compatible pairs.
 
     Raises
     ------
@@ -146,10 +131,8 @@ def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator)
     """
     ranked: list[Consensus] = []
     if len(pairs) >= options.inliers:
-        motions = (_sampled_motions if options.method == "samples" else _compatible_motions)(
-            pairs, options, rng
-        )
-        ranked = [c for c in _ranked(pairs, motions, options) if c.count >= options.inliers]
+        found = _compatible_motions(pairs, options) if motions is None else motions(pairs)
+        ranked = [c for c in _ranked(pairs, found, options) if c.count >= options.inliers]
     if not ranked:
         raise RegistrationError(
             f"of {len(pairs)} pairs of points not even {options.inliers} agree on a motion"
@@ -173,102 +156,10 @@ def motion_of(pairs: Pairs) -> Float64:
     Weights are inverse variances.
     """
     weight = 1 / pairs.variance
-    return _motions(pairs.source[None], pairs.target[None], weight[None])[0]
+    return motions_of(pairs.source[None], pairs.target[None], weight[None])[0]
 
 
-def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
-    """Return the information ``sum J^T J / v`` (6, 6), ``J = [I, -hat(p)]``: right perturbation.
-
-    The variance v is that of the pairs, scaled up to that of the residuals if these are larger.
-    """
-    p = pairs.source
-    residual = se3.transform(T_target_source, p) - pairs.target
-    degrees_of_freedom = max(3 * len(p) - 6, 1)
-    scale = max(1.0, float((residual**2 / pairs.variance[:, None]).sum()) / degrees_of_freedom)
-    J = np.zeros((len(p), 3, 6))
-    J[:, :, :3] = np.eye(3)
-    J[:, 0, 4], J[:, 0, 5] = p[:, 2], -p[:, 1]
-    J[:, 1, 3], J[:, 1, 5] = -p[:, 2], p[:, 0]
-    J[:, 2, 3], J[:, 2, 4] = p[:, 1], -p[:, 0]
-    weight = 1 / (scale * pairs.variance)
-    return np.asarray(np.einsum("kai,kaj,k->ij", J, J, weight), np.float64)
-
-
-def weakly_constrained_directions(information: Float64) -> Float64:
-    """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
-    values, vectors = np.linalg.eigh(information * _UNITS[:, None] * _UNITS)
-    weak = vectors[:, values < 1].T * _UNITS
-    return np.asarray(weak / np.linalg.norm(weak, axis=1, keepdims=True), np.float64)
-
-
-def registration_of(pairs: Pairs, estimate: Consensus, margin: float) -> Registration:
-    """Return a consensus as a registration: points are pairs, correspondences are inliers."""
-    inliers = pairs.select(estimate.inliers)
-    T = estimate.T_target_source
-    distance = np.linalg.norm(se3.transform(T, inliers.source) - inliers.target, axis=1)
-    information = information_of(inliers, T)
-    typical_sigma = float(np.sqrt(np.median(pairs.variance)))
-    return Registration(
-        T_target_source=T,
-        converged=True,
-        iterations=estimate.hypotheses,
-        correspondences=estimate.count,
-        points=len(pairs),
-        error=float(distance.sum() / (len(pairs) * typical_sigma)),
-        rms_m=float(np.sqrt((distance**2).mean())),
-        information=information,
-        unobservable=weakly_constrained_directions(information),
-        margin=margin,
-    )
-
-
-def _sampled_motions(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> Float64:
-    """Return the motions (k, 4, 4) of random triples that are congruent in both views."""
-    n = len(pairs)
-    required, drawn, max_inliers = float(options.most_samples), 0, 0
-    motions = []
-    while drawn < min(required, options.most_samples):
-        drawn += _BATCH
-        triples = rng.integers(0, n, (_BATCH, _SAMPLE_SIZE))
-        a, b, c = triples.T
-        triples = triples[(a != b) & (b != c) & (a != c)]
-        triples = triples[_are_congruent(pairs, triples, options.sigmas)]
-        if not len(triples):
-            continue
-        p, q = pairs.source[triples], pairs.target[triples]
-        hypotheses = _motions(p, q, 1 / pairs.variance[triples])
-        motions.append(hypotheses)
-        max_inliers = max(
-            max_inliers,
-            int((_squared_residuals(pairs, hypotheses) < options.sigmas**2).sum(1).max()),
-        )
-        all_inliers = (max_inliers / n) ** _SAMPLE_SIZE
-        if all_inliers > 0:
-            required = math.log(1 - options.confidence) / math.log(max(1 - all_inliers, 1e-12))
-    return np.concatenate(motions) if motions else np.zeros((0, 4, 4))
-
-
-def _are_congruent(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
-    """Whether triangles (k, 3) have equal sides in both views and are not degenerate, (k,)."""
-    congruent = np.ones(len(triples), bool)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        i, j = triples[:, a], triples[:, b]
-        source_side = np.linalg.norm(pairs.source[i] - pairs.source[j], axis=1)
-        target_side = np.linalg.norm(pairs.target[i] - pairs.target[j], axis=1)
-        sigma = np.sqrt(pairs.variance[i] + pairs.variance[j])
-        congruent &= (np.abs(source_side - target_side) < sigmas * sigma) & (
-            np.minimum(source_side, target_side) > _MIN_SIDE_SIGMAS * sigma
-        )
-    p = pairs.source[triples]
-    sides = p[:, 1:] - p[:, :1]
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    longest = np.maximum((sides**2).sum(2).max(1), 1e-12)
-    return congruent & (area > _MIN_AREA_RATIO * longest)
-
-
-def _compatible_motions(
-    pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generator
-) -> Float64:
+def _compatible_motions(pairs: Pairs, options: ConsensusOptions) -> Float64:
     """Return the motions (k, 4, 4) of sets of pairwise compatible pairs."""
     if len(pairs) > _MAX_COMPATIBLE_PAIRS:
         pairs = pairs.select(np.linspace(0, len(pairs) - 1, _MAX_COMPATIBLE_PAIRS).astype(np.int64))
@@ -288,13 +179,13 @@ def _compatible_motions(
         row = second_order[seed]
         nearest = np.argsort(-row, kind="stable")[: set_size - 1]
         members = np.concatenate([[seed], nearest[row[nearest] > 0]])
-        if len(members) < _SAMPLE_SIZE:
+        if len(members) < MIN_PAIRS:
             continue
         motions.append(motion_of(pairs.select(members)))
     return np.stack(motions) if motions else np.zeros((0, 4, 4))
 
 
-def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
+def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
     """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n)."""
     relative = (weight / weight.sum(1, keepdims=True))[..., None]
     p0, q0 = (relative * p).sum(1), (relative * q).sum(1)
@@ -309,7 +200,7 @@ def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
     return T
 
 
-def _squared_residuals(pairs: Pairs, motions: Float64) -> Float64:
+def squared_residuals(pairs: Pairs, motions: Float64) -> Float64:
     """Return the normalised squared residuals (k, m) of motions (k, 4, 4)."""
     transformed = (
         np.einsum("kij,mj->kmi", motions[:, :3, :3], pairs.source) + motions[:, None, :3, 3]
@@ -326,7 +217,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
     """Return the distinct motions, the best first, each refined on its inliers."""
     remaining = np.ones(len(motions), bool)
     score = (
-        _score(_squared_residuals(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
+        _score(squared_residuals(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
     )
     refined: list[Consensus] = []
     order = np.argsort(-score, kind="stable")
@@ -335,7 +226,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
             continue
         remaining &= _are_distinct(motions, motions[k], pairs, options)
         T, inliers = _refined(pairs, motions[k], options.sigmas)
-        refined_score = float(_score(_squared_residuals(pairs, T[None]), options.sigmas)[0])
+        refined_score = float(_score(squared_residuals(pairs, T[None]), options.sigmas)[0])
         refined.append(Consensus(T, inliers, refined_score, len(motions)))
         if len(refined) == _MAX_REFINED:
             break
@@ -353,17 +244,17 @@ def _refined(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
     """Refine T by iterated least squares over its inliers; return the best motion and its mask."""
     best, best_score = T, -1.0
     for gate in _INLIER_GATES:
-        squared = _squared_residuals(pairs, T[None])[0]
+        squared = squared_residuals(pairs, T[None])[0]
         score = float(_score(squared, sigmas))
         if score > best_score:
             best, best_score = T, score
         inliers = squared < (gate * sigmas) ** 2
-        if np.count_nonzero(inliers) < _SAMPLE_SIZE:
+        if np.count_nonzero(inliers) < MIN_PAIRS:
             break
         T = motion_of(pairs.select(inliers))
-    if float(_score(_squared_residuals(pairs, T[None])[0], sigmas)) > best_score:
+    if float(_score(squared_residuals(pairs, T[None])[0], sigmas)) > best_score:
         best = T
-    return best, _squared_residuals(pairs, best[None])[0] < sigmas**2
+    return best, squared_residuals(pairs, best[None])[0] < sigmas**2
 
 
 def _are_distinct(motions: Float64, T: Float64, pairs: Pairs, options: ConsensusOptions) -> Bool:
