@@ -14,8 +14,9 @@ from tofuse.pipeline.assessment import Assessment
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
+from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
-from tofuse.pipeline.stage_results import BackEndInput, Fused, Optimised, Refined, VisualEvidence
+from tofuse.pipeline.stage_results import Fused, Optimised, Refined, VisualEvidence
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
@@ -59,7 +60,7 @@ class BackEnd:
         poses: dict[int, Float64],
         joins: Sequence[Join],
         prior_loops: Sequence[PriorLoop],
-        observations: BackEndInput,
+        observations: Observations,
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
