@@ -263,18 +263,9 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
         link = join.link
         if join.defines_pose or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
             continue
-        r = link.registration
-        record = LoopRecord(
-            link.i,
-            link.j,
-            True,
-            f"joins components, {link.how}",
-            overlap=r.overlap,
-            rms_m=r.rms_m if np.isfinite(r.rms_m) else None,
-            free_space_violation=r.violation,
-            margin=r.margin,
-        )
-        redundant.append(ClosedLoop(record, link.T_i_j, link.information))
+        reason = f"joins components, {link.how}"
+        record = LoopRecord.of((link.i, link.j), True, reason, link.registration)
+        redundant.append(ClosedLoop.of(record, link.registration))
     return [*loops, *redundant]
 
 

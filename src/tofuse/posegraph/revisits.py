@@ -393,17 +393,9 @@ class _RevisitLoops(Loops):
         if registration is None:
             return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
         reason = self._rejection_reason(registration)
-        record = LoopRecord(
-            *pair,
-            not reason,
-            reason or f"right with a probability of {registration.probability:.0%}",
-            overlap=registration.overlap,
-            rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
-            free_space_violation=registration.violation,
-        )
-        if reason:
-            return ClosedLoop(record)
-        return ClosedLoop(record, registration.T_target_source, registration.information)
+        explanation = reason or f"right with a probability of {registration.probability:.0%}"
+        record = LoopRecord.of(pair, not reason, explanation, registration)
+        return ClosedLoop.of(record, registration)
 
     def _similar(
         self,
@@ -482,19 +474,8 @@ class _RevisitLoops(Loops):
             reason = registration.how if isolated else f"{registration.how}; another loop agrees"
             if (i, j) in similar:
                 reason = f"looks similar, {reason}"
-            record = LoopRecord(
-                i,
-                j,
-                True,
-                reason,
-                overlap=registration.overlap,
-                rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
-                free_space_violation=registration.violation,
-                margin=registration.margin,
-            )
-            accepted[i, j] = ClosedLoop(
-                record, registration.T_target_source, registration.information
-            )
+            record = LoopRecord.of((i, j), True, reason, registration)
+            accepted[i, j] = ClosedLoop.of(record, registration)
         rejected_loops = {}
         for p in pairs:
             record = LoopRecord(*p, False, "") if p in similar else closed[p].record
