@@ -358,16 +358,5 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
     evidence = views.evidence(pose, lead, len(registration.unobservable))
-    reason = evidence.rejection_reason()
-    return replace(
-        registration,
-        margin=lead,
-        believed=not reason,
-        probability=evidence.probability,
-        reason=reason,
-        runner_up=None if rival is None or rival is _NO_RIVAL else rival.T_target_source,
-        overlap=agreement.overlap,
-        support=agreement.support,
-        contradiction=agreement.contradiction,
-        violation=agreement.violation,
-    )
+    runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
+    return evidence.applied(registration, agreement, runner_up)
