@@ -504,10 +504,7 @@ class _RevisitLoops(Loops):
         T_i_k = se3.inverse(poses[i]) @ poses[k]
         T_m_j = se3.inverse(poses[m]) @ poses[j]
         difference = se3.inverse(T_i_j) @ T_i_k @ T_k_m @ T_m_j
-        return bool(
-            np.linalg.norm(difference[:3, 3]) < _CONSISTENT_M
-            and se3.angle(difference) < _CONSISTENT_RAD
-        )
+        return se3.is_within(difference, _CONSISTENT_M, _CONSISTENT_RAD)
 
     def _rejection_reason(self, registration: Registration) -> str:
         if registration.overlap is not None and registration.overlap < _MIN_OVERLAP:
@@ -565,6 +562,5 @@ def _path_lengths(poses: Mapping[int, Float64]) -> dict[int, Float64]:
     indices = sorted(poses)
     trajectory = np.stack([poses[k] for k in indices])
     steps = se3.inverse(trajectory[:-1]) @ trajectory[1:]
-    increments = np.linalg.norm(steps[:, :3, 3], axis=1), np.asarray(se3.angle(steps))
-    lengths = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack(increments, 1), axis=0)])
+    lengths = np.concatenate([np.zeros((1, 2)), np.cumsum(se3.lengths(steps), axis=0)])
     return dict(zip(indices, lengths, strict=True))

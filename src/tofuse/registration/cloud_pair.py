@@ -121,7 +121,8 @@ class _Views:
     def are_distinct_poses(self, a: Float64, b: Float64) -> bool:
         """Whether two poses (4, 4) are distinct hypotheses."""
         points = self.source_map.view.points.astype(np.float64)
-        return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
+        limits = {"metres": _DISTINCT * self.size, "rad": _DISTINCT_RAD}
+        return bool(are_distinct(a[None], b, points, **limits)[0])
 
 
 def _finest(view: Frame) -> float:

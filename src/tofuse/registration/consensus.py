@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -141,13 +142,25 @@ def consensus(
 
 
 def are_distinct(
-    T: Float64, T_other: Float64, points: Float64, *, metres: float, rad: float
-) -> bool:
-    """Whether two motions (4, 4) differ by more than `metres` at the median of points, or `rad`."""
-    centre = np.median(points, 0)[None]
-    shift = np.linalg.norm(se3.transform(T, centre) - se3.transform(T_other, centre))
-    angle = se3.angle(se3.inverse(T) @ T_other)
-    return bool(shift > metres or angle > rad)
+    motions: Float64, T: Float64, points: Float64, *, metres: float, rad: float
+) -> Bool:
+    """Whether each motion differs from another one by more than a distance or an angle, (k,).
+
+    Parameters
+    ----------
+    motions, T
+        (k, 4, 4), and (4, 4).
+    points
+        (n, 3) points that are moved, m.
+    metres
+        Distance at the median of the points.
+    rad
+        Angle between the rotations.
+    """
+    centre = np.median(points, 0)
+    shift = motions[:, :3, :3] @ centre + motions[:, :3, 3] - se3.transform(T, centre[None])
+    angle = se3.angle(se3.inverse(motions) @ T)
+    return (np.linalg.norm(shift, axis=1) > metres) | (angle > rad)
 
 
 def motion_of(pairs: Pairs) -> Float64:
@@ -219,12 +232,15 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
     score = (
         _score(squared_residuals(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
     )
+    differ = partial(
+        are_distinct, points=pairs.source, metres=options.distinct_m, rad=options.distinct_rad
+    )
     refined: list[Consensus] = []
     order = np.argsort(-score, kind="stable")
     for k in order:
         if not remaining[k]:
             continue
-        remaining &= _are_distinct(motions, motions[k], pairs, options)
+        remaining &= differ(motions, motions[k])
         T, inliers = _refined(pairs, motions[k], options.sigmas)
         refined_score = float(_score(squared_residuals(pairs, T[None]), options.sigmas)[0])
         refined.append(Consensus(T, inliers, refined_score, len(motions)))
@@ -232,10 +248,8 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
             break
     distinct: list[Consensus] = []
     for candidate in sorted(refined, key=lambda c: -c.score):
-        accepted = (
-            np.stack([o.T_target_source for o in distinct]) if distinct else np.zeros((0, 4, 4))
-        )
-        if _are_distinct(accepted, candidate.T_target_source, pairs, options).all():
+        accepted = np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4)
+        if differ(accepted, candidate.T_target_source).all():
             distinct.append(candidate)
     return distinct
 
@@ -255,15 +269,3 @@ def _refined(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
     if float(_score(squared_residuals(pairs, T[None])[0], sigmas)) > best_score:
         best = T
     return best, squared_residuals(pairs, best[None])[0] < sigmas**2
-
-
-def _are_distinct(motions: Float64, T: Float64, pairs: Pairs, options: ConsensusOptions) -> Bool:
-    """Whether motions (k, 4, 4) are distinct from T (4, 4), (k,)."""
-    centre = np.median(pairs.source, 0)
-    ends = motions[:, :3, :3] @ centre + motions[:, :3, 3]
-    end = T[:3, :3] @ centre + T[:3, 3]
-    cosine = (np.einsum("kij,ij->k", motions[:, :3, :3], T[:3, :3]) - 1) / 2
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    return (np.linalg.norm(ends - end, axis=1) > options.distinct_m) | (
-        angle > options.distinct_rad
-    )

@@ -107,16 +107,13 @@ def candidates(
     distinct: list[Candidate] = []
     for candidate in sorted(refined, key=lambda c: -c.inlier_ratio):
         # Discard poses that converge to a better one.
-        if all(
-            are_distinct(
-                candidate.T_target_source,
-                c.T_target_source,
-                described_source.points,
-                metres=options.distinct_m,
-                rad=options.distinct_rad,
-            )
-            for c in distinct
-        ):
+        if are_distinct(
+            np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4),
+            candidate.T_target_source,
+            described_source.points,
+            metres=options.distinct_m,
+            rad=options.distinct_rad,
+        ).all():
             distinct.append(candidate)
     return Candidates(size, pairs, tuple(distinct))
 
