@@ -19,6 +19,7 @@ from tofuse.posegraph.gaps import (
     motion_over,
 )
 from tofuse.posegraph.merged_components import DRIFT, MergedComponent, MergedComponents, transformed
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.pose_probability import CONTRADICTION
@@ -84,12 +85,9 @@ class JoinChecks:
         pairs = [
             (a, b) for s in self._merged.tracked.values() for a, b in itertools.pairwise(s.views)
         ]
-        sampled = (
-            np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_LEARNT_PAIRS)).round().astype(int)
-        )
         options = ProjectiveOptions(levels=PATIENT)
         contradictions = []
-        for k in sampled:
+        for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
             a, b = pairs[k]
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)

@@ -163,7 +163,7 @@ def _initial_estimate(
     """Return X and Y by Tsai and Lenz, from relative motions over several spans."""
     _, T_a, T_b = _common(a, b, offset)
     if common_world:
-        return _median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
+        return median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
     motions_a, motions_b = [], []
     for span in _SPANS:
         step = max(1, round(span * len(T_a)))
@@ -181,10 +181,10 @@ def _initial_estimate(
     t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = R, t
-    return X, _median_pose(T_a @ X @ se3.inverse(T_b))
+    return X, median_pose(T_a @ X @ se3.inverse(T_b))
 
 
-def _median_pose(poses: Float64) -> Float64:
+def median_pose(poses: Float64) -> Float64:
     """Return the component-wise median of nearby poses (N, 4, 4), in their tangent space."""
     centre = poses[len(poses) // 2]
     for _ in range(10):

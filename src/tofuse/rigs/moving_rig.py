@@ -22,6 +22,7 @@ from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.refinement import propagate_poses
 from tofuse.posegraph.split_half import refined_by_halves
 from tofuse.posegraph.view_store import SampledView
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
@@ -212,7 +213,7 @@ class _JointViews:
         camera_views = {}
         for k, track in world.items():
             rows, sampled = [], []
-            for p in np.unique(np.linspace(0, len(track.times) - 1, _VIEWS).round().astype(int)):
+            for p in evenly_spaced(np.arange(len(track.times)), _VIEWS):
                 row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
                 frame = cameras[k].image(row)
                 if frame is not None:
