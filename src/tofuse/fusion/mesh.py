@@ -69,9 +69,13 @@ class Mesh:
 
     def record(self) -> GeometryRecord:
         """Return the record for file writers, in the world frame, float64."""
-        scalars = {"views": self.views, "sigma": self.sigma}
         points = self.vertices.astype(np.float64) + self.offset
-        return GeometryRecord(points, self.faces, self.normals, self.color, scalars=scalars)
+        return replace(self.local_record(), points=points)
+
+    def local_record(self) -> GeometryRecord:
+        """Return the record relative to `offset`, float32."""
+        scalars = {"views": self.views, "sigma": self.sigma}
+        return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
         """Write the mesh to a path ending in .glb, .gltf, .ply, .obj, .stl or .usdz."""
