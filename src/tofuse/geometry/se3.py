@@ -244,6 +244,19 @@ def lengths(T: ArrayLike) -> Float64:
     return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), angle(T)], axis=1)
 
 
+def largest_sigmas(C: ArrayLike) -> Float64:
+    """Standard deviations, m and rad, (..., 2) in the worst directions.
+
+    Parameters
+    ----------
+    C
+        (..., 6, 6) covariances of twists.
+    """
+    C = np.asarray(C, float)
+    blocks = np.stack([C[..., :3, :3], C[..., 3:, 3:]], axis=-3)
+    return np.sqrt(np.linalg.eigvalsh(blocks)[..., -1].clip(0))
+
+
 def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     """Return T as a float64 (4, 4) array, or raise InputError if it is not a rigid motion."""
     T = np.asarray(T, float)

@@ -31,10 +31,11 @@ from tofuse.posegraph.pair_equations import (
     rescale,
     without_exposure,
 )
-from tofuse.posegraph.pose_priors import DAMPING, UNITS, WEAK, Priors, weak_prior
+from tofuse.posegraph.pose_priors import DAMPING, WEAK, Priors, weak_prior
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.view_store import SampledView, overlaps
 from tofuse.recordings.recording import evenly_spaced
+from tofuse.registration.projective import UNITS
 
 _ERROR_UNIT = 0.01  # of the weak prior of the camera's errors
 # Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.

@@ -21,8 +21,8 @@ from tofuse.kernels import rig_residuals as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
-from tofuse.posegraph.pose_priors import UNITS
 from tofuse.posegraph.view_store import SampledView
+from tofuse.registration.projective import UNITS
 from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.

@@ -164,10 +164,7 @@ def _initial_offset(
 
 def _too_uncertain(fit: HandEye, depth: float) -> str:
     """Return why a pose is too uncertain; empty if it is not."""
-    position, rotation = (
-        float(np.sqrt(max(np.linalg.eigvalsh(fit.covariance[part, part])[-1], 0)))
-        for part in (slice(3), slice(3, 6))
-    )
+    position, rotation = se3.largest_sigmas(fit.covariance).tolist()
     if position <= _MAX_SIGMA_FRACTION * depth and rotation <= _MAX_SIGMA_RAD:
         return ""
     return (

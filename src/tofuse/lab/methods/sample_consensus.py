@@ -27,6 +27,7 @@ from tofuse.registration.consensus import (
     motions_of,
     squared_residuals,
 )
+from tofuse.registration.projective import UNITS
 
 Method = Literal["samples", "compatible"]
 
@@ -36,8 +37,6 @@ _BATCH = 256
 _MIN_AREA_RATIO = 0.1
 # Minimum side of a sampled triangle, in standard deviations of its length.
 _MIN_SIDE_SIGMAS = 4.0
-# A direction is constrained if its sigma is at most 1 cm, or 1 degree.
-_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 
 
 @dataclass(frozen=True)
@@ -85,8 +84,8 @@ def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
 
 def weakly_constrained_directions(information: Float64) -> Float64:
     """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
-    values, vectors = np.linalg.eigh(information * _UNITS[:, None] * _UNITS)
-    weak = vectors[:, values < 1].T * _UNITS
+    values, vectors = np.linalg.eigh(information * UNITS[:, None] * UNITS)
+    weak = vectors[:, values < 1].T * UNITS
     return np.asarray(weak / np.linalg.norm(weak, axis=1, keepdims=True), np.float64)
 
 
