@@ -101,7 +101,7 @@ class Mesh:
         new_row = np.cumsum(used, dtype=np.int32) - 1
         return self.with_vertices(used, new_row[kept])
 
-    def with_vertices(self, used: Bool | Intp, faces: Int32 | Intp) -> Mesh:
+    def with_vertices(self, used: Bool | Int32, faces: Int32 | Intp) -> Mesh:
         """Return the mesh of a subset of the vertices.
 
         Parameters
