@@ -31,10 +31,10 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.methods.features import Features
+from tofuse.lab.methods.fpfh import Fpfh
 from tofuse.lab.methods.plane_sets import PlaneSets
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
-from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.surface_options import SurfaceOptions

@@ -77,6 +77,23 @@ def test_log_and_angle_are_exact_near_pi(axis: np.ndarray) -> None:
         np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-7)
 
 
+def test_motions_are_compared_by_length_and_angle() -> None:
+    T = se3.exp(np.array([[0.3, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]]))
+    np.testing.assert_allclose(se3.lengths(T), [[0.3, 0], [0, 0.2]], atol=1e-12)
+    assert se3.is_within(T[0], 0.31, 0.0)
+    assert not se3.is_within(T[0], 0.29, 0.1)
+    assert se3.is_within(T[1], 0.0, 0.21)
+    assert not se3.is_within(T[1], 0.1, 0.19)
+
+
+def test_largest_sigmas_are_those_of_the_worst_directions() -> None:
+    R = se3.so3_exp(np.array([0.3, -0.5, 0.2]))
+    C = np.zeros((2, 6, 6))
+    C[0, :3, :3] = R @ np.diag([1e-4, 9e-4, 4e-4]) @ R.T
+    C[0, 3:, 3:] = np.diag([1e-6, 0, 0])
+    np.testing.assert_allclose(se3.largest_sigmas(C), [[0.03, 0.001], [0, 0]], atol=1e-12)
+
+
 def test_functions_broadcast_over_stacks() -> None:
     xi = np.random.default_rng(0).normal(size=(4, 5, 6))
     T = se3.exp(xi)

@@ -13,16 +13,15 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.keypoints import channel_image, keypoints
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.sample_consensus import (
-    ConsensusOptions,
-    Pairs,
-    consensus,
+from tofuse.lab.methods.sample_consensus import (
+    SampleOptions,
     information_of,
-    motion_of,
     weakly_constrained_directions,
 )
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.consensus import Pairs, motion_of
+from tofuse.registration.consensus import consensus as consensus_of
+from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 
 CAMERA = Pinhole(176, 132, 200.0, 200.0, 87.5, 65.5)
@@ -87,6 +86,10 @@ def made_pairs(right, wrong, *, seed=0, sigma=0.01, spread=1.0):
     return Pairs(p, q, s**2), T
 
 
+def consensus(pairs, options, rng):
+    return consensus_of(pairs, options, options.motions(rng))
+
+
 # Consensus
 
 
@@ -97,7 +100,7 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
         pairs, T = made_pairs(right, wrong, seed=seed)
         missed = np.linalg.norm(se3.transform(T, pairs.source) - pairs.target, axis=1)
         most = np.count_nonzero(missed < 0.03)  # three standard deviations
-        found = consensus(pairs, ConsensusOptions(method), np.random.default_rng(seed))
+        found = consensus(pairs, SampleOptions(method=method), np.random.default_rng(seed))
         shift, turn = off(found[0].T_target_source, T)
         assert shift < 0.03
         assert turn < 0.6
@@ -109,7 +112,7 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
 
 def test_compatible_pairs_are_found_among_many_outliers():
     pairs, T = made_pairs(20, 780, sigma=0.005, spread=1.5)
-    found = consensus(pairs, ConsensusOptions("compatible"), np.random.default_rng(0))[0]
+    found = consensus(pairs, SampleOptions(method="compatible"), np.random.default_rng(0))[0]
     assert off(found.T_target_source, T)[0] < 0.02
     assert np.count_nonzero(found.inliers[:20]) >= 18
 
@@ -121,7 +124,7 @@ def test_pairs_are_weighted_by_their_noise(method):
     errors = []
     for seed in range(5):
         pairs, T = made_pairs(80, 0, seed=seed, sigma=sigma)
-        found = consensus(pairs, ConsensusOptions(method), np.random.default_rng(0))[0]
+        found = consensus(pairs, SampleOptions(method=method), np.random.default_rng(0))[0]
         assert found.inliers.mean() > 0.85
         assert found.inliers[sigma > 0.01].mean() > 0.8
         weighted = se3.transform(se3.inverse(T) @ found.T_target_source, pairs.source)
@@ -173,12 +176,12 @@ def test_collinear_points_leave_rotation_about_line_unconstrained():
 def test_inconsistent_pairs_are_rejected(method):
     pairs, _ = made_pairs(0, 40)
     with pytest.raises(RegistrationError, match="of 40 pairs of points not even 10 agree"):
-        consensus(pairs, ConsensusOptions(method, inliers=10), np.random.default_rng(0))
+        consensus(pairs, SampleOptions(method=method, inliers=10), np.random.default_rng(0))
 
 
 def test_same_seed_gives_same_result():
     pairs, _ = made_pairs(40, 60)
-    a, b = (consensus(pairs, ConsensusOptions(), np.random.default_rng(3))[0] for _ in range(2))
+    a, b = (consensus(pairs, SampleOptions(), np.random.default_rng(3))[0] for _ in range(2))
     np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
 
 
@@ -276,9 +279,9 @@ def test_clouds_are_rejected(images):
         (Features, {"channel": "infrared"}),
         (Features, {"ratio": 0.0}),
         (Features, {"count": 2}),
-        (ConsensusOptions, {"method": "chance"}),
-        (ConsensusOptions, {"inliers": 2}),
-        (ConsensusOptions, {"confidence": 1.0}),
+        (SampleOptions, {"method": "chance"}),
+        (SampleOptions, {"inliers": 2}),
+        (SampleOptions, {"confidence": 1.0}),
     ],
 )
 def test_options_are_checked(kind, options):

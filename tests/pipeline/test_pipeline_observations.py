@@ -17,7 +17,7 @@ def test_images_of_a_camera_that_stays_are_thinned_in_the_model() -> None:
         here = replace(frame, index=index)
         observations.add_to_model(here, here, Step("tracked", "", at(0, 0, 0)))
     # The first 32, every second one of the next 64, and every fourth one of the other 4.
-    assert observations.for_back_end().model.views == 65
+    assert observations.model.views == 65
 
 
 def test_images_of_a_camera_that_moves_on_are_all_in_the_model() -> None:
@@ -27,4 +27,4 @@ def test_images_of_a_camera_that_moves_on_are_all_in_the_model() -> None:
         T = at(0, 0, 0.06 * index)
         here = replace(frame, index=index)
         observations.add_to_model(here, here, Step("tracked", "", T))
-    assert observations.for_back_end().model.views == 100
+    assert observations.model.views == 100

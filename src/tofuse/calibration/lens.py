@@ -24,7 +24,7 @@ from tofuse.geometry.cameras import (
     Pinhole,
     Rational,
 )
-from tofuse.recordings.recording import Recording
+from tofuse.recordings.recording import Recording, evenly_spaced
 
 MIN_VIEWS = 4
 _MAX_FRAMES = 160  # maximum number of frames in which the board is searched
@@ -237,7 +237,7 @@ def _distinct(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
         else:
             distinct.append(view)
     if len(distinct) > _MAX_VIEWS:
-        chosen = set(np.linspace(0, len(distinct) - 1, _MAX_VIEWS).round().astype(int).tolist())
+        chosen = set(evenly_spaced(np.arange(len(distinct)), _MAX_VIEWS).tolist())
         similar += [view.index for k, view in enumerate(distinct) if k not in chosen]
         distinct = [view for k, view in enumerate(distinct) if k in chosen]
     return distinct, similar

@@ -221,12 +221,6 @@ class QuietProgress(Silent):
             for text in self._notes:
                 print(f"note: {text}", file=sys.stderr)
 
-    def stage(self, name: str, total: int | None = None) -> None:
-        """Print nothing."""
-
-    def advance(self, record: FrameRecord | None = None) -> None:
-        """Print nothing."""
-
     def note(self, text: str) -> None:
         """Keep the note for the end."""
         self._notes.append(text)

@@ -11,7 +11,7 @@ from rich.table import Table
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
 from tofuse.results.run_json import plain
-from tofuse.rigs.calibrate import Calibration, largest_sigmas
+from tofuse.rigs.calibrate import Calibration
 from tofuse.rigs.check import CameraMotion
 
 
@@ -24,7 +24,7 @@ def tables(rig: Rig) -> list[Table]:
         poses.add_column(title, justify="right", no_wrap=True)
     for camera in rig.cameras:
         T = camera.T_rig_camera
-        sigma_m, sigma_rad = largest_sigmas(camera)
+        sigma_m, sigma_rad = se3.largest_sigmas(camera.covariance).tolist()
         values = (
             f"{np.degrees(float(se3.angle(T))):.2f}",
             f"{1000 * sigma_m:.2g}",

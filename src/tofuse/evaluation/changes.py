@@ -28,6 +28,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.search import ViewPoints
 from tofuse.kernels.threads import run_chunks
 from tofuse.normal import MEDIAN_OF_NORMAL
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import nearest_depth
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import landing_pixels, sampled_points
@@ -208,8 +209,7 @@ def _noise_scale(views: Sequence[_SessionView]) -> float:
     # Neighbours share errors, so views up to a quarter of the session apart are compared too.
     steps = sorted({1, max(1, len(views) // 8), max(1, len(views) // 4)})
     pairs = [(views[k], views[k + s]) for s in steps for k in range(len(views) - s)]
-    sampled = np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).round().astype(int)
-    r, sigma = _residuals([pairs[k] for k in np.unique(sampled)])
+    r, sigma = _residuals([pairs[k] for k in evenly_spaced(np.arange(len(pairs)), _MAX_PAIRS)])
     if not len(r):
         return 1.0
     return max(float(np.quantile(r / sigma, 0.5)) / MEDIAN_OF_NORMAL, 1.0)
@@ -220,8 +220,8 @@ def _misalignment(
 ) -> float:
     """The distance between surfaces of two sessions in excess of noise (one sigma), m."""
     facing = [(a, b) for a in first for b in second if _similar_direction(a, b)]
-    sampled = np.linspace(0, len(facing) - 1, min(len(facing), 4 * _MAX_PAIRS)).round().astype(int)
-    r, sigma = _residuals([facing[k] for k in np.unique(sampled)])
+    sampled = evenly_spaced(np.arange(len(facing)), 4 * _MAX_PAIRS)
+    r, sigma = _residuals([facing[k] for k in sampled])
     if not len(r):
         return 0.0
     total = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,12 @@ class Cloud:
 
     def record(self) -> GeometryRecord:
         """Return the record for file writers, in the world frame, float64."""
+        return replace(self.local_record(), points=self.points.astype(np.float64) + self.offset)
+
+    def local_record(self) -> GeometryRecord:
+        """Return the record relative to `offset`, float32."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
-        points = self.points.astype(np.float64) + self.offset
-        return GeometryRecord(points, normals=self.normals, color=self.color, scalars=scalars)
+        return GeometryRecord(self.points, normals=self.normals, color=self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
         """Write the cloud to a path ending in .ply, .pcd, .las, .laz or .e57."""

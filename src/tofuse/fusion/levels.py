@@ -9,7 +9,7 @@ of the next.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -100,12 +100,4 @@ def _split_into_tiles(
 def _submesh(mesh: Mesh, faces: Int64) -> Mesh:
     """Return a subset of the faces with their vertices."""
     used, vertex_index = np.unique(mesh.faces[faces], return_inverse=True)
-    return replace(
-        mesh,
-        vertices=mesh.vertices[used],
-        faces=vertex_index.reshape(-1, 3).astype(np.int32),
-        normals=mesh.normals[used],
-        color=None if mesh.color is None else mesh.color[used],
-        sigma=mesh.sigma[used],
-        views=mesh.views[used],
-    )
+    return mesh.with_vertices(used, vertex_index)

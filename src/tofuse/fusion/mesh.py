@@ -69,9 +69,13 @@ class Mesh:
 
     def record(self) -> GeometryRecord:
         """Return the record for file writers, in the world frame, float64."""
-        scalars = {"views": self.views, "sigma": self.sigma}
         points = self.vertices.astype(np.float64) + self.offset
-        return GeometryRecord(points, self.faces, self.normals, self.color, scalars=scalars)
+        return replace(self.local_record(), points=points)
+
+    def local_record(self) -> GeometryRecord:
+        """Return the record relative to `offset`, float32."""
+        scalars = {"views": self.views, "sigma": self.sigma}
+        return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
         """Write the mesh to a path ending in .glb, .gltf, .ply, .obj, .stl or .usdz."""
@@ -95,10 +99,22 @@ class Mesh:
         used = np.zeros(len(self), bool)
         used[kept.ravel()] = True
         new_row = np.cumsum(used, dtype=np.int32) - 1
+        return self.with_vertices(used, new_row[kept])
+
+    def with_vertices(self, used: Bool | Int32, faces: Int32 | Intp) -> Mesh:
+        """Return the mesh of a subset of the vertices.
+
+        Parameters
+        ----------
+        used
+            Mask (N,) of the vertices, or their rows (K,).
+        faces
+            (M, 3) rows of the subset.
+        """
         return replace(
             self,
             vertices=self.vertices[used],
-            faces=new_row[kept].astype(np.int32).reshape(-1, 3),
+            faces=faces.astype(np.int32).reshape(-1, 3),
             normals=self.normals[used],
             color=None if self.color is None else self.color[used],
             sigma=self.sigma[used],
@@ -108,10 +124,15 @@ class Mesh:
     @property
     def spacing(self) -> float:
         """Edge of a square of two triangles of the mean area, m."""
+        return float(np.sqrt(self._double_area))
+
+    @property
+    def _double_area(self) -> float:
+        """Twice the mean area of a triangle, estimated from some of them, m^2; 0 without any."""
         sampled = self.faces[:: max(1, -(-len(self.faces) // _MAX_SAMPLED))]
         a, b, c = (self.vertices[sampled[:, k]] for k in range(3))
         double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        return float(np.sqrt(double_area.mean(dtype=float))) if len(sampled) else 0.0
+        return float(double_area.mean(dtype=float)) if len(sampled) else 0.0
 
     def without_islands(self, min_vertices: int) -> Mesh:
         """Return the mesh without connected pieces of fewer than `min_vertices` vertices."""
@@ -195,11 +216,8 @@ class Mesh:
         """Return the mesh simplified to at most `faces` triangles: faster than `decimated`."""
         if len(self.faces) <= faces:
             return self
-        sampled = self.faces[:: -(-len(self.faces) // _MAX_SAMPLED)]
-        a, b, c = (self.vertices[sampled[:, k]] for k in range(3))
-        cross = np.cross(b - a, c - a)
-        area = 0.5 * float(np.linalg.norm(cross, axis=1).mean(dtype=float)) * len(self.faces)
-        cell = float(np.sqrt(2 * area / faces))  # two triangles a cell, if it is flat
+        # Two triangles a cell, if it is flat.
+        cell = float(np.sqrt(self._double_area * len(self.faces) / faces))
         while True:
             group, count = self._cluster(cell)
             remaining = with_distinct_corners(group[self.faces])

@@ -232,6 +232,31 @@ def angle(R: ArrayLike) -> Float64:
     return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1)
 
 
+def is_within(T: ArrayLike, metres: float, rad: float) -> bool:
+    """Whether a motion (4, 4) is at most `metres` long, and rotates by at most `rad`."""
+    T = np.asarray(T, float)
+    return bool(np.linalg.norm(T[:3, 3]) <= metres and angle(T) <= rad)
+
+
+def lengths(T: ArrayLike) -> Float64:
+    """Lengths, m, and angles, rad, (K, 2) of motions (K, 4, 4)."""
+    T = np.asarray(T, float)
+    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), angle(T)], axis=1)
+
+
+def largest_sigmas(C: ArrayLike) -> Float64:
+    """Standard deviations, m and rad, (..., 2) in the worst directions.
+
+    Parameters
+    ----------
+    C
+        (..., 6, 6) covariances of twists.
+    """
+    C = np.asarray(C, float)
+    blocks = np.stack([C[..., :3, :3], C[..., 3:, 3:]], axis=-3)
+    return np.sqrt(np.linalg.eigvalsh(blocks)[..., -1].clip(0))
+
+
 def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     """Return T as a float64 (4, 4) array, or raise InputError if it is not a rigid motion."""
     T = np.asarray(T, float)

@@ -78,10 +78,8 @@ class KeyframeMap:
     def is_far(self, T_component_camera: Float64, keyframe: Keyframe) -> bool:
         """Whether a pose (4, 4) is so far from a keyframe that its view becomes the next one."""
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ T_component_camera
-        return bool(
-            se3.angle(T_keyframe_camera) > self._angle
-            or np.linalg.norm(T_keyframe_camera[:3, 3]) > self._distance * keyframe.depth
-        )
+        max_m = self._distance * keyframe.depth
+        return not se3.is_within(T_keyframe_camera, max_m, self._angle)
 
     def overlapping(self, T_component_camera: Float64) -> Keyframe:
         """Return the newest keyframe, or the nearest one if the newest does not overlap a view.

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.backend import BackEnd
 from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
-from tofuse.pipeline.components import numbered_components
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.pipeline.observations import Observations
@@ -20,8 +20,22 @@ from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joining import Group
 from tofuse.posegraph.loops import ClosedLoop, PriorLoop
-from tofuse.posegraph.merged_components import Join
-from tofuse.results.types import Reconstruction
+from tofuse.posegraph.merged_components import Join, JoinKind
+from tofuse.results.ranges import runs
+from tofuse.results.types import Component, Reconstruction
+
+# An unconnected component gets its own model if it has more frames than this.
+_MAX_WITHOUT_MODEL = 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Components of the tracker that form one of the result, and their pose (4, 4)."""
+
+    members: tuple[int, ...]
+    group: Group
+    T_main_component: Float64 | None
+    connection: JoinKind | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +62,7 @@ class Assembly:
         """Join components, and reconstruct them: the main one last."""
         with threads(self.threads):
             groups = self._join(log, stages)
-            log, components = numbered_components(log, groups, self._reconstruct_separate)
+            log, components = self._components(log, groups)
             poses = poses_in_world(log, groups[0].T_group_component)
             result = self._back_end(log, poses, groups[0].joins).run(stages, components)
         return replace(result, seed=self.seed, threads=self.threads)
@@ -73,12 +87,31 @@ class Assembly:
         stages.save("joining", (groups, dict(self.watch.seconds)))
         return groups
 
-    def _reconstruct_separate(
-        self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
-    ) -> Reconstruction:
-        """Reconstruct a component that is not connected to the main one."""
-        result = self._back_end(log, poses, joins).run(NoCheckpoints(), ())
-        return replace(result, seed=self.seed, threads=self.threads)
+    def _components(
+        self, log: FrameLog, groups: Sequence[Group]
+    ) -> tuple[FrameLog, tuple[Component, ...]]:
+        """Number components, and reconstruct those that are not connected to the main one.
+
+        The main one is 0, then in the order in which they began. Returns the log with the final
+        component in each record, and the components.
+        """
+        parts = _parts(groups)
+        numbered = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
+        components = []
+        for k, part in enumerate(parts):
+            is_member = [e.has_pose and e.record.component == k for e in numbered.entries]
+            ranges = runs([e.record.index for e in log.entries], is_member)
+            result = None
+            if part.T_main_component is None and part.group.frames > _MAX_WITHOUT_MODEL:
+                frames = [e.record.index for e in numbered.posed if e.record.component == k]
+                component_log = log.of(frames)  # in its own model it is the main component
+                poses = poses_in_world(component_log, part.group.T_group_component)
+                back_end = self._back_end(component_log, poses, part.group.joins)
+                result = replace(
+                    back_end.run(NoCheckpoints(), ()), seed=self.seed, threads=self.threads
+                )
+            components.append(Component(ranges, part.T_main_component, part.connection, result))
+        return numbered, tuple(components)
 
     def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
         return BackEnd(
@@ -87,7 +120,19 @@ class Assembly:
             poses,
             joins,
             self.prior_loops,
-            self.observations.for_back_end(),
+            self.observations,
             self.progress,
             self.watch,
         )
+
+
+def _parts(groups: Sequence[Group]) -> list[_Part]:
+    main = groups[0]
+    first = next(iter(main.T_group_component))
+    to_first = se3.inverse(main.T_group_component[first])
+    parts = [
+        _Part((c,), main, to_first @ T, None if c == first else main.connection(c))
+        for c, T in main.T_group_component.items()
+    ]
+    parts += [_Part(tuple(g.T_group_component), g, None, None) for g in groups[1:]]
+    return [parts[0], *sorted(parts[1:], key=lambda part: min(part.members))]

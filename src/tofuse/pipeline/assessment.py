@@ -19,7 +19,8 @@ from tofuse.parts import name_of
 from tofuse.pipeline.checks import Evidence, judge
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
-from tofuse.pipeline.stage_results import BackEndInput, Optimised, Refined
+from tofuse.pipeline.observations import Observations
+from tofuse.pipeline.stage_results import Optimised, Refined
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of
 from tofuse.posegraph.calibration_check import CalibrationCheck
@@ -78,7 +79,7 @@ class Assessment:
     config: Config
     log: FrameLog
     tracked: TrackedGraph
-    observations: BackEndInput
+    observations: Observations
     prior_loops: Sequence[PriorLoop]
 
     def run(

@@ -14,8 +14,9 @@ from tofuse.pipeline.assessment import Assessment
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
+from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
-from tofuse.pipeline.stage_results import BackEndInput, Fused, Optimised, Refined, VisualEvidence
+from tofuse.pipeline.stage_results import Fused, Optimised, Refined, VisualEvidence
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
@@ -59,7 +60,7 @@ class BackEnd:
         poses: dict[int, Float64],
         joins: Sequence[Join],
         prior_loops: Sequence[PriorLoop],
-        observations: BackEndInput,
+        observations: Observations,
         progress: Progress,
         watch: Stopwatch,
     ) -> None:
@@ -262,18 +263,9 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
         link = join.link
         if join.defines_pose or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
             continue
-        r = link.registration
-        record = LoopRecord(
-            link.i,
-            link.j,
-            True,
-            f"joins components, {link.how}",
-            overlap=r.overlap,
-            rms_m=r.rms_m if np.isfinite(r.rms_m) else None,
-            free_space_violation=r.violation,
-            margin=r.margin,
-        )
-        redundant.append(ClosedLoop(record, link.T_i_j, link.information))
+        reason = f"joins components, {link.how}"
+        record = LoopRecord.of((link.i, link.j), True, reason, link.registration)
+        redundant.append(ClosedLoop.of(record, link.registration))
     return [*loops, *redundant]
 
 

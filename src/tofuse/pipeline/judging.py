@@ -44,7 +44,7 @@ from tofuse.posegraph.pair_measurements import measured_pairs
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import read_reference
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.opening import Opening, OpeningOptions
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly_spaced
 from tofuse.registration.prepared_view import PreparedView
@@ -264,18 +264,12 @@ class _Images:
 
 
 @dataclass(frozen=True)
-class JudgeOptions:
+class JudgeOptions(OpeningOptions):
     """The options of ``tofuse judge``; see its ``--help``."""
 
     out: Path | None = None
     overwrite: bool = False
     tolerance: float | None = None
-    format: str | None = None
-    camera: Path | None = None
-    topic: str | None = None
-    start: int = 0
-    end: int | None = None
-    every: int = 1
     threads: int | None = None
 
 

@@ -23,9 +23,10 @@ from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.pipeline.checkpoint import NoCheckpoints
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.paint import TEXTURE, paint
+from tofuse.pipeline.paint import paint
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import TrackingState, push_frames, with_recording_facts
+from tofuse.pipeline.run_options import ModelOptions
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.loops import PriorLoop
@@ -52,7 +53,7 @@ _MIN_PROBABILITY = 0.99
 
 
 @dataclass(frozen=True)
-class MergeOptions:
+class MergeOptions(ModelOptions):
     """The options of ``tofuse merge``; see its ``--help``.
 
     Attributes
@@ -63,12 +64,8 @@ class MergeOptions:
 
     out: Path
     overwrite: bool = False
-    tolerance: float | None = None
-    voxel: float | None = None
-    faces: int | None = None
     seed: int = 0
     threads: int | None = None
-    texture: bool = False
     only_joined: bool = False
 
 
@@ -317,17 +314,7 @@ def _merge_into(
 ) -> Reconstruction:
     progress.stage("opening")
     sessions = read_sessions(results, options.threads, progress)
-    config = merged_config(sessions)
-    fusion = config.fusion
-    if options.voxel is not None:
-        fusion = replace(fusion, voxel_m=options.voxel)
-    if options.faces is not None:
-        fusion = replace(fusion, faces=options.faces)
-    if options.texture and not fusion.texture:
-        fusion = replace(fusion, texture=TEXTURE)
-    config = replace(config, fusion=fusion)
-    if options.tolerance is not None:
-        config = replace(config, tolerance_m=options.tolerance)
+    config = options.applied(merged_config(sessions))
     result = merge_sessions(
         sessions, config, seed=options.seed, threads=options.threads, progress=progress
     )
@@ -335,9 +322,9 @@ def _merge_into(
         progress.note(f"{options.out} is left as it was")
         return result
     texture = None
-    if fusion.texture:
+    if config.fusion.texture:
         recording, _ = joined_recording(sessions)
-        texture = paint(recording, result, fusion.texture, options.threads, progress)
+        texture = paint(recording, result, config.fusion.texture, options.threads, progress)
     progress.stage("writing")
     with threadpool_limits(1):
         write_result(result, folder, _report, texture)

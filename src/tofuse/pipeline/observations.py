@@ -16,7 +16,6 @@ from tofuse.odometry.base import Step
 from tofuse.pipeline.budget import checked_bytes, views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import FilteredFrame
-from tofuse.pipeline.stage_results import BackEndInput
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import Spacing, Spilled, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -41,6 +40,16 @@ class Observations:
         Prepared views of all components, for joining, loops and refinement.
     loops
         The loop detector, which receives every frame.
+    refiner
+        The refinement, which receives every frame.
+    model
+        Stored views of the model.
+    depths
+        Typical radial range of each posed frame, m, by index.
+    ambiguity_m
+        Ambiguity range of the camera, if known.
+    has_covariances
+        Whether covariances of registrations are realistic; those of ICP are too small.
     samples
         Some frames for the report.
     """
@@ -53,41 +62,41 @@ class Observations:
         )
         self.loops = config.loops.start(seed, prior_loops, self.views, config.search)
         self.samples = FrameSamples()
-        self._refiner = config.refinement.start(self.views)
-        self._model = ModelBuilder(config.fusion)
+        self.refiner = config.refinement.start(self.views)
+        self.model = ModelBuilder(config.fusion)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
         self._checks = _EvenSample(_CHECKED_IMAGES, Spill(checked_bytes(config.memory_mb)))
-        self._depths: dict[int, float] = {}  # typical ranges, m
-        self._ambiguity_m: float | None = None
-        self._has_covariances = False
+        self.depths: dict[int, float] = {}
+        self.ambiguity_m: float | None = None
+        self.has_covariances = False
 
     def add(self, filtered: FilteredFrame, step: Step) -> None:
         """Store the data of a frame with a pose for joining, loops and refinement."""
         T, surface = step.T_component_camera, step.surface
         assert T is not None
         if isinstance(filtered.corrected, RangeFrame):
-            self._ambiguity_m = filtered.corrected.ambiguity_m
+            self.ambiguity_m = filtered.corrected.ambiguity_m
         if surface is not None:
             # Covariances of trackers with prepared views are realistic; those of ICP are too small.
-            self._has_covariances = True
+            self.has_covariances = True
             self.views.push(surface, T, step.component, _reduced)
         view: Frame = filtered.for_model
         # Methods on prepared views need no points, which take long to compute.
-        if surface is None or self.loops.points or self._refiner.points:
+        if surface is None or self.loops.points or self.refiner.points:
             view = as_cloud(filtered.for_model, _MAX_POINTS)
         self.loops.push(view, T)
-        self._refiner.push(view, T)
+        self.refiner.push(view, T)
 
     def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
         """Store the data of a frame with a pose for the model and the verdict."""
         depth = _typical_range(frame)
         if isinstance(frame, RangeFrame):
-            self._depths[frame.index] = depth
+            self.depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
                 self._checks.add(lambda: restore_thinned(frame, clean))
         assert step.T_component_camera is not None
         if self._places.keeps(depth, step.T_component_camera, step.component):
-            self._model.add(clean, step.surface, _MAX_POINTS)
+            self.model.add(clean, step.surface, _MAX_POINTS)
 
     def sample(self, filtered: FilteredFrame, *, lost: bool) -> None:
         """Store small images of some frames for the report."""
@@ -99,18 +108,10 @@ class Observations:
         ):
             self.samples.take(lost=lost, make=partial(FrameSample.of, frame, tracked, modelled))
 
-    def for_back_end(self) -> BackEndInput:
-        """Return the input of the back end."""
-        return BackEndInput(
-            self.loops,
-            self._refiner,
-            self._model,
-            self._checks.images,
-            self._depths,
-            self._ambiguity_m,
-            self._has_covariances,
-            self.views,
-        )
+    @property
+    def checks(self) -> Sequence[Spilled[RangeFrame]]:
+        """Images that are compared with each other at the final poses."""
+        return self._checks.images
 
 
 def _reduced(view: PreparedView) -> PreparedView:

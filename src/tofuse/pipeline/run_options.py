@@ -11,28 +11,58 @@ from tofuse.errors import InputError
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.paint import TEXTURE
 from tofuse.pipeline.priors import Prior
+from tofuse.recordings.opening import OpeningOptions
 from tofuse.recordings.recording import Recording
 from tofuse.results.run_json import read_run_json
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options of the model and of its verdict, of ``tofuse run`` and ``tofuse merge``.
+
+    What is None is as in the configuration.
+
+    Attributes
+    ----------
+    tolerance
+        Accuracy required of a good model, m.
+    texture
+        Whether the surface gets a texture.
+    faces
+        Maximum number of triangles.
+    voxel
+        Edge of a voxel, m.
+    """
+
+    tolerance: float | None = None
+    texture: bool = False
+    faces: int | None = None
+    voxel: float | None = None
+
+    def applied(self, config: Config) -> Config:
+        """Return the configuration with these options."""
+        if self.texture and not config.fusion.texture:
+            config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
+        if self.faces is not None:
+            config = changed(config, {"fusion": {"faces": self.faces}}, where="--faces")
+        if self.voxel is not None:
+            config = changed(config, {"fusion": {"voxel_m": self.voxel}}, where="--voxel")
+        if self.tolerance is not None:
+            config = changed(config, {"tolerance_m": self.tolerance}, where="--tolerance")
+        return config
+
+
 @dataclass(frozen=True)
-class Options:
+class Options(OpeningOptions, ModelOptions):
     """The options of ``tofuse run``; see its ``--help``."""
 
     out: Path
     method: str | None = None
     config: Path | None = None
-    camera: Path | None = None
-    topic: str | None = None
-    format: str | None = None
     seed: int | None = None
     threads: int | None = None
-    start: int = 0
-    end: int | None = None
-    every: int = 1
-    average_still: bool = False
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
@@ -40,10 +70,6 @@ class Options:
     loops: Path | None = None
     object: bool = False
     unwrap: bool = False
-    tolerance: float | None = None
-    texture: bool = False
-    faces: int | None = None
-    voxel: float | None = None
     memory: int | None = None
     overwrite: bool = False
 
@@ -58,17 +84,10 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
     if options.guess:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
-    if options.texture and not config.fusion.texture:
-        config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
-    if options.faces is not None:
-        config = changed(config, {"fusion": {"faces": options.faces}}, where="--faces")
-    if options.voxel is not None:
-        config = changed(config, {"fusion": {"voxel_m": options.voxel}}, where="--voxel")
+    config = options.applied(config)
     if options.memory is not None:
         megabytes = options.memory // 1_000_000
         config = changed(config, {"memory_mb": megabytes}, where="--memory")
-    if options.tolerance is not None:
-        config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
     leading_filters: list[dict[str, Any]] = []
     if options.min_depth is not None or options.max_depth is not None:
         low = options.min_depth or 0.0

@@ -43,7 +43,6 @@ _MODULES = (
     "lab.methods",
     "odometry",
     "pipeline.background_queue",
-    "pipeline.components",
     "pipeline.config",
     "pipeline.frame_log",
     "pipeline.intake",

@@ -23,6 +23,7 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.covariances import GraphCovariances
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.view_store import PosedView
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 
@@ -162,12 +163,12 @@ class _CovarianceErrors:
         """
         graph = covariances.graph
         n = len(graph.ids)
-        evenly_spaced = np.unique(np.linspace(0, n - 1, min(n, _EVENLY_SPACED)).round().astype(int))
-        positions = evenly_spaced if extra is None else np.union1d(evenly_spaced, extra)
+        even = evenly_spaced(np.arange(n), _EVENLY_SPACED)
+        positions = even if extra is None else np.union1d(even, extra)
         C = covariances.joint(positions) if n > 1 else None
         if C is None:
             return None
-        is_even = np.isin(positions, evenly_spaced)
+        is_even = np.isin(positions, even)
         results = [_bounds(part, is_even) for part in _aligned(C, graph.poses[positions], is_even)]
         bounds, rms, single = zip(*results, strict=True)
         return cls(positions, np.array(bounds), np.array(rms), np.stack(single, 1))

@@ -89,7 +89,7 @@ def end_speeds(component: TrackedComponent, *, end: bool) -> Float64:
     if len(poses) < 2:
         return np.zeros((0, 2))
     elapsed = np.maximum(np.diff(times), 1e-9)
-    return _lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
+    return se3.lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
 
 
 def largest_motion(before: TrackedComponent, after: TrackedComponent) -> Float64:
@@ -115,7 +115,7 @@ def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | N
         tracked = se3.inverse(side.poses[:-1]) @ side.poses[1:]
         measured = se3.inverse(odometry[:-1]) @ odometry[1:]
         all_errors.append(se3.log(se3.inverse(tracked) @ measured))
-        lengths.append(_lengths(measured))
+        lengths.append(se3.lengths(measured))
         intervals.append(np.diff(side.times))
     errors = np.concatenate(all_errors)
     valid = np.isfinite(errors).all(1)
@@ -124,7 +124,7 @@ def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | N
     step_count = max(elapsed / max(float(np.median(np.concatenate(intervals))), 1e-9), 1.0)
     # Errors of odometry are in proportion to the motion.
     typical = np.median(np.concatenate(lengths)[valid], axis=0) * step_count
-    excess = np.maximum(_lengths(T[None])[0] / np.maximum(typical, 1e-9), 1.0)
+    excess = np.maximum(se3.lengths(T[None])[0] / np.maximum(typical, 1e-9), 1.0)
     step_sigma = SIGMA_OF_MEDIAN * np.median(np.abs(errors[valid]), axis=0)
     sigma = step_sigma * np.sqrt(step_count) * np.repeat(excess, 3)
     limit = np.repeat([CONVERGENCE * before.depth, CONVERGENCE], 3)
@@ -132,11 +132,6 @@ def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | N
         return None
     method = "bridged by odometry"
     return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), method)
-
-
-def _lengths(T: Float64) -> Float64:
-    """(K, 2) lengths, m, and angles, rad, of motions (K, 4, 4)."""
-    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(se3.angle(T))], 1)
 
 
 def extrapolated(before: TrackedComponent, after: TrackedComponent) -> Link | None:

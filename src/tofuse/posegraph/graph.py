@@ -10,6 +10,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.registration.base import Registration
 
 # Squared error of an edge, in units of its information, up to which it may be rounding.
 ROUNDING = 1e-12
@@ -253,3 +254,18 @@ class LoopRecord:
     rms_m: float | None = None
     free_space_violation: float | None = None
     margin: float | None = None
+
+    @classmethod
+    def of(
+        cls, pair: tuple[int, int], accepted: bool, reason: str, registration: Registration
+    ) -> LoopRecord:
+        """Return the decision on a registration of the views of frames `pair` (i, j)."""
+        return cls(
+            *pair,
+            accepted,
+            reason,
+            overlap=registration.overlap,
+            rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
+            free_space_violation=registration.violation,
+            margin=registration.margin,
+        )

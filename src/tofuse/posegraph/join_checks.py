@@ -19,6 +19,7 @@ from tofuse.posegraph.gaps import (
     motion_over,
 )
 from tofuse.posegraph.merged_components import DRIFT, MergedComponent, MergedComponents, transformed
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.pose_probability import CONTRADICTION
@@ -84,12 +85,9 @@ class JoinChecks:
         pairs = [
             (a, b) for s in self._merged.tracked.values() for a, b in itertools.pairwise(s.views)
         ]
-        sampled = (
-            np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_LEARNT_PAIRS)).round().astype(int)
-        )
         options = ProjectiveOptions(levels=PATIENT)
         contradictions = []
-        for k in sampled:
+        for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
             a, b = pairs[k]
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)
@@ -191,21 +189,14 @@ class JoinChecks:
                 reach = self.speed * elapsed
                 if reach[0] < max_motion * before.depth and reach[1] < max_motion:
                     motion = motion_over(before, after, T)
-                    translation = float(np.linalg.norm(motion[:3, 3]))
-                    if (
-                        translation < max_motion * before.depth
-                        and float(se3.angle(motion)) < max_motion
-                    ):
+                    if se3.is_within(motion, max_motion * before.depth, max_motion):
                         return True
         return False
 
     def _within_drift(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
         """Whether two poses differ by no more than drift and the error of a single link."""
-        difference = se3.inverse(T) @ other
         limit = drift + _LINK_ERROR
-        return bool(
-            np.linalg.norm(difference[:3, 3]) <= limit * depth and se3.angle(difference) <= limit
-        )
+        return se3.is_within(se3.inverse(T) @ other, limit * depth, limit)
 
     def confirming(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, links: list[Link], count: int
@@ -235,11 +226,8 @@ class JoinChecks:
                     continue
                 motion = motion_over(first, second, T)
                 max_motion = largest_motion(first, second)
-                depth = first.depth
-                if (
-                    np.linalg.norm(motion[:3, 3]) > max_motion[0] + _SMALL_MOTION * depth
-                    or float(se3.angle(motion)) > max_motion[1] + _SMALL_MOTION
-                ):
+                max_m = max_motion[0] + _SMALL_MOTION * first.depth
+                if not se3.is_within(motion, max_m, max_motion[1] + _SMALL_MOTION):
                     return False
         return True
 

@@ -31,9 +31,11 @@ from tofuse.posegraph.pair_equations import (
     rescale,
     without_exposure,
 )
-from tofuse.posegraph.pose_priors import DAMPING, UNITS, WEAK, Priors, weak_prior
+from tofuse.posegraph.pose_priors import DAMPING, WEAK, Priors, weak_prior
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.view_store import SampledView, overlaps
+from tofuse.recordings.recording import evenly_spaced
+from tofuse.registration.projective import UNITS
 
 _ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
 # Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.
@@ -339,10 +341,7 @@ def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
     keep = [np.zeros(0, np.intp)]
     order = np.argsort(pairs[:, 1], kind="stable")
     _, begin = np.unique(pairs[order, 1], return_index=True)
-    for rows in np.split(order, begin[1:]):
-        if len(rows) > neighbours:
-            rows = rows[np.unique(np.linspace(0, len(rows) - 1, neighbours).round().astype(int))]
-        keep.append(rows)
+    keep += [evenly_spaced(rows, neighbours) for rows in np.split(order, begin[1:])]
     return pairs[np.concatenate(keep)]
 
 

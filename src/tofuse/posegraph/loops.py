@@ -52,6 +52,13 @@ class ClosedLoop:
     T_i_j: Float64 | None = None
     information: Float64 | None = None
 
+    @classmethod
+    def of(cls, record: LoopRecord, registration: Registration) -> ClosedLoop:
+        """Return the decision `record` on a registration, with its measurement if accepted."""
+        if not record.accepted:
+            return cls(record)
+        return cls(record, registration.T_target_source, registration.information)
+
 
 def close_prior_loop(
     loop: PriorLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
@@ -241,9 +248,7 @@ class Confirmation(Bounded):
         record = LoopRecord(
             i, j, not rejection_reason, reason, overlap=best.inlier_ratio, rms_m=best.rms_m
         )
-        if rejection_reason:
-            return ClosedLoop(record)
-        return ClosedLoop(record, best.T_target_source, best.information)
+        return ClosedLoop.of(record, best)
 
     def _register(self, source: Frame, target: Frame, guess: Float64, seed: int) -> Registration:
         rng = np.random.default_rng([seed, SEED_STAGE, source.index, target.index])

@@ -172,10 +172,7 @@ class MergedComponents:
         T_b_j = self.T_merged(b, j)
         difference = se3.inverse(T_first @ T_b_j) @ T_second @ T_b_j
         depth = self.depth_of(j)
-        return bool(
-            np.linalg.norm(difference[:3, 3]) <= DISTINCT_M + drift * depth
-            and se3.angle(difference) <= DISTINCT_RAD + drift
-        )
+        return se3.is_within(difference, DISTINCT_M + drift * depth, DISTINCT_RAD + drift)
 
     def separation(self, a: MergedComponent, b: MergedComponent, link: Link, other: Link) -> float:
         """Return the distance between the views of two links, on the side where it is larger.

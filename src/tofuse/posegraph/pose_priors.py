@@ -10,10 +10,9 @@ from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import PairSystem
+from tofuse.registration.projective import UNITS
 
-# Units of the motion of a view, for priors and convergence: 1 cm and 1 degree.
-UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
-WEAK = 1e-3  # information of a weak prior in these units
+WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it
 
 

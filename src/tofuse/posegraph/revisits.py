@@ -393,17 +393,9 @@ class _RevisitLoops(Loops):
         if registration is None:
             return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
         reason = self._rejection_reason(registration)
-        record = LoopRecord(
-            *pair,
-            not reason,
-            reason or f"right with a probability of {registration.probability:.0%}",
-            overlap=registration.overlap,
-            rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
-            free_space_violation=registration.violation,
-        )
-        if reason:
-            return ClosedLoop(record)
-        return ClosedLoop(record, registration.T_target_source, registration.information)
+        explanation = reason or f"right with a probability of {registration.probability:.0%}"
+        record = LoopRecord.of(pair, not reason, explanation, registration)
+        return ClosedLoop.of(record, registration)
 
     def _similar(
         self,
@@ -482,19 +474,8 @@ class _RevisitLoops(Loops):
             reason = registration.how if isolated else f"{registration.how}; another loop agrees"
             if (i, j) in similar:
                 reason = f"looks similar, {reason}"
-            record = LoopRecord(
-                i,
-                j,
-                True,
-                reason,
-                overlap=registration.overlap,
-                rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
-                free_space_violation=registration.violation,
-                margin=registration.margin,
-            )
-            accepted[i, j] = ClosedLoop(
-                record, registration.T_target_source, registration.information
-            )
+            record = LoopRecord.of((i, j), True, reason, registration)
+            accepted[i, j] = ClosedLoop.of(record, registration)
         rejected_loops = {}
         for p in pairs:
             record = LoopRecord(*p, False, "") if p in similar else closed[p].record
@@ -523,10 +504,7 @@ class _RevisitLoops(Loops):
         T_i_k = se3.inverse(poses[i]) @ poses[k]
         T_m_j = se3.inverse(poses[m]) @ poses[j]
         difference = se3.inverse(T_i_j) @ T_i_k @ T_k_m @ T_m_j
-        return bool(
-            np.linalg.norm(difference[:3, 3]) < _CONSISTENT_M
-            and se3.angle(difference) < _CONSISTENT_RAD
-        )
+        return se3.is_within(difference, _CONSISTENT_M, _CONSISTENT_RAD)
 
     def _rejection_reason(self, registration: Registration) -> str:
         if registration.overlap is not None and registration.overlap < _MIN_OVERLAP:
@@ -584,6 +562,5 @@ def _path_lengths(poses: Mapping[int, Float64]) -> dict[int, Float64]:
     indices = sorted(poses)
     trajectory = np.stack([poses[k] for k in indices])
     steps = se3.inverse(trajectory[:-1]) @ trajectory[1:]
-    increments = np.linalg.norm(steps[:, :3, 3], axis=1), np.asarray(se3.angle(steps))
-    lengths = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack(increments, 1), axis=0)])
+    lengths = np.concatenate([np.zeros((1, 2)), np.cumsum(se3.lengths(steps), axis=0)])
     return dict(zip(indices, lengths, strict=True))

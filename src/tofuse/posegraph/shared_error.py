@@ -20,6 +20,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels import pair_equations as kernels
 from tofuse.registration.projection import Projection
+from tofuse.registration.projective import UNITS
 
 # Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
 # image's width, as in the tracker's covariance.
@@ -32,7 +33,7 @@ _MIN_WEIGHT = 0.1
 _MIN_CHANGE = 0.02
 # Prior sigma of the pose of a single pair, in units of 1 cm and 1 degree (and 1 of the exposure).
 _PRIOR_SIGMA = 1.8
-_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
+_UNITS = np.append(UNITS, 1.0)
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 

@@ -23,8 +23,9 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_evenly, support_of
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.posegraph.pose_priors import UNITS, Priors
+from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.view_store import HasCoarseView, SampledView, overlaps, world_centroids
+from tofuse.registration.projective import UNITS
 
 A = TypeVar("A")
 

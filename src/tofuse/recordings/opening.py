@@ -13,14 +13,12 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import average_still
 
 
-@dataclass(frozen=True)
-class Opening:
-    """Arguments with which a recording was opened; see `open_recording` and `tofuse run`.
+@dataclass(frozen=True, kw_only=True)
+class OpeningOptions:
+    """Options with which a recording is opened.
 
     Attributes
     ----------
-    paths
-        Files or folders.
     format, camera, topic
         See `open_recording`.
     start, end, every
@@ -29,7 +27,6 @@ class Opening:
         Whether stationary intervals are averaged to one frame each.
     """
 
-    paths: tuple[Path, ...]
     format: str | None = None
     camera: Path | None = None
     topic: str | None = None
@@ -37,6 +34,19 @@ class Opening:
     end: int | None = None
     every: int = 1
     average_still: bool = False
+
+
+@dataclass(frozen=True)
+class Opening(OpeningOptions):
+    """Arguments with which a recording was opened; see `open_recording` and `tofuse run`.
+
+    Attributes
+    ----------
+    paths
+        Files or folders.
+    """
+
+    paths: tuple[Path, ...]
 
     @classmethod
     def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
@@ -75,13 +85,13 @@ class Opening:
             camera, end = data["camera"], data["end"]
             opening = cls(
                 paths,
-                data["format"],
-                None if camera is None else Path(str(camera)),
-                data["topic"],
-                int(data["start"]),
-                None if end is None else int(end),
-                int(data["every"]),
-                bool(data["average_still"]),
+                format=data["format"],
+                camera=None if camera is None else Path(str(camera)),
+                topic=data["topic"],
+                start=int(data["start"]),
+                end=None if end is None else int(end),
+                every=int(data["every"]),
+                average_still=bool(data["average_still"]),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise InputError("does not state how its recording was opened", where=where) from error

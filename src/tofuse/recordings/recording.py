@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError, UnreadableFrameError
@@ -17,6 +18,7 @@ from tofuse.kernels.threads import job_pool
 from tofuse.recordings.frames import Frame, RangeFrame
 
 R = TypeVar("R")
+S = TypeVar("S", bound=np.generic)
 
 
 class Source(Protocol):
@@ -256,7 +258,7 @@ class Recording:
             pool.shutdown(cancel_futures=True)
 
 
-def evenly_spaced(items: Intp, count: int) -> Intp:
+def evenly_spaced(items: NDArray[S], count: int) -> NDArray[S]:
     """Return at most `count` of the items, evenly spaced, including the first and the last."""
     if len(items) == 0:
         return items

@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds, with_cloud_information
-from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.fpfh import candidates
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 from tofuse.registration.uncertainty import UncertaintyOptions
@@ -64,7 +64,7 @@ class AnyPair(Registrar):
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
         # Other clouds are matched by features below.
-        proposals = partial(_feature_proposals, source, target, rng) if are_images else None
+        proposals = partial(_feature_proposals, source, target) if are_images else None
         image_registration = _registered_as_images(
             source, target, guess, proposals, search=searches
         )
@@ -77,13 +77,13 @@ class AnyPair(Registrar):
         return register_clouds(source, target, guess, rng, image_registration)
 
 
-def _feature_proposals(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
+def _feature_proposals(source: Frame, target: Frame) -> Float64:
     """Return the poses (N, 4, 4) proposed by feature matching, under any rotation."""
     try:
-        candidates = Fpfh(points=_DESCRIBED_POINTS, signed=True).candidates(source, target, rng)
+        found = candidates(source, target, points=_DESCRIBED_POINTS, signed=True)
     except RegistrationError:
         return np.zeros((0, 4, 4))
-    return np.stack([pose.T_target_source for pose in candidates.poses[:_PROPOSALS]])
+    return np.stack([pose.T_target_source for pose in found.poses[:_PROPOSALS]])
 
 
 def _registered_as_images(

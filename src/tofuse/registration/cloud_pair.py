@@ -22,13 +22,13 @@ from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
-from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.consensus import are_distinct
+from tofuse.registration.fpfh import candidates
 from tofuse.registration.icp import Icp
 from tofuse.registration.pose_probability import CERTAIN, CLOUDS, Evidence
 from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.remapping import Remapping
-from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
@@ -121,7 +121,8 @@ class _Views:
     def are_distinct_poses(self, a: Float64, b: Float64) -> bool:
         """Whether two poses (4, 4) are distinct hypotheses."""
         points = self.source_map.view.points.astype(np.float64)
-        return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
+        limits = {"metres": _DISTINCT * self.size, "rad": _DISTINCT_RAD}
+        return bool(are_distinct(a[None], b, points, **limits)[0])
 
 
 def _finest(view: Frame) -> float:
@@ -284,12 +285,8 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
     """
     poses, failure = [], None
     try:
-        candidates = (
-            Fpfh(signed=views.has_free_space)
-            .candidates(views.source, views.target, views.rng)
-            .poses
-        )
-        poses += [views.refined(c.T_target_source) for c in candidates[:_MAX_REFINED]]
+        found = candidates(views.source, views.target, signed=views.has_free_space)
+        poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
     if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):
@@ -362,16 +359,5 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
     evidence = views.evidence(pose, lead, len(registration.unobservable))
-    reason = evidence.rejection_reason()
-    return replace(
-        registration,
-        margin=lead,
-        believed=not reason,
-        probability=evidence.probability,
-        reason=reason,
-        runner_up=None if rival is None or rival is _NO_RIVAL else rival.T_target_source,
-        overlap=agreement.overlap,
-        support=agreement.support,
-        contradiction=agreement.contradiction,
-        violation=agreement.violation,
-    )
+    runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
+    return evidence.applied(registration, agreement, runner_up)

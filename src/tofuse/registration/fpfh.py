@@ -1,36 +1,33 @@
-"""Global registration of clouds by matching fast point feature histograms."""
+"""Poses of clouds under any rotation by matching fast point feature histograms."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Bool, Float64, Int64
-from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels import fpfh as kernels
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
-from tofuse.parts import part
 from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
-from tofuse.registration.reduce import reduced
-from tofuse.registration.sample_consensus import (
+from tofuse.registration.coarse_to_fine import spacing
+from tofuse.registration.consensus import (
     Consensus,
     ConsensusOptions,
-    Method,
+    Motions,
     Pairs,
     are_distinct,
     consensus,
     motion_of,
-    registration_of,
 )
+from tofuse.registration.reduce import reduced
 from tofuse.registration.shape import shape_at
 
+# Defaults of `candidates`.
+POINTS, REACH, NEIGHBOURS = 4000, 5.0, 12
 _BINS = 11
 # Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
@@ -50,18 +47,27 @@ _REACHES, _MIN_PAIRS = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
 _MIN_NORMAL_COSINE = 0.8
 
 
-@part("registration", "fpfh")
-@dataclass(frozen=True)
-class Fpfh(Bounded, Registrar):
-    """Fast point feature histograms (Rusu et al. 2009) with robust consensus of the matches.
+def candidates(
+    source: Frame,
+    target: Frame,
+    *,
+    points: int = POINTS,
+    reach: float = REACH,
+    neighbours: int = NEIGHBOURS,
+    signed: bool = False,
+    options: ConsensusOptions | None = None,
+    motions: Motions | None = None,
+) -> Candidates:
+    """Return the consensus poses of matched points of two views, and how well the views fit there.
 
     Both views are averaged to the same resolution. Each point is described by histograms of angles
-    between normals, which are invariant to rigid motion; mutual nearest neighbours are matched,
-    and nearly all matches may be outliers. Of the consensus motions the one under which most points
-    of the source fit is chosen and refined. The guess is not used.
+    between normals, which are invariant to rigid motion (`fpfh`); mutual nearest neighbours are
+    matched, and nearly all matches may be outliers.
 
-    Attributes
+    Parameters
     ----------
+    source, target
+        Views.
     points
         Maximum number of points of each averaged view.
     reach
@@ -71,111 +77,45 @@ class Fpfh(Bounded, Registrar):
     signed
         Whether the orientation of the normals is known. Arrays of points are assumed to be seen
         from their origin.
-    method, inliers, seeds
-        Options of the consensus, see `ConsensusOptions`.
-    refine
-        Whether the pose is refined by generalised ICP (`CoarseToFine`, starting at the resolution
-        of the averaged views); else it is that of the matches.
+    options
+        Options of the consensus, except for those of distinct motions.
+    motions
+        See `consensus`.
+
+    Raises
+    ------
+    RegistrationError
+        If too few matches agree on a motion.
     """
-
-    points: Annotated[int, Bounds(20, 20_000)] = 4000
-    reach: Annotated[float, Bounds(1, 100)] = 5.0
-    neighbours: Annotated[int, Bounds(4, 1000)] = 12
-    signed: bool = False
-    method: Method = "compatible"
-    inliers: int = 6
-    seeds: int = 100
-    refine: bool = True
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._consensus(1.0)
-
-    def _consensus(self, size: float) -> ConsensusOptions:
-        return ConsensusOptions(
-            self.method,
-            inliers=self.inliers,
-            seeds=self.seeds,
-            distinct_m=_DISTINCT * size,
-            distinct_rad=_DISTINCT_RAD,
-        )
-
-    def register(
-        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
-    ) -> Registration:
-        """See `Registrar.register`; without `refine` its points are the matches.
-
-        `margin` is the lead in the fraction of the averaged points that fit.
-
-        Raises
-        ------
-        RegistrationError
-            If too few matches agree on a motion, or, once refined, too few points correspond.
-        """
-        candidates = self.candidates(source, target, rng)
-        best = candidates.poses[0]
-        rival = candidates.poses[1].inlier_ratio if len(candidates.poses) > 1 else 0.0
-        coarse = registration_of(candidates.pairs, best.consensus, best.inlier_ratio - rival)
-        if not self.refine:
-            return coarse
-        refinement = CoarseToFine(coarsest=candidates.size)
-        refined = refinement.register(source, target, best.T_target_source, rng)
-        return replace(refined, margin=coarse.margin)
-
-    def candidates(self, source: Frame, target: Frame, rng: np.random.Generator) -> Candidates:
-        """Return the consensus poses of the matches, and how well the averaged views fit there.
-
-        Raises
-        ------
-        RegistrationError
-            If too few matches agree on a motion.
-        """
-        size = _COARSER * max(spacing(source), spacing(target))
-        size, data, model = reduced(source, target, size, self.points)
-        described_source, described_target = (
-            self._described(data, size),
-            self._described(model, size),
-        )
-        i, j = mutually_nearest(described_source.histograms, described_target.histograms)
-        variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
-        pairs = Pairs(described_source.points[i], described_target.points[j], variance)
-        tree = KdTree(described_target.points)
-        refined = [
-            Candidate(
-                *_refined(described_source, described_target, tree, c.T_target_source, size), c
-            )
-            for c in consensus(pairs, self._consensus(size), rng)
-        ]
-        distinct: list[Candidate] = []
-        for candidate in sorted(refined, key=lambda c: -c.inlier_ratio):
-            # Discard poses that converge to a better one.
-            if all(
-                are_distinct(
-                    candidate.T_target_source,
-                    c.T_target_source,
-                    described_source.points,
-                    metres=_DISTINCT * size,
-                    rad=_DISTINCT_RAD,
-                )
-                for c in distinct
-            ):
-                distinct.append(candidate)
-        return Candidates(size, pairs, tuple(distinct))
-
-    def _described(self, view: CloudFrame, size: float) -> DescribedCloud:
-        shape = shape_at(view, np.arange(len(view)), self.neighbours)
-        # Points that are on no surface have no descriptor and corrupt those of their neighbours.
-        valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
-        points, normals = view.points[valid].astype(np.float64), shape.normals[valid]
-        if len(points) < self.inliers:
-            raise RegistrationError(
-                f"has {len(points)} points on surfaces, too few to be matched",
-                where=f"frame {view.index}",
-            )
-        return DescribedCloud(
-            points, normals, fpfh(points, normals, self.reach * size, self.signed)
-        )
+    size = _COARSER * max(spacing(source), spacing(target))
+    size, data, model = reduced(source, target, size, points)
+    options = replace(
+        options or ConsensusOptions(), distinct_m=_DISTINCT * size, distinct_rad=_DISTINCT_RAD
+    )
+    described_source, described_target = (
+        _described(view, reach * size, neighbours, signed, options.inliers)
+        for view in (data, model)
+    )
+    i, j = mutually_nearest(described_source.histograms, described_target.histograms)
+    variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
+    pairs = Pairs(described_source.points[i], described_target.points[j], variance)
+    tree = KdTree(described_target.points)
+    refined = [
+        Candidate(*_refined(described_source, described_target, tree, c.T_target_source, size), c)
+        for c in consensus(pairs, options, motions)
+    ]
+    distinct: list[Candidate] = []
+    for candidate in sorted(refined, key=lambda c: -c.inlier_ratio):
+        # Discard poses that converge to a better one.
+        if are_distinct(
+            np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4),
+            candidate.T_target_source,
+            described_source.points,
+            metres=options.distinct_m,
+            rad=options.distinct_rad,
+        ).all():
+            distinct.append(candidate)
+    return Candidates(size, pairs, tuple(distinct))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +153,24 @@ class Candidates:
     size: float
     pairs: Pairs
     poses: tuple[Candidate, ...]
+
+
+def _described(
+    view: CloudFrame, reach: float, neighbours: int, signed: bool, min_points: int
+) -> DescribedCloud:
+    """Describe the points of a view that are on surfaces; `reach` in m.
+
+    Other points have no descriptor, and corrupt those of their neighbours.
+    """
+    shape = shape_at(view, np.arange(len(view)), neighbours)
+    valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
+    points, normals = view.points[valid].astype(np.float64), shape.normals[valid]
+    if len(points) < min_points:
+        raise RegistrationError(
+            f"has {len(points)} points on surfaces, too few to be matched",
+            where=f"frame {view.index}",
+        )
+    return DescribedCloud(points, normals, fpfh(points, normals, reach, signed))
 
 
 def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float64:

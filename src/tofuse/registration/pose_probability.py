@@ -9,12 +9,13 @@ and 4 degrees, which allows for systematic errors of the camera at large baselin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.registration.agreement import Agreement
+from tofuse.registration.base import Registration
 
 # Tolerances of a right pose: fraction of the depth, and rad.
 RIGHT_FRACTION, RIGHT_RAD = 0.05, float(np.radians(4.0))
@@ -76,6 +77,34 @@ class Evidence:
     ) -> Evidence:
         """Return the evidence from the agreement of both views."""
         return cls(agreement.support, agreement.contradiction, margin, degenerate, model)
+
+    def applied(
+        self, registration: Registration, agreement: Agreement, runner_up: Float64 | None
+    ) -> Registration:
+        """Return a registration with its decision.
+
+        Parameters
+        ----------
+        registration
+            The registration that the evidence is about.
+        agreement
+            The agreement of both views at its pose.
+        runner_up
+            (4, 4) T_target_source of the best rival, if any.
+        """
+        reason = self.rejection_reason()
+        return replace(
+            registration,
+            margin=self.margin,
+            believed=not reason,
+            probability=self.probability,
+            reason=reason,
+            runner_up=runner_up,
+            overlap=agreement.overlap,
+            support=agreement.support,
+            contradiction=agreement.contradiction,
+            violation=agreement.violation,
+        )
 
     @property
     def search_regressors(self) -> Float64:

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Float32
-from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.view_planes import fit_planes
 from tofuse.registration.prepared_view import PreparedView
+from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.registration.view_planes import fitted_planes
 
 _CHUNKS = 4
 # Deviation from a plane as a fraction of the depth, and half width of a plane's window as a
@@ -28,18 +28,8 @@ def with_rough_planes(view: PreparedView) -> PreparedView:
     z[(view.z <= 0) | (np.abs(z - view.z) > 5 * _DEVIATION * view.z)] = 0
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
     weight = np.divide(1, (_DEVIATION * w) ** 2, out=np.zeros_like(z), where=z > 0)
-    valid = weight > 0
-    rows, columns = z.shape
-    planes = np.empty((rows, columns, 4), np.float32)
-    quality = np.empty((rows, columns, 2), np.float32)
-    radii = np.array([max(2, round(_WINDOW * columns))], np.int64)
-    run_chunks(
-        lambda a, b: fit_planes(
-            w, view.rays, weight, valid, radii, 1.0, 0.7, 0.2, planes, quality, a, b
-        ),
-        rows,
-        _CHUNKS,
-    )
+    options = SurfaceOptions(radii=(max(2, round(_WINDOW * z.shape[1])),), fill=0.7, offset=0.2)
+    planes, quality = fitted_planes(w, view.rays, weight, weight > 0, 1.0, options, _CHUNKS)
     has_plane = view.planes[..., 3] > 0
     misfit = quality[..., 0]
     variance: Float32 = quality[..., 1] * np.where(np.isfinite(misfit), misfit, 0)

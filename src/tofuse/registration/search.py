@@ -93,8 +93,7 @@ class SearchOptions(Bounded):
 
 def are_distinct_poses(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
     """Whether two poses (4, 4) are distinct hypotheses."""
-    T_a_b = se3.inverse(a) @ b
-    return bool(np.linalg.norm(T_a_b[:3, 3]) > distinct_m or se3.angle(T_a_b) > DISTINCT_RAD)
+    return not se3.is_within(se3.inverse(a) @ b, distinct_m, DISTINCT_RAD)
 
 
 @dataclass(frozen=True, eq=False)

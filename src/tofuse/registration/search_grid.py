@@ -12,6 +12,7 @@ from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_chunks
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import nearest_depth
 from tofuse.registration.floor import Floor
 from tofuse.registration.prepared_view import PreparedView
@@ -70,7 +71,7 @@ class ResampledView:
         keep = np.arange(len(self.points))
         if thinned is not None:
             keep = np.concatenate([keep[~thinned], keep[thinned][::4]])
-        keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
+        keep = evenly_spaced(keep, count)
         points = self.points[keep], self.normals[keep], self.albedo[keep]
         return kernels.Resampled(*points, self.grid, self.frame)
 

@@ -173,8 +173,7 @@ def are_inverse(
     T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
 ) -> bool:
     """Whether forward and backward alignments (4, 4) are consistent within `metres`, `radians`."""
-    difference = T_target_source @ T_source_target
-    return bool(np.linalg.norm(difference[:3, 3]) <= metres and se3.angle(difference) <= radians)
+    return se3.is_within(T_target_source @ T_source_target, metres, radians)
 
 
 def usual_tolerances(fit_statistics: FitStatistics) -> AgreementOptions:

@@ -318,20 +318,9 @@ class _Pair:
         self, pose: _Pose, evidence: Evidence, rival: Candidate | None
     ) -> Registration:
         """Return a pose as a registration."""
-        reason = evidence.rejection_reason()
         registration = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
-        return replace(
-            registration,
-            margin=evidence.margin,
-            believed=not reason,
-            probability=evidence.probability,
-            reason=reason,
-            runner_up=None if rival is None else rival.T_target_source,
-            overlap=pose.agreement.overlap,
-            support=evidence.support,
-            contradiction=evidence.contradiction,
-            violation=pose.agreement.violation,
-        )
+        runner_up = None if rival is None else rival.T_target_source
+        return evidence.applied(registration, pose.agreement, runner_up)
 
     def _covariance(self, pose: _Pose) -> Float64:
         # The result of a search constrains no degenerate direction.

@@ -26,8 +26,12 @@ def fitted_planes(
     mask: Bool,
     limit: float,
     options: SurfaceOptions,
+    chunks: int | None = None,
 ) -> tuple[Float32, Float32]:
-    """Return planes (H, W, 4) and quality (H, W, 2) at the pixels of the mask, see `fit_planes`."""
+    """Return planes (H, W, 4) and quality (H, W, 2) at the pixels of the mask, see `fit_planes`.
+
+    `chunks` is the number of chunks of rows, `row_chunks` unless given.
+    """
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
@@ -39,7 +43,7 @@ def fitted_planes(
             planes, quality, start, stop,
         )  # fmt: skip
 
-    run_chunks(fit, rows, row_chunks(rows))
+    run_chunks(fit, rows, chunks or row_chunks(rows))
     return planes, quality
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
+from tofuse.geometry import se3
 from tofuse.normal import OF_95_PERCENT
 from tofuse.report.fields import normalized_accuracy
 from tofuse.report.packing import pack
@@ -71,8 +72,7 @@ def _bound(record: FrameRecord) -> float:
     C = record.covariance
     if C is None or not np.isfinite(C).all():
         return float("nan")
-    variance = float(np.linalg.eigvalsh(C[:3, :3])[-1])
-    return OF_95_PERCENT * float(np.sqrt(max(variance, 0.0)))
+    return OF_95_PERCENT * float(se3.largest_sigmas(C)[0])
 
 
 def _poses(poses: Float64, axes: Float64) -> str:

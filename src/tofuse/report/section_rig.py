@@ -70,10 +70,7 @@ def _camera(camera: RigCamera, first: bool) -> tuple[str, ...]:
     position = ", ".join(f"{x:.3f}" for x in camera.T_rig_camera[:3, 3]).replace("-", "−")
     if first:
         return (camera.name, position, "–", "–", "–", "–")
-    sigma_m, sigma_rad = (
-        float(np.sqrt(max(np.linalg.eigvalsh(camera.covariance[part, part])[-1], 0)))
-        for part in (slice(3), slice(3, 6))
-    )
+    sigma_m, sigma_rad = se3.largest_sigmas(camera.covariance).tolist()
     offsets = (camera.time_offset_s, camera.depth_offset_m)
     signed = [f"{1000 * x:+.1f}".replace("-", "−") for x in offsets]
     return (

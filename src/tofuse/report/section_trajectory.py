@@ -165,14 +165,13 @@ def uncertainty(s: Subject) -> Values:
     bounded = np.isfinite(C).all((1, 2))
     if bounded.sum() < 2:
         return {"uncertainty": []}
-    figures = []
-    for quantity, part, scale, unit, max_sigma in (
-        ("position", slice(0, 3), 1000.0, "mm", np.inf),
-        ("rotation", slice(3, 6), 180 / np.pi, "degrees", 180.0),
+    figures, largest = [], se3.largest_sigmas(C[bounded])
+    for k, quantity, scale, unit, max_sigma in (
+        (0, "position", 1000.0, "mm", np.inf),
+        (1, "rotation", 180 / np.pi, "degrees", 180.0),
     ):
-        variance = np.linalg.eigvalsh(C[bounded][:, part, part])[:, -1]
         sigma = np.full(len(C), np.nan)
-        sigma[bounded] = np.minimum(scale * np.sqrt(variance.clip(0)), max_sigma)
+        sigma[bounded] = np.minimum(scale * largest[:, k], max_sigma)
         svg = plots.lines(
             s.index,
             [(sigma, plots.AFTER, "-")],

@@ -33,6 +33,7 @@ from tofuse.results.folder import (
     is_result,
     lock_folder,
 )
+from tofuse.results.loading import read_mesh
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.run_json import read_run_json, rotation_up_world, run_json_checked
 from tofuse.results.tiles import is_tiles, write_tiles
@@ -70,25 +71,14 @@ class _Result:
     @cached_property
     def mesh(self) -> Mesh:
         path = self.folder / "mesh.ply"
-        if not path.is_file():
+        mesh = read_mesh(path)
+        if mesh is None:
             raise InputError(
                 "doesn't exist: clouds without a camera model have no surface",
                 where=path,
                 remedy="choose a format for clouds",
             )
-        ply = read_ply(path)
-        faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
-        normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
-        zeros = np.zeros(len(ply))
-        return Mesh(
-            ply.points.astype(np.float32),
-            faces,
-            normals,
-            ply.color,
-            ply.scalars.get("sigma", zeros).astype(np.float32),
-            ply.scalars.get("views", zeros).astype(np.int32),
-            np.zeros(3),
-        )
+        return mesh
 
     @cached_property
     def R_up_world(self) -> Float64:

@@ -95,7 +95,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         },
         run["seed"],
         run["threads"],
-        _mesh(folder / "mesh.ply"),
+        read_mesh(folder / "mesh.ply"),
         tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
         tuple(_session(each) for each in run.get("sessions", ())),
         tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
@@ -177,17 +177,21 @@ def _cloud(path: Path) -> Cloud:
     )
 
 
-def _mesh(path: Path) -> Mesh | None:
+def read_mesh(path: Path) -> Mesh | None:
+    """Read the surface of a result, None if it has none.
+
+    Columns that another program left out are 0.
+    """
     if not path.is_file():
         return None
     ply = read_ply(path)
-    normals, faces = ply.normals, ply.faces
+    normals, faces, zeros = ply.normals, ply.faces, np.zeros(len(ply))
     return Mesh(
         ply.points.astype(np.float32),
         np.zeros((0, 3), np.int32) if faces is None else faces,
         np.zeros((len(ply), 3), np.float32) if normals is None else normals,
         ply.color,
-        np.asarray(ply.scalars["sigma"], np.float32),
-        np.asarray(ply.scalars["views"], np.int32),
+        np.asarray(ply.scalars.get("sigma", zeros), np.float32),
+        np.asarray(ply.scalars.get("views", zeros), np.int32),
         np.zeros(3),
     )

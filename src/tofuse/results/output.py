@@ -88,16 +88,7 @@ def _write_model(
 ) -> tiles.TilingSummary | None:
     """Write clouds and surfaces; returns a summary of the tiles, or None without tiles."""
     cloud = result.cloud
-    write_ply(
-        folder / "cloud.ply",
-        GeometryRecord(
-            cloud.points,
-            normals=cloud.normals,
-            color=cloud.color,
-            scalars={"views": cloud.views}
-            | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
-        ),
-    )
+    write_ply(folder / "cloud.ply", cloud.local_record())
     tiling = None
     if result.mesh is not None:
         tiling = _write_mesh(result.mesh, result, folder, texture)
@@ -131,16 +122,7 @@ def _write_mesh(
     For a surface that is too large for one file, `mesh.glb` is a simplified overview, and the full
     detail is written as tiles.
     """
-    write_ply(
-        folder / "mesh.ply",
-        GeometryRecord(
-            mesh.vertices,
-            normals=mesh.normals,
-            color=mesh.color,
-            scalars={"views": mesh.views, "sigma": mesh.sigma},
-            faces=mesh.faces,
-        ),
-    )
+    write_ply(folder / "mesh.ply", mesh.local_record())
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
     tiling = None

@@ -196,11 +196,3 @@ def _from_moving(
     )
     unplaced = {names[k]: reason for k, reason in sorted(estimate.reasons.items())}
     return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", estimate.notes)
-
-
-def largest_sigmas(camera: RigCamera) -> tuple[float, float]:
-    """Return the largest standard deviations of a camera's position, m, and rotation, rad."""
-    C = camera.covariance
-    sigmas = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))
-    position, rotation = sigmas
-    return position, rotation

@@ -151,10 +151,7 @@ def _test_motion(
     A = se3.adjoint(se3.inverse(T))
     C = A @ C_before @ A.T + C_after
     chance = float(chi2.sf(xi @ np.linalg.pinv(C, hermitian=True) @ xi, 6))
-    position, rotation = (
-        float(np.sqrt(max(np.linalg.eigvalsh(C[part, part])[-1], 0)))
-        for part in (slice(3), slice(3, 6))
-    )
+    position, rotation = se3.largest_sigmas(C).tolist()
     return CameraMotion(camera.name, T, chance, chance < limit, chance, position, rotation)
 
 

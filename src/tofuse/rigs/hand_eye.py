@@ -18,10 +18,10 @@ from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.normal import MEDIAN_OF_NORMAL
+from tofuse.registration.projective import UNITS
 from tofuse.rigs.clocks import Lag, lag_between
 
-# Units of the unknowns: 1 cm, 1 degree, and 1 ms.
-_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+# Unit of the time offset, as `UNITS` of poses: 1 ms.
 _TIME_UNIT = 1e-3
 # Largest gap across which poses are interpolated, in intervals; minimum number of common poses.
 _MAX_GAP, _MIN_COMMON = 3.5, 12
@@ -163,7 +163,7 @@ def _initial_estimate(
     """Return X and Y by Tsai and Lenz, from relative motions over several spans."""
     _, T_a, T_b = _common(a, b, offset)
     if common_world:
-        return _median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
+        return median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
     motions_a, motions_b = [], []
     for span in _SPANS:
         step = max(1, round(span * len(T_a)))
@@ -181,10 +181,10 @@ def _initial_estimate(
     t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = R, t
-    return X, _median_pose(T_a @ X @ se3.inverse(T_b))
+    return X, median_pose(T_a @ X @ se3.inverse(T_b))
 
 
-def _median_pose(poses: Float64) -> Float64:
+def median_pose(poses: Float64) -> Float64:
     """Return the component-wise median of nearby poses (N, 4, 4), in their tangent space."""
     centre = poses[len(poses) // 2]
     for _ in range(10):
@@ -216,19 +216,19 @@ class _Fit:
             g = _weighted_product(J, w / sigma**2, e[..., None])[:, 0]
             H += np.diag(1e-9 * H.diagonal() + 1e-6)
             step = -np.linalg.solve(H, g)
-            X = se3.orthonormalise(X @ se3.exp(step[:6] * _UNITS))
+            X = se3.orthonormalise(X @ se3.exp(step[:6] * UNITS))
             if not self.common_world:
-                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * _UNITS))
+                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * UNITS))
             offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half_step, self.half_step))
             if np.abs(step).max() < _CONVERGENCE:
                 break
         J, e, times = self.linearised(X, Y, offset)
         sigma = _sigma(e)
         C = _covariance(J, e, times, sigma)
-        units = np.outer(_UNITS, _UNITS)
+        units = np.outer(UNITS, UNITS)
         return HandEye(
             X, C[:6, :6] * units, Y, offset, float(np.sqrt(C[-1, -1])) * _TIME_UNIT, len(e),
-            sigma * _UNITS,
+            sigma * UNITS,
         )  # fmt: skip
 
     def linearised(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
@@ -238,17 +238,17 @@ class _Fit:
         right = se3.jacobian_inverse(e)
         left = se3.jacobian_inverse(-e)
         by_x = -left
-        columns = [by_x * _UNITS]
+        columns = [by_x * UNITS]
         if not self.common_world:
-            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * _UNITS)
+            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * UNITS)
         # The velocity of b: a larger offset selects an earlier pose.
         T_after, valid_after = self.b.at(times - offset + self.half_step)
         T_before, valid_before = self.b.at(times - offset - self.half_step)
         velocity = se3.log(se3.inverse(T_before) @ T_after) / (2 * self.half_step)
         velocity = np.where((valid_after & valid_before)[:, None], velocity, 0.0)
         columns.append((-(right @ velocity[..., None])) * _TIME_UNIT)
-        J = np.concatenate(columns, axis=2) / _UNITS[:, None]
-        return np.asarray(J, np.float64), np.asarray(e / _UNITS, np.float64), times
+        J = np.concatenate(columns, axis=2) / UNITS[:, None]
+        return np.asarray(J, np.float64), np.asarray(e / UNITS, np.float64), times
 
 
 def _sigma(e: Float64) -> Float64:

@@ -10,7 +10,7 @@ motion are the same for neighbouring points, in all views of a place.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,8 +21,8 @@ from tofuse.kernels import rig_residuals as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
-from tofuse.posegraph.pose_priors import UNITS
 from tofuse.posegraph.view_store import SampledView
+from tofuse.registration.projective import UNITS
 from tofuse.rigs.joint_covariance import by_region, correlated, inverse_slope
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
@@ -156,6 +156,13 @@ def disagreements_of(
         if a != b:
             T = se3.inverse(poses[i]) @ poses[j]
             distances.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
+    return _medians(distances)
+
+
+def _medians(
+    distances: Mapping[tuple[int, int], Sequence[Float64]],
+) -> dict[tuple[int, int], tuple[float, int]]:
+    """Return the median and the number of the distances of each pair, in order of the pairs."""
     by_pair = {ends: np.concatenate(parts) for ends, parts in sorted(distances.items())}
     return {ends: (float(np.median(d)), len(d)) for ends, d in by_pair.items() if len(d)}
 
@@ -443,5 +450,4 @@ class _System:
         for (i, j), row in zip(self.pairs, rows, strict=True):
             a, b = sorted((self.views[i].camera, self.views[j].camera))
             distances.setdefault((a, b), []).append(np.abs(row[:, kernels.RESIDUAL]))
-        by_pair = {ends: np.concatenate(parts) for ends, parts in sorted(distances.items())}
-        return {ends: (float(np.median(d)), len(d)) for ends, d in by_pair.items() if len(d)}
+        return _medians(distances)

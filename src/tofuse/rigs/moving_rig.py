@@ -22,6 +22,7 @@ from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.refinement import propagate_poses
 from tofuse.posegraph.split_half import refined_by_halves
 from tofuse.posegraph.view_store import SampledView
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
@@ -163,10 +164,7 @@ def _initial_offset(
 
 def _too_uncertain(fit: HandEye, depth: float) -> str:
     """Return why a pose is too uncertain; empty if it is not."""
-    position, rotation = (
-        float(np.sqrt(max(np.linalg.eigvalsh(fit.covariance[part, part])[-1], 0)))
-        for part in (slice(3), slice(3, 6))
-    )
+    position, rotation = se3.largest_sigmas(fit.covariance).tolist()
     if position <= _MAX_SIGMA_FRACTION * depth and rotation <= _MAX_SIGMA_RAD:
         return ""
     return (
@@ -212,7 +210,7 @@ class _JointViews:
         camera_views = {}
         for k, track in world.items():
             rows, sampled = [], []
-            for p in np.unique(np.linspace(0, len(track.times) - 1, _VIEWS).round().astype(int)):
+            for p in evenly_spaced(np.arange(len(track.times)), _VIEWS):
                 row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
                 frame = cameras[k].image(row)
                 if frame is not None:

@@ -22,6 +22,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
 from tofuse.posegraph.view_store import SampledView
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.pose_probability import ACCEPTED, Evidence
@@ -345,7 +346,4 @@ class _Placer:
 
 def _evenly(items: Sequence[V], count: int) -> list[V]:
     """Return at most `count` of the items, evenly spaced."""
-    if len(items) <= count:
-        return list(items)
-    at = np.linspace(0, len(items) - 1, count).round().astype(int)
-    return [items[k] for k in at]
+    return [items[k] for k in evenly_spaced(np.arange(len(items)), count)]

@@ -27,7 +27,7 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import RigCamera
 from tofuse.recordings.rig_source import RigSource
 from tofuse.results.types import Reconstruction
-from tofuse.rigs.hand_eye import Track
+from tofuse.rigs.hand_eye import Track, median_pose
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
@@ -209,7 +209,7 @@ def _mean_trajectory(rig_estimates: Sequence[_RigEstimate]) -> Float64:
     for other in rig_estimates[1:]:
         common = np.isfinite(first.poses[:, 0, 0]) & np.isfinite(other.poses[:, 0, 0])
         if common.any():
-            T = _median_pose(first.poses[common] @ se3.inverse(other.poses[common]))
+            T = median_pose(first.poses[common] @ se3.inverse(other.poses[common]))
             stacked.append(_RigEstimate(T @ other.poses, other.information))
     mean = _weighted_means(stacked)
     rows = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
@@ -292,14 +292,6 @@ def _image(recording: Recording, k: int) -> RangeFrame | None:
     except UnreadableFrameError:
         return None
     return frame if isinstance(frame, RangeFrame) and len(frame) else None
-
-
-def _median_pose(poses: Float64) -> Float64:
-    """Return the component-wise median of nearby poses, in their tangent space."""
-    centre = poses[len(poses) // 2]
-    for _ in range(10):
-        centre = centre @ se3.exp(np.median(se3.log(se3.inverse(centre) @ poses), axis=0))
-    return np.asarray(se3.orthonormalise(centre), np.float64)
 
 
 def _weighted_means(rig_estimates: Sequence[_RigEstimate]) -> Float64:

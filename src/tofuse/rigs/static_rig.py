@@ -21,6 +21,7 @@ from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.background import BackgroundSurface, background_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.recordings.still import average_of, change_between
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.rigs.clocks import lag_between
@@ -174,13 +175,7 @@ def _refined_offsets(
     """
     corrected = offsets.copy()
     instants = _common_times(cameras, offsets)
-    instants = instants[
-        np.unique(
-            np.linspace(0, len(instants) - 1, min(len(instants), _COMPARED_INSTANTS))
-            .round()
-            .astype(int)
-        )
-    ]
+    instants = evenly_spaced(instants, _COMPARED_INSTANTS)
     views_of = {
         0: [_sampled(v) for v in _views_at(cameras[order[0]], corrected[order[0]], instants)]
     }
@@ -325,10 +320,7 @@ def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
     common = times[(times >= begin - margin) & (times <= end + margin)]
     if not len(common):
         common = times[:1]
-    rows = np.unique(
-        np.linspace(0, len(common) - 1, min(len(common), _MAX_INSTANTS)).round().astype(int)
-    )
-    return np.asarray(common[rows], np.float64)
+    return evenly_spaced(common, _MAX_INSTANTS)
 
 
 def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:

@@ -60,7 +60,7 @@ class ReflectorMap:
         if self._T is not None:
             motion = se3.inverse(self._T) @ T_world_camera
             min_distance = _DISTANCE * float(np.median(surfaces.range_m[illuminated]))
-            if se3.angle(motion) < _ANGLE and np.linalg.norm(motion[:3, 3]) < min_distance:
+            if se3.is_within(motion, min_distance, _ANGLE):
                 return
         selected = np.zeros_like(illuminated)
         selected[::2, ::2] = (illuminated & static)[::2, ::2]

@@ -13,17 +13,13 @@ from tofuse.arrays import Float64, Int64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.lab.methods.keypoints import Channel, Detector, Keypoints, keypoints
+from tofuse.lab.methods.sample_consensus import SampleOptions, registration_of
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.consensus import Pairs, consensus
 from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.sample_consensus import (
-    ConsensusOptions,
-    Pairs,
-    consensus,
-    registration_of,
-)
 from tofuse.registration.surface_options import SurfaceOptions
 
 
@@ -66,7 +62,7 @@ class Features(Bounded, Registrar):
     mutual: bool = True
     blur_px: Annotated[float, Bounds(0.001, 100)] = 0.7
     verify: bool = True
-    consensus: ConsensusOptions = ConsensusOptions()  # noqa: RUF009 - immutable
+    consensus: SampleOptions = SampleOptions()  # noqa: RUF009 - immutable
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def register(
@@ -82,7 +78,7 @@ class Features(Bounded, Registrar):
         """
         (a, s), (b, t) = self._found(source), self._found(target)
         pairs = self.pairs(a, b)
-        found = consensus(pairs, self.consensus, rng)
+        found = consensus(pairs, self.consensus, self.consensus.motions(rng))
         scores = [c.score / len(pairs) for c in found]
         if self.verify:
             agreed = [agreement(s, t, c.T_target_source).score for c in found]

@@ -20,6 +20,7 @@ from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.recording import evenly_spaced
 from tofuse.recordings.sources import FileSource
 
 HEADER_BYTES = 128
@@ -207,7 +208,7 @@ class AdiTofSource(FileSource):
     def _camera_of_points(self, path: Path) -> RayTable:
         """The camera of the points in evenly spaced frames."""
         samples = []
-        for k in np.unique(np.linspace(0, len(self.locations) - 1, _SAMPLES).round()).astype(int):
+        for k in evenly_spaced(np.arange(len(self.locations)), _SAMPLES):
             try:
                 images = self._images(int(k))
             except InputError:
