@@ -21,7 +21,7 @@ from tofuse.files.ply import read_ply
 from tofuse.files.stamps import stamp
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion import exchange
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, mesh_of
 from tofuse.fusion.texture import baked
 from tofuse.results.colmap import write_colmap
 from tofuse.results.folder import (
@@ -76,19 +76,7 @@ class _Result:
                 where=path,
                 remedy="choose a format for clouds",
             )
-        ply = read_ply(path)
-        faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
-        normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
-        zeros = np.zeros(len(ply))
-        return Mesh(
-            ply.points.astype(np.float32),
-            faces,
-            normals,
-            ply.color,
-            ply.scalars.get("sigma", zeros).astype(np.float32),
-            ply.scalars.get("views", zeros).astype(np.int32),
-            np.zeros(3),
-        )
+        return mesh_of(read_ply(path))
 
     @cached_property
     def R_up_world(self) -> Float64:

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.errors import InputError
 from tofuse.files.ply import read_ply
 from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, mesh_of
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
@@ -181,13 +181,6 @@ def _mesh(path: Path) -> Mesh | None:
     if not path.is_file():
         return None
     ply = read_ply(path)
-    normals, faces = ply.normals, ply.faces
-    return Mesh(
-        ply.points.astype(np.float32),
-        np.zeros((0, 3), np.int32) if faces is None else faces,
-        np.zeros((len(ply), 3), np.float32) if normals is None else normals,
-        ply.color,
-        np.asarray(ply.scalars["sigma"], np.float32),
-        np.asarray(ply.scalars["views"], np.int32),
-        np.zeros(3),
-    )
+    if not {"sigma", "views"} <= set(ply.scalars):
+        raise InputError("has no columns `sigma` and `views`", where=path, remedy="run again")
+    return mesh_of(ply)

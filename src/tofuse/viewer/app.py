@@ -11,6 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
@@ -22,7 +23,6 @@ from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
 from tofuse.viewer.content import (
     ColorBar,
-    Layer,
     ViewContent,
     colorings,
     layer_colors,
@@ -126,7 +126,7 @@ class ResultView:
         self._lines = {}
         for name, poses, color in (
             ("after", result.after, AFTER),
-            ("before", result.before, BEFORE),
+            ("before", result.view.before, BEFORE),
         ):
             if not poses:
                 continue
@@ -157,7 +157,7 @@ class ResultView:
             if has_surface:
                 self._layer_toggles["surface"] = gui.add_checkbox("Surface", True)
             self._layer_toggles["points"] = gui.add_checkbox("Points", not has_surface)
-            if result.model_before is not None:
+            if result.view.model_before is not None:
                 self._layer_toggles["model before"] = gui.add_checkbox(
                     "Points before optimisation", False
                 )
@@ -198,12 +198,12 @@ class ResultView:
             self._model.clear()
             self._paint()
 
-    def _visible_layers(self) -> dict[str, Layer]:
+    def _visible_layers(self) -> dict[str, GeometryRecord]:
         """The visible layers of the model, by name."""
         layers = {
             "surface": self._result.mesh,
             "points": self._result.cloud,
-            "model before": self._result.model_before,
+            "model before": self._result.view.model_before,
         }
         return {
             name: layer
@@ -225,7 +225,7 @@ class ResultView:
                 self._model[name] = self._add_layer(name, layer, colors)
         self._legend.content = "" if scale is None else color_bar(scale)
 
-    def _add_layer(self, name: str, layer: Layer, colors: UInt8) -> Any:
+    def _add_layer(self, name: str, layer: GeometryRecord, colors: UInt8) -> Any:
         scene = self._server.scene
         if name == "surface" and self._result.tiles is not None:
             coloring, up = self._coloring, self._result.up
@@ -273,7 +273,7 @@ class ResultView:
         words = f"Frame {index}: **{frame['status']}**"
         if frame["reason"]:
             words += f" – {_escape_markdown(frame['reason'])}"
-        picture = _nearest(result.pictures, index)
+        picture = _nearest(result.view.pictures, index)
         if picture is not None:
             self._images.content = _images_html(picture)
             if picture.index != index:
