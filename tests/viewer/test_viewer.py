@@ -180,7 +180,7 @@ def test_colours_follow_values(folder):
     colors, bar = layer_colors(found.mesh, "accuracy", found.up)
     assert np.corrcoef(colors.astype(int).sum(1), found.mesh.scalars["sigma"])[0, 1] > 0.9
     assert bar.label == "Accuracy (95 %)"
-    assert bar.ticks[0].startswith("±")
+    assert bar.labels[0].startswith("±")
     shaded = layer_colors(found.mesh, "colour", found.up)[0].astype(float)
     assert np.all(shaded >= 0.6 * found.mesh.color - 1)
     assert np.all(shaded <= found.mesh.color)

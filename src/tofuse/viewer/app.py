@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import threading
+from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
+from tofuse.report.fields import Field
 from tofuse.report.pictures import FATES, Pictures
 from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
 from tofuse.report.thumbnails import viridis
@@ -22,7 +24,6 @@ from tofuse.report.words import frame_range
 from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
 from tofuse.viewer.content import (
-    ColorBar,
     ViewContent,
     colorings,
     layer_colors,
@@ -216,14 +217,14 @@ class ResultView:
         visible = self._visible_layers()
         for name, handle in self._model.items():
             handle.visible = name in visible
-        scale: ColorBar | None = None
+        scale: Field | None = None
         for name, layer in visible.items():
             coloring = "colour" if name == "model before" else self._coloring
-            colors, bar = layer_colors(layer, coloring, self._result.up)
-            scale = bar or scale
+            colors, field = layer_colors(layer, coloring, self._result.up)
+            scale = field or scale
             if name not in self._model and len(layer.points):
                 self._model[name] = self._add_layer(name, layer, colors)
-        self._legend.content = "" if scale is None else color_bar(scale)
+        self._legend.content = "" if scale is None else color_bar(scale.label, scale.labels)
 
     def _add_layer(self, name: str, layer: GeometryRecord, colors: UInt8) -> Any:
         scene = self._server.scene
@@ -478,12 +479,12 @@ def _length(metres: float) -> str:
     return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
 
 
-def color_bar(bar: ColorBar) -> str:
-    """Return a colour bar with its ticks as HTML."""
+def color_bar(label: str, labels: Sequence[str]) -> str:
+    """Return a colour bar with a title, and labels at its ends and in its middle, as HTML."""
     stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
-    ticks = "".join(f"<span>{tick}</span>" for tick in bar.ticks)
+    ticks = "".join(f"<span>{text}</span>" for text in labels)
     return (
-        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{bar.label}'
+        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{label}'
         f'<div style="height:12px;border-radius:3px;background:linear-gradient(90deg,{stops})">'
         f'</div><div style="display:flex;justify-content:space-between">{ticks}</div></div>'
     )

@@ -19,9 +19,10 @@ from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import display_colors
 from tofuse.fusion.mesh import mesh_of
 from tofuse.normal import OF_95_PERCENT
+from tofuse.report import fields
+from tofuse.report.fields import Field
 from tofuse.report.scene import RigCameras
 from tofuse.report.thumbnails import viridis
-from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.run_json import (
     main_poses,
@@ -228,18 +229,10 @@ def colorings(layers: Sequence[GeometryRecord]) -> list[str]:
     return [name for name in COLORINGS if any(value is not None for value in values[name])]
 
 
-@dataclass(frozen=True)
-class ColorBar:
-    """A colour bar: its label, and the ticks at its ends and in its middle."""
-
-    label: str
-    ticks: tuple[str, str, str]
-
-
 def layer_colors(
     layer: GeometryRecord, coloring: str, up: Float64, scale_of: GeometryRecord | None = None
-) -> tuple[UInt8, ColorBar | None]:
-    """Return colours (N, 3) of a layer, and their colour bar; grey if it has no such values.
+) -> tuple[UInt8, Field | None]:
+    """Return colours (N, 3) of a layer, and the field of the bar; grey if it has no such values.
 
     Colours of values are exactly those of the bar. The layer's original colours are shaded by a
     fixed light from above and from one side, since the page is unlit.
@@ -258,10 +251,11 @@ def layer_colors(
     if coloring == "colour" and layer.color is not None:
         return _shaded(display_colors(layer.color), layer, up), None
     values = _values(layer, coloring, up)
-    if values is not None:
-        scale_values = None if scale_of is None else _values(scale_of, coloring, up)
-        return _map_colors(values, values if scale_values is None else scale_values, coloring)
-    return np.full((len(layer.points), 3), 170, np.uint8), None
+    if values is None:
+        return np.full((len(layer.points), 3), 170, np.uint8), None
+    scale_values = None if scale_of is None else _values(scale_of, coloring, up)
+    field = _FIELDS[coloring](values if scale_values is None else scale_values)
+    return viridis(field.on_bar(values)), field
 
 
 def _values(layer: GeometryRecord, coloring: str, up: Float64) -> Float64 | None:
@@ -274,27 +268,11 @@ def _values(layer: GeometryRecord, coloring: str, up: Float64) -> Float64 | None
     return (OF_95_PERCENT if coloring == "accuracy" else 1.0) * column.astype(float)
 
 
-_LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "height": ("Height", length),
-    "accuracy": ("Accuracy (95 %)", lambda m: f"±{length(m)}"),
-    "view count": ("Number of views", lambda n: f"{n:.0f}"),
+_FIELDS: dict[str, Callable[[Float64], Field]] = {
+    "height": fields.height,
+    "accuracy": fields.accuracy,
+    "view count": fields.view_count,
 }
-
-
-def _map_colors(values: Float64, scale: Float64, coloring: str) -> tuple[UInt8, ColorBar]:
-    """Colours of values on the scale of others, and the bar; accuracies on a logarithmic scale."""
-    label, text = _LABELS[coloring]
-    logarithmic = coloring == "accuracy"
-    mapped, mapped_scale = (
-        np.log(np.maximum(v, 1e-6)) if logarithmic else v for v in (values, scale)
-    )
-    finite = mapped_scale[np.isfinite(mapped_scale)]
-    low, high = np.percentile(finite, [2, 98]).tolist() if len(finite) else (0.0, 1.0)
-    inverse: Callable[[float], float] = (lambda v: float(np.exp(v))) if logarithmic else float
-    origin = low if coloring == "height" else 0.0
-    ticks = tuple(text(inverse(v) - origin) for v in (low, (low + high) / 2, high))
-    colors = viridis((np.nan_to_num(mapped, nan=high) - low) / max(high - low, 1e-9))
-    return colors, ColorBar(label, (ticks[0], ticks[1], ticks[2]))
 
 
 def _shaded(color: UInt8, layer: GeometryRecord, up: Float64) -> UInt8:
