@@ -13,6 +13,7 @@ from tofuse.normal import OF_95_PERCENT
 from tofuse.report import words
 from tofuse.report.packing import pack
 from tofuse.report.scene import Scene
+from tofuse.report.thumbnails import percentile_range
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _MIN_ACCURACY_M = 1e-4
@@ -100,14 +101,14 @@ def normalized_accuracy(metres: Float64) -> Float64:
 
 def view_count(counts: Float64) -> Field:
     """Return the field of numbers of views (K,)."""
-    low, high = _percentile_range(counts)
+    low, high = percentile_range(counts)
     labels = (f"{low:.0f}", "", f"{high:.0f}")
     return Field("views", "Number of views", counts, low, high, labels, (low, high))
 
 
 def height(heights: Float64) -> Field:
     """Return the field of heights (K,) in m."""
-    low, high = _percentile_range(heights)
+    low, high = percentile_range(heights)
     labels = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
     return Field("height", "Height", heights, low, high, labels, (low, high))
 
@@ -123,9 +124,9 @@ def accuracy(values: Float64, errors: Float64 | None = None) -> Field:
         (N,) 95 % bounds of camera centres, m, which have the same colour scale.
     """
     max_bound = OF_95_PERCENT * UNKNOWN_M
-    low, high = _percentile_range(values[values < UNKNOWN_M])  # so that these can be distinguished
+    low, high = percentile_range(values[values < UNKNOWN_M])  # so that these can be distinguished
     if errors is not None and (errors < UNKNOWN_M).any():
-        error_range = _percentile_range(errors[errors < UNKNOWN_M])
+        error_range = percentile_range(errors[errors < UNKNOWN_M])
         low, high = min(low, error_range[0]), max(high, error_range[1])
     low = max(low, _MIN_ACCURACY_M)
     high = max(high, 1.01 * low)
@@ -136,12 +137,3 @@ def accuracy(values: Float64, errors: Float64 | None = None) -> Field:
     )  # fmt: skip
     span = (_MIN_ACCURACY_M, max_bound)
     return Field("accuracy", "Accuracy (95 %)", values, low, high, labels, span, logarithmic=True)
-
-
-def _percentile_range(values: Float64) -> tuple[float, float]:
-    """Values that bound the middle 96 %."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return 0.0, 1.0
-    low, high = np.percentile(values, [2, 98])
-    return float(low), float(high)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
@@ -17,8 +17,8 @@ from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
 from tofuse.report.fields import Field
-from tofuse.report.pictures import FATES, Pictures
-from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
+from tofuse.report.pictures import FATES, KINDS, Pictures
+from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines, spacing_of
 from tofuse.report.thumbnails import viridis
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
 FOV = 2 * float(np.arctan(0.5))  # of camera frusta as drawn
-_TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 _REASONS = 4
 _MAX_EXTENT_RATIO = 1.8  # cameras are not framed if that enlarges the model's box more
 
@@ -445,14 +444,8 @@ def _place_camera(server: ViserServer, result: ViewContent) -> float:
     return size
 
 
-def _point_size(points: Float32) -> float:
-    from scipy.spatial import cKDTree
-
-    if len(points) < 2:
-        return 0.01
-    sampled = points[:: max(1, len(points) // 2000)]
-    distances, _ = cKDTree(points).query(sampled, k=2)
-    return float(max(1.3 * np.median(distances[:, 1]), 1e-4))
+def _point_size(points: NDArray[np.floating]) -> float:
+    return max(1.3 * spacing_of(points.astype(float)), 1e-4)
 
 
 def _nearest(pictures: tuple[Pictures, ...], index: int) -> Pictures | None:
@@ -498,9 +491,8 @@ def _escape_markdown(text: str) -> str:
 def _images_html(picture: Pictures) -> str:
     """The images of a frame as HTML, embedded as data URIs."""
     cells = []
-    for kind, data in picture.images.items():
-        name, title = ("png" if kind == "fate" else "jpeg"), _TITLES[kind]
-        source = f"data:image/{name};base64,{base64.b64encode(data).decode()}"
+    for kind in picture.images:
+        title, source = KINDS[kind], picture.uri(kind)
         style = "width:100%;border-radius:4px;image-rendering:pixelated;display:block"
         cells.append(
             f'<figure style="margin:0"><img alt="{title}" src="{source}" style="{style}">'
