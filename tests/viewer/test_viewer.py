@@ -20,6 +20,7 @@ import pytest
 from browser import changed, chromium, watched
 from report_results import make_room
 from tofuse.cli import main
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
@@ -31,7 +32,7 @@ from tofuse.report.pictures import draw
 from tofuse.report.thumbnails import viridis
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
-from tofuse.viewer.content import Layer, colorings, layer_colors, read_content
+from tofuse.viewer.content import colorings, layer_colors, read_content
 from tofuse.viewer.coverage import Coverage
 from tofuse.viewer.picking import pick
 from tofuse.viewer.server import serve, stop
@@ -74,14 +75,14 @@ def test_content_matches_result(folder):
     made, _ = make_room()
     found = read_content(folder)
     posed = np.flatnonzero(made.has_pose)
-    assert sorted(found.after) == sorted(found.before) == posed.tolist()
+    assert sorted(found.after) == sorted(found.view.before) == posed.tolist()
     for k in posed:
         np.testing.assert_allclose(found.after[k], made.trajectory[k], atol=1e-12)
-        np.testing.assert_array_equal(found.before[k], made.diagnostics.sequential[k])
-    assert [p.index for p in found.pictures] == list(range(0, 15, 2))
-    assert set(found.pictures[0].images) == {"range", "amplitude", "fate"}
+        np.testing.assert_array_equal(found.view.before[k], made.diagnostics.sequential[k])
+    assert [p.index for p in found.view.pictures] == list(range(0, 15, 2))
+    assert set(found.view.pictures[0].images) == {"range", "amplitude", "fate"}
     np.testing.assert_allclose(found.loops, made.trajectory[[[0, 23]], :3, 3], atol=1e-12)
-    assert len(found.model_before.points) == len(made.cloud)
+    assert len(found.view.model_before.points) == len(made.cloud)
     np.testing.assert_allclose(np.linalg.norm(found.up), 1)
     assert found.up[1] < -0.9
 
@@ -91,9 +92,9 @@ def test_result_without_view_file_is_shown(folder, tmp_path):
     (out / NAME).unlink()
     found = read_content(out)
     assert len(found.after) == 21
-    assert found.before == {}
-    assert found.pictures == ()
-    assert found.model_before is None
+    assert found.view.before == {}
+    assert found.view.pictures == ()
+    assert found.view.model_before is None
 
 
 def damaged(out, how):
@@ -177,9 +178,9 @@ def test_colours_follow_values(folder):
     heights = found.mesh.points @ found.up
     assert np.corrcoef(bright["height"], heights)[0, 1] > 0.9
     colors, bar = layer_colors(found.mesh, "accuracy", found.up)
-    assert np.corrcoef(colors.astype(int).sum(1), found.mesh.sigma)[0, 1] > 0.9
+    assert np.corrcoef(colors.astype(int).sum(1), found.mesh.scalars["sigma"])[0, 1] > 0.9
     assert bar.label == "Accuracy (95 %)"
-    assert bar.ticks[0].startswith("±")
+    assert bar.labels[0].startswith("±")
     shaded = layer_colors(found.mesh, "colour", found.up)[0].astype(float)
     assert np.all(shaded >= 0.6 * found.mesh.color - 1)
     assert np.all(shaded <= found.mesh.color)
@@ -187,7 +188,7 @@ def test_colours_follow_values(folder):
 
 def test_nearest_point_on_ray_is_picked():
     points = np.array([[0, 0, 4], [0.001, 0, 2], [0, 0, -1], [0.5, 0, 2]], np.float32)
-    cloud = Layer(points, None, None, None, np.array([0.001, 0.002, 0.003, 0.004]), None)
+    cloud = GeometryRecord(points, scalars={"sigma": np.array([0.001, 0.002, 0.003, 0.004])})
     found = pick([cloud], [0, 0, 0], [0, 0, 2])
     np.testing.assert_array_equal(found.point, points[1])
     assert found.sigma == 0.002
@@ -195,7 +196,7 @@ def test_nearest_point_on_ray_is_picked():
     assert pick([cloud], [0, 0, 0], [1, 1, 0]) is None
     # Surfaces are invisible from behind, so they cannot be picked.
     faces, away = np.array([[0, 1, 3]], np.int32), np.tile(np.float32([0, 0, 1]), (4, 1))
-    assert pick([Layer(points, away, faces, None, None, None)], [0, 0, 0], [0, 0, 1]) is None
+    assert pick([GeometryRecord(points, faces, away)], [0, 0, 0], [0, 0, 1]) is None
 
 
 @pytest.fixture(scope="module")

@@ -152,12 +152,12 @@ def test_tiled_result_is_read_with_its_overview(folder, layer) -> None:
     assert result.up @ [0, -1, 0] > 0.9
     (tile,) = [t for t in layer.root.walk() if t.content == "0-0-0-0.glb"]
     part = layer.layer(tile)
-    assert part.sigma is not None
-    assert set(np.round(part.sigma, 7)) <= set(np.round(mesh.sigma.astype(float), 7))
+    sigma = part.scalars["sigma"].astype(float)
+    assert set(np.round(sigma, 7)) <= set(np.round(mesh.sigma.astype(float), 7))
     # One colour scale for all tiles.
     lone, _ = layer_colors(part, "accuracy", result.up)
-    scaled, words = layer_colors(part, "accuracy", result.up, result.mesh)
-    assert words == layer_colors(result.mesh, "accuracy", result.up)[1]
+    scaled, bar = layer_colors(part, "accuracy", result.up, result.mesh)
+    assert bar.labels == layer_colors(result.mesh, "accuracy", result.up)[1].labels
     assert (lone != scaled).any()
     same, _ = layer_colors(part, "accuracy", result.up, part)
     np.testing.assert_array_equal(same, lone)

@@ -8,7 +8,7 @@ import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -357,12 +357,8 @@ def load(folder: str | Path) -> Result:
     from tofuse.viewer.view_file import read_view_file
 
     reconstruction = load_result(folder)
-    view_file = read_view_file(Path(folder))
-    if view_file is not None:
-        sequential = reconstruction.diagnostics.sequential
-        for k, frame in enumerate(reconstruction.diagnostics.frames):
-            sequential[k] = view_file.before.get(frame.index, np.nan)
-        reconstruction = replace(
-            reconstruction, diagnostics=replace(reconstruction.diagnostics, sequential=sequential)
-        )
+    before = read_view_file(Path(folder)).before
+    sequential = reconstruction.diagnostics.sequential
+    for k, frame in enumerate(reconstruction.diagnostics.frames):
+        sequential[k] = before.get(frame.index, np.nan)
     return Result.of(reconstruction)

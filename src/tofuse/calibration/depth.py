@@ -21,7 +21,7 @@ from tofuse.arrays import Float64, Intp
 from tofuse.calibration.plane_views import PlaneView
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
-from tofuse.normal import MEDIAN_OF_NORMAL
+from tofuse.normal import robust_sigma
 from tofuse.sensor.depth_correction import DepthCorrection
 
 _KNOT_SPACING_M = 0.04
@@ -150,8 +150,8 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
         len({view.frame for view in views}),
         len(views),
         (low, high),
-        _robust_rms(np.concatenate(before)),
-        _robust_rms(np.concatenate(after)),
+        robust_sigma(np.concatenate(before)),
+        robust_sigma(np.concatenate(after)),
         _patch_rms(views, before, shape),
         _patch_rms(views, after, shape),
         constant,
@@ -233,7 +233,7 @@ def _solve(
         knot, fraction = _interval(_measured_of_true(true, knots, curve), knots)
         bias = curve[knot] * (1 - fraction) + curve[knot + 1] * fraction
         residual = measured - true - bias - offsets[pixel]
-        scale = max(_robust_rms(residual / sigma), 0.1)
+        scale = max(robust_sigma(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
         weight *= np.minimum(1, _HUBER * scale * sigma / np.maximum(np.abs(residual), 1e-12))
         # Columns: two knots, three parameters of the plane. d(true) = -true^2 ray . d(plane).
@@ -367,7 +367,7 @@ def _pixel_offsets(
     sums, weights = np.zeros(size), np.zeros(size)
     joined = np.concatenate(residuals)
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
-    scale = max(_robust_rms(joined / sigma), 0.1)
+    scale = max(robust_sigma(joined / sigma), 0.1)
     for view, residual in zip(views, residuals, strict=True):
         sigmas = np.hypot(view.sigma_m, _FLOOR_M) * scale
         # The residual contains the offset, so the outlier threshold is large.
@@ -380,7 +380,7 @@ def _pixel_offsets(
     smooth = _blur_and_fill(sums, weights, max(2.0, _BLUR_WIDTH * shape[1]))
     observed = weights > 0
     deviation = (mean - smooth)[observed]
-    limit = 3 * max(_robust_rms(deviation), 1e-6)
+    limit = 3 * max(robust_sigma(deviation), 1e-6)
     inliers = np.abs(deviation) < limit
     variance = float(np.mean(deviation[inliers] ** 2 - 1 / weights[observed][inliers]))
     pixel_weight = np.zeros(shape)
@@ -402,11 +402,6 @@ def _blur_and_fill(sums: Float64, weights: Float64, width: float) -> Float64:
         missing &= ~filled
         width *= 2
     return out
-
-
-def _robust_rms(values: Float64) -> float:
-    """Return the rms of the normal distribution with the same median absolute value."""
-    return float(np.median(np.abs(values))) / MEDIAN_OF_NORMAL
 
 
 def _patch_rms(

@@ -15,15 +15,7 @@ from tofuse.calibration.board import Board, board_image, find_corners
 from tofuse.calibration.board_pose import board_pose, pose_of
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.geometry.cameras import (
-    DISTORTION_ORDER,
-    MODELS,
-    BrownConrady,
-    Camera,
-    Fisheye,
-    Pinhole,
-    Rational,
-)
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
 from tofuse.recordings.recording import Recording, evenly_spaced
 
 MIN_VIEWS = 4
@@ -370,14 +362,9 @@ def _fit_opencv(
         flags=all_flags,
     )
     K, distortion, rvecs, tvecs, deviations = out[1], out[2].ravel(), out[3], out[4], out[5].ravel()
-    classes: dict[str, type[Pinhole]] = {
-        "pinhole": Pinhole,
-        "brown": BrownConrady,
-        "rational": Rational,
-    }
     order = DISTORTION_ORDER["rational"]
     values = {n: float(v) for n, v in zip(order, distortion, strict=False) if n in names}
-    camera = classes[model](
+    camera = MODELS[model](
         size[0], size[1], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), **values
     )
     deviation = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))

@@ -18,15 +18,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_bytes, read_text
-from tofuse.geometry.cameras import (
-    DISTORTION_ORDER,
-    BrownConrady,
-    Camera,
-    Fisheye,
-    Pinhole,
-    Rational,
-    RayTable,
-)
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
 from tofuse.recordings.camera_file import checked_lens
 
 _MAX_BYTES = 64 << 20
@@ -305,12 +297,7 @@ def _lens(
     values = dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True))
     order = DISTORTION_ORDER[model]
     values |= dict(zip(order, k, strict=False))
-    classes: dict[str, type[Pinhole]] = {
-        "brown": BrownConrady,
-        "rational": Rational,
-        "fisheye": Fisheye,
-    }
-    camera = checked_lens(classes[model], size, values, path)
+    camera = checked_lens(MODELS[model], size, values, path)
     extra = k[len(order) :]
     if not np.isfinite(extra).all() or len(k) > 14:
         raise InputError(

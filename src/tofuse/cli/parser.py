@@ -200,110 +200,106 @@ def _command(
     return parser
 
 
+# `p` is a parser or a group of its options.
+
+
+def _value(p: Any, usage: str, kind: Callable[[str], Any], text: str, **settings: Any) -> None:
+    """Add an option or argument with a value: its name, and the placeholder of the value."""
+    name, metavar = usage.split()
+    p.add_argument(name, type=kind, metavar=metavar, help=text, **settings)
+
+
+def _choice(p: Any, name: str, choices: Sequence[str], text: str, **settings: Any) -> None:
+    """Add an option or argument whose value is one of a few words."""
+    p.add_argument(name, choices=choices, help=text, **settings)
+
+
+def _flag(p: Any, name: str, text: str) -> None:
+    """Add an option without a value."""
+    p.add_argument(name, action="store_true", help=text)
+
+
 def _run(commands: Any) -> None:
     p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT, reconstructs=True)
     _inputs(p)
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
+    _value(p, "--out DIR", Path, "folder for the result", required=True)
     _overwrite(p)
     _json(p, "progress and result as JSON lines")
-    p.add_argument(
-        "--into",
-        type=Path,
-        metavar="RESULT",
-        help="merge the recording into the map of an existing result, if they overlap",
+    _value(
+        p,
+        "--into RESULT",
+        Path,
+        "merge the recording into the map of an existing result, if they overlap",
     )
-    p.add_argument(
-        "--texture", action="store_true", help="texture the surface, in mesh.glb and mesh.obj"
-    )
+    _flag(p, "--texture", "texture the surface, in mesh.glb and mesh.obj")
     _faces(p, "default: all")
     _voxel(p, "from the camera's resolution")
-    p.add_argument(
-        "--memory",
-        type=_bytes,
-        metavar="SIZE",
-        help="approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)",
+    _value(
+        p,
+        "--memory SIZE",
+        _bytes,
+        "approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)",
     )
-    p.add_argument(
-        "--rig",
-        type=Path,
-        metavar="FILE",
-        help="a rig.json or cameraconfig.json; each INPUT is one of its cameras, in the same order",
+    _value(
+        p,
+        "--rig FILE",
+        Path,
+        "a rig.json or cameraconfig.json; each INPUT is one of its cameras, in the same order",
     )
     _processing(p)
-    p.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="spread loop search and refinement of a long recording over the workers of a Dask "
+    _value(
+        p,
+        "--scheduler ADDRESS",
+        str,
+        "spread loop search and refinement of a long recording over the workers of a Dask "
         "scheduler: tcp://HOST:8786, or its scheduler file",
     )
     g = p.add_argument_group("live view in the browser")
-    g.add_argument(
-        "--view", action="store_true", help="show the reconstruction live, and then the result"
-    )
+    _flag(g, "--view", "show the reconstruction live, and then the result")
     _page(g)
     g = p.add_argument_group("input")
     _source(g)
     _selection(g)
-    g.add_argument(
-        "--average-still",
-        action="store_true",
-        help="average static segments into one frame each",
-    )
-    g.add_argument("--min-depth", type=_depth, metavar="M", help="discard points closer than this")
-    g.add_argument("--max-depth", type=_depth, metavar="M", help="discard points farther than this")
+    _flag(g, "--average-still", "average static segments into one frame each")
+    _value(g, "--min-depth M", _depth, "discard points closer than this")
+    _value(g, "--max-depth M", _depth, "discard points farther than this")
 
 
 def _source(p: Any) -> None:
-    p.add_argument("--format", metavar="F", help="input format, if not recognised")
-    p.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="use this camera.json instead of the recording's own",
-    )
-    p.add_argument("--topic", metavar="T", help="topic of a ROS bag, if the default is wrong")
+    _value(p, "--format F", str, "input format, if not recognised")
+    _value(p, "--camera FILE", Path, "use this camera.json instead of the recording's own")
+    _value(p, "--topic T", str, "topic of a ROS bag, if the default is wrong")
 
 
 def _selection(p: Any) -> None:
-    p.add_argument("--start", type=_integer, default=0, metavar="I", help="first frame (0)")
-    p.add_argument("--end", type=_integer, metavar="I", help="stop before this frame")
-    p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    _value(p, "--start I", _integer, "first frame (0)", default=0)
+    _value(p, "--end I", _integer, "stop before this frame")
+    _value(p, "--every N", _count, "use every N-th frame", default=1)
 
 
 def _processing(p: argparse.ArgumentParser) -> None:
     g = p.add_argument_group("reconstruction")
     _method(g)
-    g.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="options from a .toml file, or from the run.json of an earlier result",
+    _value(
+        g,
+        "--config FILE",
+        Path,
+        "options from a .toml file, or from the run.json of an earlier result",
     )
-    g.add_argument(
-        "--guess",
-        choices=("identity", "previous", "odometry"),
-        help="initial guess of each registration",
+    _choice(
+        g, "--guess", ("identity", "previous", "odometry"), "initial guess of each registration"
     )
-    g.add_argument(
+    _choice(
+        g,
         "--prior",
-        choices=("auto", "none", "device"),
-        default="auto",
-        help="priors in addition to the images, as far as they agree: gravity and a phone's own "
+        ("auto", "none", "device"),
+        "priors in addition to the images, as far as they agree: gravity and a phone's own "
         "poses (auto, the default), none, or odometry as well (device)",
+        default="auto",
     )
-    g.add_argument(
-        "--loops", type=Path, metavar="FILE", help="known loop closures, one `i j` per line"
-    )
-    g.add_argument(
-        "--object",
-        action="store_true",
-        help="turntable mode: an object turns in front of a static camera",
-    )
-    g.add_argument(
-        "--unwrap",
-        action="store_true",
-        help="unwrap phase beyond the camera's ambiguity range",
-    )
+    _value(g, "--loops FILE", Path, "known loop closures, one `i j` per line")
+    _flag(g, "--object", "turntable mode: an object turns in front of a static camera")
+    _flag(g, "--unwrap", "unwrap phase beyond the camera's ambiguity range")
     _tolerance(g, 'a "good" result')
     _seed(g)
     _threads(g)
@@ -313,97 +309,77 @@ def _processing(p: argparse.ArgumentParser) -> None:
 
 
 def _inputs(p: Any) -> None:
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    _value(p, "inputs INPUT", str, "recordings, joined in this order", nargs="+")
 
 
 def _json(p: Any, purpose: str = "print the result as JSON") -> None:
-    p.add_argument("--json", action="store_true", help=purpose)
+    _flag(p, "--json", purpose)
 
 
 def _overwrite(p: Any, purpose: str = "an existing result in --out") -> None:
-    p.add_argument("--overwrite", action="store_true", help=f"replace {purpose}")
+    _flag(p, "--overwrite", f"replace {purpose}")
 
 
 def _threads(p: Any) -> None:
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _value(p, "--threads N", _count, "threads (default: all cores)")
 
 
 def _seed(p: Any) -> None:
-    p.add_argument("--seed", type=_non_negative, metavar="N", help="random seed (0)")
+    _value(p, "--seed N", _non_negative, "random seed (0)")
 
 
 def _method(p: Any) -> None:
-    p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+    _value(p, "--method NAME", str, "default, thesis (default: default)")
 
 
 def _tolerance(p: Any, purpose: str, default: str = "0.5 %% of the model, at least 10mm") -> None:
     text = f"accuracy required of {purpose}, e.g. 30mm ({default})"
-    p.add_argument("--tolerance", type=_length, metavar="LENGTH", help=text)
+    _value(p, "--tolerance LENGTH", _length, text)
 
 
 def _faces(p: Any, default: str) -> None:
-    text = f"maximum number of triangles ({default})"
-    p.add_argument("--faces", type=_count, metavar="N", help=text)
+    _value(p, "--faces N", _count, f"maximum number of triangles ({default})")
 
 
 def _voxel(p: Any, default: str) -> None:
     text = f"resolution of the model, e.g. 5mm (default: {default})"
-    p.add_argument("--voxel", type=_length, metavar="LENGTH", help=text)
+    _value(p, "--voxel LENGTH", _length, text)
 
 
 def _batch(commands: Any) -> None:
     p = _command(
         commands, "batch", "reconstruct many recordings, each as a separate job", epilog=_BATCH
     )
-    p.add_argument(
-        "recordings",
-        nargs="+",
-        type=Path,
-        metavar="LIST",
-        help="a list of recordings, a recording, or a glob",
-    )
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the results")
+    _value(p, "recordings LIST", Path, "a list of recordings, a recording, or a glob", nargs="+")
+    _value(p, "--out DIR", Path, "folder for the results", required=True)
     _overwrite(p, "results made with other options; up-to-date results are kept")
     _json(p, "jobs and outcome as JSON lines")
-    p.add_argument(
-        "--only", action="append", metavar="NAME", help="run only this job; may be repeated"
-    )
-    p.add_argument("--print-jobs", action="store_true", help="only print one command per job")
+    _value(p, "--only NAME", str, "run only this job; may be repeated", action="append")
+    _flag(p, "--print-jobs", "only print one command per job")
     g = p.add_argument_group("workers")
     who = g.add_mutually_exclusive_group()
-    who.add_argument(
-        "--workers", type=_count, metavar="N", help="parallel jobs on this machine (1)"
+    _value(who, "--workers N", _count, "parallel jobs on this machine (1)")
+    _value(
+        who, "--scheduler ADDRESS", str, "Dask scheduler: tcp://HOST:8786, or its scheduler file"
     )
-    who.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Dask scheduler: tcp://HOST:8786, or its scheduler file",
+    _value(
+        g,
+        "--threads N",
+        _count,
+        "threads per job (default: all cores shared by the jobs; on Dask: 1)",
     )
-    g.add_argument(
-        "--threads",
-        type=_count,
-        metavar="N",
-        help="threads per job (default: all cores shared by the jobs; on Dask: 1)",
-    )
-    g.add_argument(
-        "--memory", type=_bytes, metavar="SIZE", help="memory per job, e.g. 4GB (not limited)"
-    )
-    g.add_argument(
-        "--retries",
-        type=_non_negative,
-        metavar="N",
-        help="how often a job whose process was killed is restarted (3)",
+    _value(g, "--memory SIZE", _bytes, "memory per job, e.g. 4GB (not limited)")
+    _value(
+        g, "--retries N", _non_negative, "how often a job whose process was killed is restarted (3)"
     )
 
 
 def _register(commands: Any) -> None:
     p = _command(commands, "register", "register two files or frames", epilog=_REGISTER)
-    p.add_argument("source", metavar="SOURCE", help="the view to be transformed")
-    p.add_argument("target", metavar="TARGET", help="the view that stays fixed")
-    p.add_argument(
-        "--guess", type=Path, metavar="FILE", help="initial guess of T_target_source (none)"
-    )
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the result (none)")
+    _value(p, "source SOURCE", str, "the view to be transformed")
+    _value(p, "target TARGET", str, "the view that stays fixed")
+    _value(p, "--guess FILE", Path, "initial guess of T_target_source (none)")
+    _value(p, "--out DIR", Path, "folder for the result (none)")
     _overwrite(p, "an existing one in --out")
     _json(p)
     _threads(p)
@@ -419,14 +395,14 @@ def _judge(commands: Any) -> None:
         epilog=_JUDGE,
         reconstructs=True,
     )
-    p.add_argument("recording", metavar="RECORDING", help="range images")
-    p.add_argument(
-        "trajectory",
-        type=Path,
-        metavar="TRAJECTORY",
-        help="a trajectory in any supported format, a result, or a recording with poses",
+    _value(p, "recording RECORDING", str, "range images")
+    _value(
+        p,
+        "trajectory TRAJECTORY",
+        Path,
+        "a trajectory in any supported format, a result, or a recording with poses",
     )
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
+    _value(p, "--out DIR", Path, "folder for the refined result (none)")
     _overwrite(p)
     _json(p)
     _tolerance(p, "good poses")
@@ -444,20 +420,18 @@ def _merge(commands: Any) -> None:
         epilog=_MERGE,
         reconstructs=True,
     )
-    p.add_argument(
-        "results",
+    _value(
+        p,
+        "results RESULT",
+        Path,
+        "two or more results; the first one defines the world frame",
         nargs="+",
-        type=Path,
-        metavar="RESULT",
-        help="two or more results; the first one defines the world frame",
     )
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the map")
+    _value(p, "--out DIR", Path, "folder for the map", required=True)
     _overwrite(p)
     _json(p, "progress and result as JSON lines")
     _tolerance(p, 'a "good" map', "default: as the first result")
-    p.add_argument(
-        "--texture", action="store_true", help="texture the surface (default: as the first result)"
-    )
+    _flag(p, "--texture", "texture the surface (default: as the first result)")
     _faces(p, "default: as the first result")
     _voxel(p, "as the first result")
     _seed(p)
@@ -480,8 +454,8 @@ def _rig(commands: Any) -> None:
         epilog=_CALIBRATE_RIG,
         function="rig_calibrate",
     )
-    p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one per camera")
-    p.add_argument("--out", required=True, type=Path, metavar="FILE", help="the rig.json to write")
+    _value(p, "inputs RECORDING", str, "one per camera", nargs="+")
+    _value(p, "--out FILE", Path, "the rig.json to write", required=True)
     _overwrite(p, "an existing FILE")
     _rig_options(p)
     p = _command(
@@ -491,26 +465,24 @@ def _rig(commands: Any) -> None:
         epilog=_CHECK_RIG,
         function="rig_check",
     )
-    p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")
-    p.add_argument(
-        "inputs",
-        nargs="+",
-        metavar="RECORDING",
-        help="new recordings of its cameras, in the same order",
+    _value(p, "rig RIG", Path, "a rig.json")
+    _value(
+        p, "inputs RECORDING", str, "new recordings of its cameras, in the same order", nargs="+"
     )
     _rig_options(p)
 
 
 def _rig_options(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
+    _choice(
+        p,
         "--motion",
-        choices=("auto", "still", "moving"),
+        ("auto", "still", "moving"),
+        "whether the cameras are static (default: detected from the images)",
         default="auto",
-        help="whether the cameras are static (default: detected from the images)",
     )
     _json(p)
     _threads(p)
-    p.add_argument("--format", metavar="F", help="input format, if not recognised")
+    _value(p, "--format F", str, "input format, if not recognised")
 
 
 def _demo(commands: Any) -> None:
@@ -522,22 +494,14 @@ def _demo(commands: Any) -> None:
         reconstructs=True,
     )
     what = p.add_mutually_exclusive_group()
-    what.add_argument(
-        "--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)"
-    )
-    what.add_argument(
+    _choice(what, "--scene", DEMO_SCENES, "what to simulate (room)", default="room")
+    _flag(
+        what,
         "--failure",
-        action="store_true",
-        help="simulate a recording that can't be reconstructed, 1.5 m along a bare corridor: "
+        "simulate a recording that can't be reconstructed, 1.5 m along a bare corridor: "
         "report.html shows how the failure is detected and explained",
     )
-    p.add_argument(
-        "--out",
-        type=Path,
-        default=Path("tofuse-demo"),
-        metavar="DIR",
-        help="output folder (tofuse-demo)",
-    )
+    _value(p, "--out DIR", Path, "output folder (tofuse-demo)", default=Path("tofuse-demo"))
     _overwrite(p, "an existing demo in DIR")
     _json(p, "progress and result as JSON lines")
     _method(p)
@@ -547,30 +511,31 @@ def _demo(commands: Any) -> None:
 
 def _simulate(commands: Any) -> None:
     p = _command(commands, "simulate", "simulate a recording")
-    p.add_argument("scene", metavar="SCENE", help=", ".join(DEMO_SCENES))
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="output folder")
-    p.add_argument("--camera", default="sr4000", metavar="NAME", help="camera model (sr4000)")
-    p.add_argument("--every", type=_count, metavar="N", help="stride (default: the thesis's)")
-    p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
-    p.add_argument("--first", type=_non_negative, metavar="K", help="first raw frame (0)")
-    p.add_argument("--uniform", action="store_true", help="uniform albedo, no texture")
+    _value(p, "scene SCENE", str, ", ".join(DEMO_SCENES))
+    _value(p, "--out DIR", Path, "output folder", required=True)
+    _value(p, "--camera NAME", str, "camera model (sr4000)", default="sr4000")
+    _value(p, "--every N", _count, "stride (default: the thesis's)")
+    _value(p, "--frames N", _count, "stop after this many frames")
+    _value(p, "--first K", _non_negative, "first raw frame (0)")
+    _flag(p, "--uniform", "uniform albedo, no texture")
     passing = p.add_mutually_exclusive_group()
     for kind, does in (("person", "walks"), ("box", "slides")):
-        passing.add_argument(
-            f"--with-{kind}",
-            type=_ratio,
-            metavar="RATIO",
-            help=f"a {kind} {does} through the view, covering this fraction of it, 0 to 1",
+        _value(
+            passing,
+            f"--with-{kind} RATIO",
+            _ratio,
+            f"a {kind} {does} through the view, covering this fraction of it, 0 to 1",
         )
-    p.add_argument(
-        "--without",
+    _value(
+        p,
+        "--without EFFECTS",
+        str,
+        "sensor errors to disable, separated by commas, or `all`",
         default="",
-        metavar="EFFECTS",
-        help="sensor errors to disable, separated by commas, or `all`",
     )
-    p.add_argument("--no-correction", action="store_true", help="omit the factory depth correction")
-    p.add_argument("--imu", action="store_true", help="simulate an accelerometer as well")
-    p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the `peaks` scene (0.05)")
+    _flag(p, "--no-correction", "omit the factory depth correction")
+    _flag(p, "--imu", "simulate an accelerometer as well")
+    _value(p, "--sigma M", _metres, "noise of the `peaks` scene (0.05)")
     _seed(p)
     _threads(p)
 
@@ -579,25 +544,22 @@ def _inspect(commands: Any) -> None:
     p = _command(commands, "inspect", "show a recording's properties and check it for faults")
     _inputs(p)
     _source(p)
-    p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
-    p.add_argument(
-        "--object", action="store_true", help="an object turns in front of a static camera"
-    )
-    p.add_argument(
-        "--quick", action="store_true", help="only the checks that `tofuse run` makes first"
-    )
+    _value(p, "--sheet PNG", Path, "write a contact sheet of the frames")
+    _flag(p, "--object", "an object turns in front of a static camera")
+    _flag(p, "--quick", "only the checks that `tofuse run` makes first")
     _json(p)
 
 
 def _convert(commands: Any) -> None:
     p = _command(commands, "convert", "write any recording as a native, TUM or Open3D folder")
     _inputs(p)
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder")
-    p.add_argument(
+    _value(p, "--out DIR", Path, "a new folder", required=True)
+    _choice(
+        p,
         "--to",
-        choices=("native", "tum", "open3d"),
+        ("native", "tum", "open3d"),
+        "layout of the folder (native; the others cannot store everything)",
         default="native",
-        help="layout of the folder (native; the others cannot store everything)",
     )
     _source(p)
     _selection(p)
@@ -605,18 +567,17 @@ def _convert(commands: Any) -> None:
 
 def _record(commands: Any) -> None:
     p = _command(commands, "record", "record from a connected camera")
-    p.add_argument(
-        "device", nargs="?", metavar="CAMERA", help="camera name; omit to list available cameras"
-    )
-    p.add_argument("--out", type=Path, metavar="DIR", help="a new folder for the recording")
-    p.add_argument("--seconds", type=_seconds, metavar="S", help="stop after this time")
-    p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
-    p.add_argument(
-        "--set",
+    _value(p, "device CAMERA", str, "camera name; omit to list available cameras", nargs="?")
+    _value(p, "--out DIR", Path, "a new folder for the recording")
+    _value(p, "--seconds S", _seconds, "stop after this time")
+    _value(p, "--frames N", _count, "stop after this many frames")
+    _value(
+        p,
+        "--set NAME=VALUE",
+        str,
+        "camera option, e.g. serial=1234; may be repeated",
         action="append",
         default=[],
-        metavar="NAME=VALUE",
-        help="camera option, e.g. serial=1234; may be repeated",
     )
 
 
@@ -629,137 +590,111 @@ def _calibrate(commands: Any) -> None:
         "depth: from views of planes, writes a correction.npz.\n"
         "import: from a file of Bouguet's toolbox, CalLab, OpenCV or ROS, writes a camera.json.\n",
     )
-    p.add_argument("subject", choices=("lens", "depth", "import"), help="what to calibrate")
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings; import: one file")
-    p.add_argument("--out", type=Path, metavar="FILE", help="write the result")
+    _choice(p, "subject", ("lens", "depth", "import"), "what to calibrate")
+    _value(p, "inputs INPUT", str, "recordings; import: one file", nargs="+")
+    _value(p, "--out FILE", Path, "write the result")
     _overwrite(p, "an existing FILE")
     _json(p)
     g = p.add_argument_group("lens and depth")
-    g.add_argument(
-        "--board", metavar="CxR:M", help="inner corners and square size in metres, e.g. 8x6:0.1"
-    )
-    g.add_argument(
+    _value(g, "--board CxR:M", str, "inner corners and square size in metres, e.g. 8x6:0.1")
+    _choice(
+        g,
         "--image",
-        choices=("amplitude", "color"),
+        ("amplitude", "color"),
+        "image in which to detect the board (amplitude)",
         default="amplitude",
-        help="image in which to detect the board (amplitude)",
     )
     _source(g)
     _selection(g)
     g = p.add_argument_group("depth")
-    g.add_argument(
-        "--wall", action="store_true", help="the board is flat on a wall; use the whole wall"
-    )
-    g.add_argument(
-        "--planes",
-        type=_count,
-        default=4,
-        metavar="N",
-        help="without --board: maximum planes per view (4)",
-    )
+    _flag(g, "--wall", "the board is flat on a wall; use the whole wall")
+    _value(g, "--planes N", _count, "without --board: maximum planes per view (4)", default=4)
     _seed(g)
     g = p.add_argument_group("lens")
-    g.add_argument(
+    _choice(
+        g,
         "--model",
-        choices=("pinhole", "brown", "rational", "fisheye"),
+        ("pinhole", "brown", "rational", "fisheye"),
+        "distortion model (brown)",
         default="brown",
-        help="distortion model (brown)",
     )
     g = p.add_argument_group("import")
-    g.add_argument(
-        "--recording", metavar="REC", help="take depth unit and kind from this recording"
-    )
-    g.add_argument("--index", type=_integer, metavar="N", help="camera index in a CalLab file")
+    _value(g, "--recording REC", str, "take depth unit and kind from this recording")
+    _value(g, "--index N", _integer, "camera index in a CalLab file")
 
 
 def _noise(commands: Any) -> None:
     p = _command(commands, "noise", "estimate a camera's noise from a static recording")
     _inputs(p)
-    p.add_argument(
-        "--out", type=Path, metavar="FILE", help="write the noise model, e.g. noise.json"
-    )
+    _value(p, "--out FILE", Path, "write the noise model, e.g. noise.json")
     _overwrite(p, "an existing FILE")
-    p.add_argument("--name", metavar="NAME", help="name of the camera")
+    _value(p, "--name NAME", str, "name of the camera")
     _source(p)
     _json(p)
 
 
 def _evaluate(commands: Any) -> None:
     p = _command(commands, "evaluate", "compare a trajectory with a reference")
-    p.add_argument("estimate", type=Path, metavar="ESTIMATE", help="a trajectory or a result")
-    p.add_argument(
-        "reference",
-        type=Path,
-        metavar="REFERENCE",
-        help="a trajectory, or a recording that comes with reference poses",
+    _value(p, "estimate ESTIMATE", Path, "a trajectory or a result")
+    _value(
+        p,
+        "reference REFERENCE",
+        Path,
+        "a trajectory, or a recording that comes with reference poses",
     )
-    p.add_argument(
-        "--recording",
-        type=Path,
-        metavar="REC",
-        help="also measure the map consistency of its images",
-    )
-    p.add_argument(
-        "--reference-error",
-        type=_length,
-        metavar="LENGTH",
-        help="rms error of the reference itself, e.g. 20mm; prints an interval for the ATE",
+    _value(p, "--recording REC", Path, "also measure the map consistency of its images")
+    _value(
+        p,
+        "--reference-error LENGTH",
+        _length,
+        "rms error of the reference itself, e.g. 20mm; prints an interval for the ATE",
     )
     _json(p)
 
 
 def _optimize(commands: Any) -> None:
     p = _command(commands, "optimize", "optimise a pose graph")
-    p.add_argument("input", type=Path, metavar="IN.g2o", help="the pose graph")
-    p.add_argument(
-        "--out", required=True, type=Path, metavar="OUT.g2o", help="the optimised pose graph"
-    )
-    p.add_argument(
-        "--optimiser",
-        metavar="NAME",
-        help="levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic",
+    _value(p, "input IN.g2o", Path, "the pose graph")
+    _value(p, "--out OUT.g2o", Path, "the optimised pose graph", required=True)
+    _value(
+        p,
+        "--optimiser NAME",
+        str,
+        "levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic",
     )
     _overwrite(p, "an existing OUT.g2o")
 
 
 def _export(commands: Any) -> None:
     p = _command(commands, "export", "write a result in other formats")
-    p.add_argument("result", type=Path, metavar="DIR", help="a result: the --out of `tofuse run`")
-    p.add_argument("formats", nargs="+", metavar="FORMAT", help=", ".join(EXPORTS))
-    p.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the files (default: that of the result)"
-    )
+    _value(p, "result DIR", Path, "a result: the --out of `tofuse run`")
+    _value(p, "formats FORMAT", str, ", ".join(EXPORTS), nargs="+")
+    _value(p, "--out DIR", Path, "folder for the files (default: that of the result)")
     _faces(p, "60000; STL: all")
-    p.add_argument(
-        "--every", type=_count, default=1, metavar="N", help="every N-th image (nerfstudio, colmap)"
-    )
-    p.add_argument(
-        "--pinhole", action="store_true", help="images without distortion (nerfstudio, colmap)"
-    )
+    _value(p, "--every N", _count, "every N-th image (nerfstudio, colmap)", default=1)
+    _flag(p, "--pinhole", "images without distortion (nerfstudio, colmap)")
     _overwrite(p, "existing files")
 
 
 def _experiments(commands: Any) -> None:
     p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis")
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the report")
+    _value(p, "--out DIR", Path, "folder for the report", required=True)
     _overwrite(p, "existing experiments in DIR")
-    p.add_argument(
-        "--cases", default="", metavar="NAMES", help="run only these, separated by commas"
-    )
-    p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
+    _value(p, "--cases NAMES", str, "run only these, separated by commas", default="")
+    _value(p, "--seeds N", _count, "noise seeds (20)", default=20)
     _seed(p)
     _threads(p)
 
 
 def _view(commands: Any) -> None:
     p = _command(commands, "view", "show a result in the browser")
-    p.add_argument("result", type=Path, metavar="DIR", help="a result: the --out of `tofuse run`")
+    _value(p, "result DIR", Path, "a result: the --out of `tofuse run`")
     _page(p)
 
 
 def _page(p: Any) -> None:
-    p.add_argument("--port", type=_port, metavar="N", help="port (8080, or the next free one)")
-    p.add_argument("--no-open", action="store_true", help="do not open the browser")
+    _value(p, "--port N", _port, "port (8080, or the next free one)")
+    _flag(p, "--no-open", "do not open the browser")
 
 
 def _bytes(text: str) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofuse.arrays import UInt8, UInt16
+from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.files.atomic import write_bytes, write_text
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.reading import damage_reported, read_bytes
@@ -183,17 +183,21 @@ def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     return accessor
 
 
-def _linear_of_srgb() -> UInt16:
-    """(256,) linear light of sRGB values (IEC 61966-2-1), 16 bits, ascending."""
+def linear_of_srgb() -> Float64:
+    """Return the linear light (256,), 0 to 1, of sRGB values 0 to 255 (IEC 61966-2-1)."""
     s = np.arange(256) / 255
-    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.round(65535 * light).astype("<u2")
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+
+
+def _rounded_linear() -> UInt16:
+    """(256,) `linear_of_srgb` as 16 bits, ascending."""
+    return np.round(65535 * linear_of_srgb()).astype("<u2")
 
 
 def linear(color: UInt8) -> UInt16:
     """Return linear light and opacity (N, 4), 16 bits, of (N, 3) sRGB colours."""
     out = np.full((*color.shape[:-1], 4), 65535, "<u2")
-    out[..., :3] = _linear_of_srgb()[color]
+    out[..., :3] = _rounded_linear()[color]
     return out
 
 
@@ -223,7 +227,7 @@ def read_glb(path: str | Path) -> GeometryRecord:
         normals, light = columns.get("NORMAL"), columns.get("COLOR_0")
         color = None
         if light is not None:
-            color = np.searchsorted(_linear_of_srgb(), light[:, :3]).clip(0, 255).astype(np.uint8)
+            color = np.searchsorted(_rounded_linear(), light[:, :3]).clip(0, 255).astype(np.uint8)
         return GeometryRecord(
             points,
             faces.astype(np.int32),

@@ -47,8 +47,17 @@ def input_error(error: OSError, path: str | Path) -> InputError:
     return InputError(problem, where=path, remedy=remedy)
 
 
-def required_package(name: str, extra: str, where: str | Path) -> Any:
-    """Import a package that only some files need, and that the named extra of tofuse installs.
+def required_package(name: str, extra: str | None, where: str | Path) -> Any:
+    """Import a package that only some functions need.
+
+    Parameters
+    ----------
+    name
+        The package.
+    extra
+        The extra of tofuse that installs it; None if there is none.
+    where
+        What needs it, for the error.
 
     Raises
     ------
@@ -58,9 +67,8 @@ def required_package(name: str, extra: str, where: str | Path) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InputError(
-            f"needs the package {name}", where=where, remedy=f"pip install 'tofuse[{extra}]'"
-        ) from error
+        remedy = f"pip install {name}" if extra is None else f"pip install 'tofuse[{extra}]'"
+        raise InputError(f"needs the package {name}", where=where, remedy=remedy) from error
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from tofuse.files.las import write_las, write_laz
 from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
+from tofuse.files.reading import required_package
 from tofuse.files.stl import write_stl
 from tofuse.files.usdz import write_usdz
 from tofuse.fusion.colors import display_colors
@@ -66,7 +66,7 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
 
 def to_trimesh(record: GeometryRecord) -> Any:
     """Return a `trimesh.Trimesh` or `trimesh.PointCloud`, in the frame of the record."""
-    trimesh = _library("trimesh")
+    trimesh = required_package("trimesh", None, "to_trimesh")
     if record.faces is None:
         return trimesh.PointCloud(record.points, colors=record.color)
     return trimesh.Trimesh(
@@ -80,7 +80,7 @@ def to_trimesh(record: GeometryRecord) -> Any:
 
 def to_open3d(record: GeometryRecord) -> Any:
     """Return an Open3D `TriangleMesh` or `PointCloud`, in the frame of the record."""
-    o3d = _library("open3d")
+    o3d = required_package("open3d", None, "to_open3d")
     vector = o3d.utility.Vector3dVector
     if record.faces is None:
         geometry = o3d.geometry.PointCloud(vector(record.points))
@@ -106,13 +106,6 @@ def _for_display(mesh: GeometryRecord, R: Float64) -> GeometryRecord:
         mesh.uv,
         mesh.texture,
     )
-
-
-def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError("is not installed", where=name, remedy=f"pip install {name}") from error
 
 
 def _ply(record: GeometryRecord, path: str | Path, _: Float64) -> None:

@@ -312,6 +312,21 @@ class Mesh:
         return centroids + step.clip(-0.5 * cell_m, 0.5 * cell_m)
 
 
+def mesh_of(record: GeometryRecord) -> Mesh:
+    """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
+    zeros = np.zeros(len(record))
+    faces, normals = record.faces, record.normals
+    return Mesh(
+        record.points.astype(np.float32),
+        np.zeros((0, 3), np.int32) if faces is None else faces,
+        np.zeros((len(record), 3), np.float32) if normals is None else normals,
+        record.color,
+        record.scalars.get("sigma", zeros).astype(np.float32),
+        record.scalars.get("views", zeros).astype(np.int32),
+        np.zeros(3),
+    )
+
+
 def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
     """Return the means (G, ...) of values (N, ...) of groups of sizes (G,)."""
     columns = values.reshape(len(values), -1).T

@@ -19,6 +19,7 @@ from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.refinement import Refinement
 from tofuse.registration.base import Registration
+from tofuse.results.card import length
 from tofuse.results.ranges import Range, in_words, is_single, runs, runs_of, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
@@ -435,12 +436,12 @@ def accuracy_reasons(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> 
     if unbounded:
         return
     if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
-        error, allowed = _length(a.position_m), _length(tolerance_m)
+        error, allowed = length(a.position_m), length(tolerance_m)
         if a.position_m <= tolerance_m:
             error, allowed = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
         text = f"Pose errors may reach {error} rms (95 % bound); the tolerance is {allowed}."
         if a.worst is not None:
-            text += f" Frame {a.worst.frame} is the least certain: {_length(a.worst.position_m)}."
+            text += f" Frame {a.worst.frame} is the least certain: {length(a.worst.position_m)}."
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
 
 
@@ -458,7 +459,7 @@ def _loop_drift(e: Evidence) -> Iterator[Reason]:
         se3.inverse(e.sequential[i]) @ e.sequential[j]
     )
     first, last = sorted((int(graph.ids[i]), int(graph.ids[j])))
-    drift = f"{_length(float(np.linalg.norm(gap[:3, 3])))}, {_angle(float(se3.angle(gap)))}"
+    drift = f"{length(float(np.linalg.norm(gap[:3, 3])))}, {_angle(float(se3.angle(gap)))}"
     text = (
         f"Odometry drift over loop {first}-{last} is {drift}, {np.sqrt(errors[worst] / 6):.1f} "
         "times what noise explains: the depth offset or the focal length of the camera may be "
@@ -476,8 +477,8 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
     (m, rad), (m_after, rad_after) = gap.before, gap.after
     correction = proposal(check.errors, check.best)
     text = (
-        f"Odometry drift over loop {gap.i}-{gap.j} is {_length(m)}, {_angle(rad)}. "
-        f"{correction[0].upper()}{correction[1:]} would reduce it to {_length(m_after)}, "
+        f"Odometry drift over loop {gap.i}-{gap.j} is {length(m)}, {_angle(rad)}. "
+        f"{correction[0].upper()}{correction[1:]} would reduce it to {length(m_after)}, "
         f"{_angle(rad_after)}: check the calibration."
     )
     yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
@@ -492,7 +493,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
             "assumes that the calibration is right. An error of 1% would move the poses by "
-            f"{_length(0.01 * check.motion['focal'][0])}."
+            f"{length(0.01 * check.motion['focal'][0])}."
         )
     elif check.unconfirmed:
         correction = proposal(check.unconfirmed, check.best)
@@ -536,7 +537,7 @@ def _gap(e: Evidence) -> Iterator[Reason]:
         closed > 1
     )
     text = (
-        f"Odometry drift over loop {first}-{last} was {_length(distance)}, {_angle(angle)} before "
+        f"Odometry drift over loop {first}-{last} was {length(distance)}, {_angle(angle)} before "
         f"it was closed.{count_note}"
     )
     yield Reason("loop_gap", ((first, last),), text)
@@ -599,10 +600,6 @@ def _poses_of(ranges: Sequence[Range]) -> str:
 
 def _percent(fraction: float) -> str:
     return f"{100 * fraction:.0f} %"
-
-
-def _length(metres: float) -> str:
-    return f"{metres * 1e3:.0f} mm" if metres < 1 else f"{metres:.2f} m"
 
 
 def _angle(rad: float) -> str:

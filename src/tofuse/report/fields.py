@@ -12,7 +12,8 @@ from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.normal import OF_95_PERCENT
 from tofuse.report import words
 from tofuse.report.packing import pack
-from tofuse.report.scene import Scene, height_range
+from tofuse.report.scene import Scene
+from tofuse.report.thumbnails import percentile_range
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _MIN_ACCURACY_M = 1e-4
@@ -59,7 +60,13 @@ class Field:
 
     def normalized(self, values: Float64) -> Float64:
         """Return values as fractions of the span, 0 to 1; 1 where unknown."""
-        low, high = self.span
+        return self._fraction(values, *self.span)
+
+    def on_bar(self, values: Float64) -> Float64:
+        """Return values as fractions of the colour bar, 0 to 1; 1 where unknown."""
+        return self._fraction(values, self.low, self.high)
+
+    def _fraction(self, values: Float64, low: float, high: float) -> Float64:
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
         fraction: Float64 = (values - low) / max(high - low, 1e-9)
@@ -80,32 +87,46 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     points = scene.points if mesh is None else mesh.vertices.astype(float)
     sigma = scene.sigma if mesh is None else mesh.sigma
     views = scene.views if mesh is None else mesh.views
-    available = [] if sigma is None else [_accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
-    available.append(_height(-points[:, 1], height_range(points)))
+    available = [] if sigma is None else [accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
+    available.append(height(-points[:, 1]))
     if views is not None:
-        low, high = _percentile_range(views.astype(float))
-        labels = (f"{low:.0f}", "", f"{high:.0f}")
-        values = views.astype(float)
-        available.append(Field("views", "Number of views", values, low, high, labels, (low, high)))
+        available.append(view_count(views.astype(float)))
     return available
 
 
 def normalized_accuracy(metres: Float64) -> Float64:
     """Return 95 % bounds in m as fractions of the span of a field of accuracies."""
-    return _accuracy(metres).normalized(metres)
+    return accuracy(metres).normalized(metres)
 
 
-def _height(heights: Float64, ends: tuple[float, float]) -> Field:
-    low, high = ends
+def view_count(counts: Float64) -> Field:
+    """Return the field of numbers of views (K,)."""
+    low, high = percentile_range(counts)
+    labels = (f"{low:.0f}", "", f"{high:.0f}")
+    return Field("views", "Number of views", counts, low, high, labels, (low, high))
+
+
+def height(heights: Float64) -> Field:
+    """Return the field of heights (K,) in m."""
+    low, high = percentile_range(heights)
     labels = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
-    return Field("height", "Height", heights, low, high, labels, ends)
+    return Field("height", "Height", heights, low, high, labels, (low, high))
 
 
-def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
+def accuracy(values: Float64, errors: Float64 | None = None) -> Field:
+    """Return the field of accuracies, on a logarithmic scale.
+
+    Parameters
+    ----------
+    values
+        (K,) 95 % bounds, m.
+    errors
+        (N,) 95 % bounds of camera centres, m, which have the same colour scale.
+    """
     max_bound = OF_95_PERCENT * UNKNOWN_M
-    low, high = _percentile_range(values[values < UNKNOWN_M])  # so that these can be distinguished
+    low, high = percentile_range(values[values < UNKNOWN_M])  # so that these can be distinguished
     if errors is not None and (errors < UNKNOWN_M).any():
-        error_range = _percentile_range(errors[errors < UNKNOWN_M])
+        error_range = percentile_range(errors[errors < UNKNOWN_M])
         low, high = min(low, error_range[0]), max(high, error_range[1])
     low = max(low, _MIN_ACCURACY_M)
     high = max(high, 1.01 * low)
@@ -116,12 +137,3 @@ def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
     )  # fmt: skip
     span = (_MIN_ACCURACY_M, max_bound)
     return Field("accuracy", "Accuracy (95 %)", values, low, high, labels, span, logarithmic=True)
-
-
-def _percentile_range(values: Float64) -> tuple[float, float]:
-    """Values that bound the middle 96 %."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return 0.0, 1.0
-    low, high = np.percentile(values, [2, 98])
-    return float(low), float(high)

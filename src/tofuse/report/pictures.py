@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,12 +10,19 @@ from functools import partial
 import numpy as np
 
 from tofuse.kernels.threads import run_all
-from tofuse.report.thumbnails import NO_MEASUREMENT, REMOVED, encode, grey, viridis
+from tofuse.report.thumbnails import (
+    NO_MEASUREMENT,
+    REMOVED,
+    encode,
+    grey,
+    percentile_range,
+    viridis,
+)
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
 
-# Kinds of images, in the order in which they are shown.
-KINDS = ("color", "range", "amplitude", "fate")
+# Kinds of images, in the order in which they are shown, and their titles.
+KINDS = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 
 # Colour and label of each use of a pixel.
 FATES = {
@@ -32,6 +40,11 @@ class Pictures:
     index: int
     images: dict[str, bytes]
 
+    def uri(self, kind: str) -> str:
+        """Return an image as a data URI, which is empty if there is none of this kind."""
+        data, name = self.images.get(kind), "png" if kind == "fate" else "jpeg"
+        return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"
+
 
 def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
     """Return the depths in m at the ends of the colour map, the same for all frames."""
@@ -39,10 +52,7 @@ def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
     values = (
         np.concatenate([d[d > 0] for d in subsampled]) if subsampled else np.zeros(0, np.float16)
     )
-    if len(values) == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(values.astype(float), [2, 98])
-    return float(low), float(max(high, low + 1e-3))
+    return percentile_range(values, min_width=1e-3)
 
 
 def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:

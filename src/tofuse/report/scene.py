@@ -443,16 +443,8 @@ def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
 
 def height_colors(points: Float64) -> UInt8:
     """Return colours (N, 3) of points by height, which is -y."""
-    low, high = height_range(points)
+    low, high = thumbnails.percentile_range(-points[:, 1])
     return thumbnails.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
-
-
-def height_range(points: Float64) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the heights (-y) of points, m."""
-    if len(points) == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(-points[:, 1], [2, 98])
-    return float(low), float(high)
 
 
 def spacing_of(points: Float64) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import thumbnails, words
 from tofuse.report.pictures import FATES, KINDS, depth_range
@@ -86,14 +84,6 @@ def clouds(s: Subject) -> Values:
     return {"clouds": samples, "clouds_note": note}
 
 
-_TITLES = {
-    "color": "Colour",
-    "range": "Range",
-    "amplitude": "Amplitude",
-    "fate": "Use of pixels",
-}
-
-
 def player(s: Subject) -> Values:
     """Return the images of frames, with the status of each."""
     shown = s.extras.pictures
@@ -113,16 +103,9 @@ def player(s: Subject) -> Values:
                 for p in shown
             ],
             "status": [records[p.index].status if p.index in records else "" for p in shown],
-            "images": {
-                kind: [_uri(kind, p.images.get(kind, b"")) for p in shown] for kind in kinds
-            },
+            "images": {kind: [p.uri(kind) for p in shown] for kind in kinds},
         },
-        "player_kinds": [(kind, _TITLES[kind]) for kind in kinds],
+        "player_kinds": [(kind, KINDS[kind]) for kind in kinds],
         "player_note": note,
         "fates": [("#{:02x}{:02x}{:02x}".format(*color), text) for color, text in FATES.values()],
     }
-
-
-def _uri(kind: str, data: bytes) -> str:
-    name = "png" if kind == "fate" else "jpeg"
-    return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"

@@ -6,6 +6,7 @@ import base64
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.kernels.splat import nearest_points
@@ -82,10 +83,24 @@ def depth_limits(frame: Frame) -> tuple[float, float]:
         values = frame.z[frame.valid].astype(float)
     else:
         values = np.linalg.norm(frame.points - frame.origin, axis=1)
-    if len(values) == 0:
+    return percentile_range(values, min_width=1e-3)
+
+
+def percentile_range(values: NDArray[np.floating], min_width: float = 0.0) -> tuple[float, float]:
+    """Return values that bound the middle 96 % of the finite ones, (K,); 0 and 1 if there are none.
+
+    Parameters
+    ----------
+    values
+        The values.
+    min_width
+        Minimum difference between the bounds.
+    """
+    values = values[np.isfinite(values)]
+    if not len(values):
         return 0.0, 1.0
-    low, high = np.percentile(values, [2, 98])
-    return float(low), float(max(high, low + 1e-3))
+    low, high = np.percentile(values.astype(float), [2, 98])
+    return float(low), float(max(high, low + min_width))
 
 
 def depth_image(

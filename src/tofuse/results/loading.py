@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.errors import InputError
 from tofuse.files.ply import read_ply
 from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, mesh_of
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
@@ -182,16 +182,4 @@ def read_mesh(path: Path) -> Mesh | None:
 
     Columns that another program left out are 0.
     """
-    if not path.is_file():
-        return None
-    ply = read_ply(path)
-    normals, faces, zeros = ply.normals, ply.faces, np.zeros(len(ply))
-    return Mesh(
-        ply.points.astype(np.float32),
-        np.zeros((0, 3), np.int32) if faces is None else faces,
-        np.zeros((len(ply), 3), np.float32) if normals is None else normals,
-        ply.color,
-        np.asarray(ply.scalars.get("sigma", zeros), np.float32),
-        np.asarray(ply.scalars.get("views", zeros), np.int32),
-        np.zeros(3),
-    )
+    return mesh_of(read_ply(path)) if path.is_file() else None

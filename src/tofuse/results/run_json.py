@@ -22,7 +22,7 @@ from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.refinement import Refinement
 from tofuse.results.folder import TILES, TILESET, is_result
 from tofuse.results.tiles import TilingSummary
-from tofuse.results.types import Component, FrameRecord, Reason, Reconstruction, SelfCalibration
+from tofuse.results.types import FrameRecord, Reason, Reconstruction, SelfCalibration
 
 
 def write_run_json(path: Path, result: Reconstruction, tiling: TilingSummary | None = None) -> None:
@@ -91,24 +91,14 @@ def _content(result: Reconstruction, tiling: TilingSummary | None) -> dict[str, 
         "T_up_world": result.T_up_world,
         "tiles": _tiles(tiling),
         "rig": result.recording.get("rig"),
-        "components": [_component(c) for c in result.components],
-        "sessions": [
-            {
-                "name": s.name,
-                "result": s.result,
-                "opening": s.opening,
-                "config": s.config,
-                "first": s.first,
-                "count": s.count,
-                "T_main_session": s.T_main_session,
-            }
-            for s in result.sessions
+        "components": [
+            _fields(c, "frames", "T_main_component", "joined") for c in result.components
         ],
-        "session_pairs": [asdict(pair) for pair in result.session_pairs],
+        "sessions": [vars(session) for session in result.sessions],
+        "session_pairs": [vars(pair) for pair in result.session_pairs],
         "changes": [
             {
-                "a": c.a,
-                "b": c.b,
+                **_fields(c, "a", "b"),
                 "kind": c.change.kind,
                 "centre_m": c.change.centre,
                 "size_m": c.change.size,
@@ -116,60 +106,25 @@ def _content(result: Reconstruction, tiling: TilingSummary | None) -> dict[str, 
             }
             for c in result.changes
         ],
-        "loops": [
-            {
-                "i": p.i,
-                "j": p.j,
-                "accepted": p.accepted,
-                "reason": p.reason,
-                "overlap": p.overlap,
-                "rms_m": p.rms_m,
-                "free_space_violation": p.free_space_violation,
-                "margin": p.margin,
-            }
-            for p in d.loops
-        ],
+        "loops": [vars(loop) for loop in d.loops],
         "optimiser": [
-            {
-                "first": p.first,
-                "vertices": p.vertices,
-                "edges": p.edges,
-                "before": p.before,
-                "after": p.after,
-                "improved": p.improved,
-                "converged": p.converged,
-            }
+            _fields(p, "first", "vertices", "edges", "before", "after", "improved", "converged")
             for p in d.parts
         ],
-        "priors": [
-            {
-                "sensor": s.sensor,
-                "measured": s.measured,
-                "used": s.used,
-                "scale": s.scale,
-                "text": s.text,
-            }
-            for s in d.priors
-        ],
+        "priors": [_fields(s, "sensor", "measured", "used", "scale", "text") for s in d.priors],
         "refinement": _refinement(d.refinement),
         "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},
     }
 
 
+def _fields(record: Any, *names: str) -> dict[str, Any]:
+    """Some fields of a record, in this order."""
+    return {name: getattr(record, name) for name in names}
+
+
 def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
-    return {
-        "index": f.index,
-        "timestamp": f.timestamp,
-        "status": f.status,
-        "reason": f.reason,
-        "valid_share": f.valid_share,
-        "inlier_share": f.inlier_share,
-        "rms_m": f.rms_m,
-        "covariance": None if f.covariance is None else f.covariance.ravel(),
-        "unobservable": f.unobservable,
-        "component": f.component,
-        "session": _session_of(f.index, result),
-    }
+    covariance = None if f.covariance is None else f.covariance.ravel()
+    return {**vars(f), "covariance": covariance, "session": _session_of(f.index, result)}
 
 
 def _tiles(tiling: TilingSummary | None) -> dict[str, Any] | None:
@@ -178,9 +133,7 @@ def _tiles(tiling: TilingSummary | None) -> dict[str, Any] | None:
         return None
     return {
         "tileset": f"{TILES}/{TILESET}",
-        "levels": tiling.levels,
-        "tiles": tiling.tiles,
-        "faces": tiling.faces,
+        **_fields(tiling, "levels", "tiles", "faces"),
         "overview_faces": len(tiling.overview.faces),
     }
 
@@ -203,40 +156,12 @@ def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
 
 def accuracy_json(a: Accuracy) -> dict[str, Any]:
     """Return the accuracy as in `run.json`, except that infinite bounds are not yet null."""
-    worst = None
-    if a.worst is not None:
-        w = a.worst
-        worst = {"frame": w.frame, "position_m": w.position_m, "rotation_rad": w.rotation_rad}
-    return {
-        "position_m": a.position_m,
-        "rotation_rad": a.rotation_rad,
-        "relative": a.relative,
-        "assessed": a.assessed,
-        "worst": worst,
-        "unbounded": list(a.unbounded),
-        "by_odometry": list(a.by_odometry),
-    }
+    return asdict(a)
 
 
 def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
     """Return the reasons as `run.json` has them."""
-    return [
-        {
-            "code": r.code,
-            "frames": list(r.frames),
-            "ranges": [list(each) for each in r.ranges],
-            "text": r.text,
-        }
-        for r in reasons
-    ]
-
-
-def _component(c: Component) -> dict[str, Any]:
-    return {
-        "frames": [list(each) for each in c.frames],
-        "T_main_component": c.T_main_component,
-        "joined": c.joined,
-    }
+    return [_fields(reason, "code", "frames", "ranges", "text") for reason in reasons]
 
 
 def _refinement(r: Refinement | None) -> dict[str, Any] | None:
@@ -244,11 +169,7 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
     if r is None or not r.views:
         return None
     return {
-        "kept": r.kept,
-        "views": r.views,
-        "pairs": r.pairs,
-        "moved_m": r.moved_m,
-        "moved_rad": r.moved_rad,
+        **_fields(r, "kept", "views", "pairs", "moved_m", "moved_rad"),
         "support_before": r.support[0],
         "support_after": r.support[1],
         "camera": r.errors,
@@ -261,11 +182,7 @@ def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
     if calibration is None:
         return None
     return {
-        "focal": calibration.focal,
-        "offset_m": calibration.offset_m,
-        "center_x": calibration.center_x,
-        "center_y": calibration.center_y,
-        "distortion": calibration.distortion,
+        **_fields(calibration, "focal", "offset_m", "center_x", "center_y", "distortion"),
         "sigma": dict(calibration.sigmas),
         "stated_bound_m": calibration.bound_m[0],
         "corrected_bound_m": calibration.bound_m[1],

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import base64
 import threading
+from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
-from tofuse.report.pictures import FATES, Pictures
-from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
+from tofuse.report.fields import Field
+from tofuse.report.pictures import FATES, KINDS, Pictures
+from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines, spacing_of
 from tofuse.report.thumbnails import viridis
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
 from tofuse.viewer.content import (
-    ColorBar,
-    Layer,
     ViewContent,
     colorings,
     layer_colors,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
 FOV = 2 * float(np.arctan(0.5))  # of camera frusta as drawn
-_TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 _REASONS = 4
 _MAX_EXTENT_RATIO = 1.8  # cameras are not framed if that enlarges the model's box more
 
@@ -126,7 +126,7 @@ class ResultView:
         self._lines = {}
         for name, poses, color in (
             ("after", result.after, AFTER),
-            ("before", result.before, BEFORE),
+            ("before", result.view.before, BEFORE),
         ):
             if not poses:
                 continue
@@ -157,7 +157,7 @@ class ResultView:
             if has_surface:
                 self._layer_toggles["surface"] = gui.add_checkbox("Surface", True)
             self._layer_toggles["points"] = gui.add_checkbox("Points", not has_surface)
-            if result.model_before is not None:
+            if result.view.model_before is not None:
                 self._layer_toggles["model before"] = gui.add_checkbox(
                     "Points before optimisation", False
                 )
@@ -198,12 +198,12 @@ class ResultView:
             self._model.clear()
             self._paint()
 
-    def _visible_layers(self) -> dict[str, Layer]:
+    def _visible_layers(self) -> dict[str, GeometryRecord]:
         """The visible layers of the model, by name."""
         layers = {
             "surface": self._result.mesh,
             "points": self._result.cloud,
-            "model before": self._result.model_before,
+            "model before": self._result.view.model_before,
         }
         return {
             name: layer
@@ -216,16 +216,16 @@ class ResultView:
         visible = self._visible_layers()
         for name, handle in self._model.items():
             handle.visible = name in visible
-        scale: ColorBar | None = None
+        scale: Field | None = None
         for name, layer in visible.items():
             coloring = "colour" if name == "model before" else self._coloring
-            colors, bar = layer_colors(layer, coloring, self._result.up)
-            scale = bar or scale
+            colors, field = layer_colors(layer, coloring, self._result.up)
+            scale = field or scale
             if name not in self._model and len(layer.points):
                 self._model[name] = self._add_layer(name, layer, colors)
-        self._legend.content = "" if scale is None else color_bar(scale)
+        self._legend.content = "" if scale is None else color_bar(scale.label, scale.labels)
 
-    def _add_layer(self, name: str, layer: Layer, colors: UInt8) -> Any:
+    def _add_layer(self, name: str, layer: GeometryRecord, colors: UInt8) -> Any:
         scene = self._server.scene
         if name == "surface" and self._result.tiles is not None:
             coloring, up = self._coloring, self._result.up
@@ -273,7 +273,7 @@ class ResultView:
         words = f"Frame {index}: **{frame['status']}**"
         if frame["reason"]:
             words += f" – {_escape_markdown(frame['reason'])}"
-        picture = _nearest(result.pictures, index)
+        picture = _nearest(result.view.pictures, index)
         if picture is not None:
             self._images.content = _images_html(picture)
             if picture.index != index:
@@ -444,14 +444,8 @@ def _place_camera(server: ViserServer, result: ViewContent) -> float:
     return size
 
 
-def _point_size(points: Float32) -> float:
-    from scipy.spatial import cKDTree
-
-    if len(points) < 2:
-        return 0.01
-    sampled = points[:: max(1, len(points) // 2000)]
-    distances, _ = cKDTree(points).query(sampled, k=2)
-    return float(max(1.3 * np.median(distances[:, 1]), 1e-4))
+def _point_size(points: NDArray[np.floating]) -> float:
+    return max(1.3 * spacing_of(points.astype(float)), 1e-4)
 
 
 def _nearest(pictures: tuple[Pictures, ...], index: int) -> Pictures | None:
@@ -478,12 +472,12 @@ def _length(metres: float) -> str:
     return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
 
 
-def color_bar(bar: ColorBar) -> str:
-    """Return a colour bar with its ticks as HTML."""
+def color_bar(label: str, labels: Sequence[str]) -> str:
+    """Return a colour bar with a title, and labels at its ends and in its middle, as HTML."""
     stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
-    ticks = "".join(f"<span>{tick}</span>" for tick in bar.ticks)
+    ticks = "".join(f"<span>{text}</span>" for text in labels)
     return (
-        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{bar.label}'
+        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{label}'
         f'<div style="height:12px;border-radius:3px;background:linear-gradient(90deg,{stops})">'
         f'</div><div style="display:flex;justify-content:space-between">{ticks}</div></div>'
     )
@@ -497,9 +491,8 @@ def _escape_markdown(text: str) -> str:
 def _images_html(picture: Pictures) -> str:
     """The images of a frame as HTML, embedded as data URIs."""
     cells = []
-    for kind, data in picture.images.items():
-        name, title = ("png" if kind == "fate" else "jpeg"), _TITLES[kind]
-        source = f"data:image/{name};base64,{base64.b64encode(data).decode()}"
+    for kind in picture.images:
+        title, source = KINDS[kind], picture.uri(kind)
         style = "width:100%;border-radius:4px;image-rendering:pixelated;display:block"
         cells.append(
             f'<figure style="margin:0"><img alt="{title}" src="{source}" style="{style}">'

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32, Float64, Int32, UInt8
+from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import read_glb
 from tofuse.files.ply import read_ply
 from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import display_colors
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import mesh_of
 from tofuse.normal import OF_95_PERCENT
-from tofuse.report.pictures import Pictures
+from tofuse.report import fields
+from tofuse.report.fields import Field
 from tofuse.report.scene import RigCameras
 from tofuse.report.thumbnails import viridis
-from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.run_json import (
     main_poses,
@@ -31,71 +31,9 @@ from tofuse.results.run_json import (
     run_json_checked,
 )
 from tofuse.viewer.level_of_detail import OVERVIEW_FACES, select_tiles
-from tofuse.viewer.view_file import read_view_file
+from tofuse.viewer.view_file import ViewFile, read_view_file
 
 MAX_FACES = 500_000  # that a browser renders smoothly
-
-
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """Points, or a surface, with the values by which they can be coloured.
-
-    Attributes
-    ----------
-    points, normals
-        (N, 3) m, in the world frame; normals may be None.
-    faces
-        (M, 3) rows of `points`, or None for a cloud.
-    color
-        (N, 3) RGB from colour or amplitude, or None.
-    sigma, views
-        (N,) m and counts, or None.
-    """
-
-    points: Float32
-    normals: Float32 | None
-    faces: Int32 | None
-    color: UInt8 | None
-    sigma: Float64 | None
-    views: Float64 | None
-
-    @classmethod
-    def of(cls, ply: GeometryRecord) -> Layer:
-        """Return the layer of a PLY file that tofuse wrote."""
-        scalars = {
-            name: ply.scalars[name].astype(float)
-            for name in ("sigma", "views")
-            if name in ply.scalars
-        }
-        return cls(
-            ply.points.astype(np.float32),
-            ply.normals,
-            ply.faces,
-            ply.color,
-            scalars.get("sigma"),
-            scalars.get("views"),
-        )
-
-    def simplified(self, faces: int) -> Layer:
-        """Return a surface simplified to about `faces` triangles at most; a cloud as it is."""
-        if self.faces is None or self.normals is None or len(self.faces) <= faces:
-            return self
-        n = len(self.points)
-        color = None if self.color is None else display_colors(self.color)
-        sigma = np.zeros(n) if self.sigma is None else self.sigma
-        views = np.zeros(n) if self.views is None else self.views
-        simplified = Mesh(
-            self.points, self.faces, self.normals, color, sigma.astype(np.float32),
-            views.astype(np.int32), np.zeros(3),
-        ).clustered(faces)  # fmt: skip
-        return Layer(
-            simplified.vertices,
-            simplified.normals,
-            simplified.faces,
-            simplified.color,
-            None if self.sigma is None else simplified.sigma.astype(float),
-            None if self.views is None else simplified.views.astype(float),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,51 +59,47 @@ class TiledLayer:
         root, extras = read_tileset(path)
         return cls(folder, root, rotation_up_world(extras, path))
 
-    def layer(self, tile: Tile) -> Layer:
+    def layer(self, tile: Tile) -> GeometryRecord:
         """Read a tile with content, in the world frame."""
         assert tile.content is not None
         glb = read_glb(self.folder / tile.content)
         R = self.R_up_world.astype(np.float32)
-        scalars = {name: glb.scalars[name].astype(float) for name in glb.scalars}
-        return Layer(
-            glb.points.astype(np.float32) @ R,
-            None if glb.normals is None else glb.normals.astype(np.float32) @ R,
-            glb.faces,
-            glb.color,
-            scalars.get("sigma"),
-            scalars.get("views"),
-        )
+        normals = None if glb.normals is None else glb.normals @ R
+        return replace(glb, points=glb.points @ R, normals=normals)
 
-    def overview(self) -> Layer:
+    def overview(self) -> GeometryRecord:
         """The full surface with few triangles; InputError if tiles are missing or damaged."""
         layers = [self.layer(tile) for tile in select_tiles(self.root, None, OVERVIEW_FACES)]
         if not layers:
             raise InputError(
                 "has no tiles", where=self.folder / TILESET, remedy="copy the whole folder"
             )
-        return merge_layers(layers)
+        return merged(layers)
 
 
-def merge_layers(layers: Sequence[Layer]) -> Layer:
-    """Merge layers with faces; the result has the values that all of them have."""
+def merged(layers: Sequence[GeometryRecord]) -> GeometryRecord:
+    """Merge surfaces; the result has the columns that all of them have."""
 
-    def concatenated(values: list[NDArray[Any] | None]) -> Any:
-        present = [item for item in values if item is not None]
+    def joined(columns: list[NDArray[Any] | None]) -> Any:
+        present = [column for column in columns if column is not None]
         return np.concatenate(present) if len(present) == len(layers) else None
 
-    offsets = np.cumsum([0] + [len(layer.points) for layer in layers])
+    offsets = np.cumsum([0] + [len(layer) for layer in layers])
     faces = [
         layer.faces + np.int32(offset)
         for layer, offset in zip(layers, offsets, strict=False)
         if layer.faces is not None
     ]
-    return Layer(
+    return GeometryRecord(
         np.concatenate([layer.points for layer in layers]),
-        concatenated([layer.normals for layer in layers]),
         np.concatenate(faces),
-        concatenated([layer.color for layer in layers]),
-        concatenated([layer.sigma for layer in layers]),
-        concatenated([layer.views for layer in layers]),
+        joined([layer.normals for layer in layers]),
+        joined([layer.color for layer in layers]),
+        scalars={
+            name: np.concatenate([layer.scalars[name] for layer in layers])
+            for name in layers[0].scalars
+            if all(name in layer.scalars for layer in layers)
+        },
     )
 
 
@@ -178,13 +112,11 @@ class ViewContent:
     folder, run
         The output folder and its `run.json`.
     cloud, mesh
-        The model.
-    after, before
-        T_world_camera (4, 4) by frame index, after and before loop closure.
-    model_before
-        Points of the model before loop closure, or None.
-    pictures
-        Images of some frames.
+        The model, with the columns `sigma` (m) and `views` where they are known.
+    after
+        T_world_camera (4, 4) by frame index, after loop closure.
+    view
+        Its `view.npz`.
     up
         (3,) unit vector in the world frame.
     tiles
@@ -193,12 +125,10 @@ class ViewContent:
 
     folder: Path
     run: dict[str, Any]
-    cloud: Layer
-    mesh: Layer | None
+    cloud: GeometryRecord
+    mesh: GeometryRecord | None
     after: dict[int, Float64]
-    before: dict[int, Float64]
-    model_before: Layer | None
-    pictures: tuple[Pictures, ...]
+    view: ViewFile
     up: Float64
     tiles: TiledLayer | None = None
 
@@ -242,36 +172,37 @@ def read_content(folder: Path) -> ViewContent:
         )
     run = read_run_json(folder / "run.json")
     posed, poses = main_poses(folder, run)
-    after = dict(zip(posed, poses, strict=True))
     tiled = None
+    mesh: GeometryRecord | None = None
     if run.get("tiles"):
         tiled = TiledLayer.read(folder / TILES)
-        mesh: Layer | None = tiled.overview()
-        cloud = replace(tiled.overview(), faces=None)
+        mesh = tiled.overview()
+        cloud = replace(mesh, faces=None)
     else:
-        cloud = Layer.of(read_ply(folder / "cloud.ply"))
-        mesh = None
+        cloud = read_ply(folder / "cloud.ply")
         if (folder / "mesh.ply").is_file():
-            mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
-    view_file = read_view_file(folder)
-    model_before = None
-    if view_file is not None and len(view_file.points):
-        model_before = Layer(view_file.points, None, None, view_file.color, None, None)
+            mesh = _simplified(read_ply(folder / "mesh.ply"))
     content = ViewContent(
         folder,
         run,
         cloud,
         mesh,
-        after,
-        {} if view_file is None else view_file.before,
-        model_before,
-        () if view_file is None else view_file.pictures,
+        dict(zip(posed, poses, strict=True)),
+        read_view_file(folder),
         rotation_up_world(run, folder / "run.json")[1],
         tiled,
     )
     with run_json_checked(folder / "run.json"):
         _check_fields(content)
     return content
+
+
+def _simplified(surface: GeometryRecord) -> GeometryRecord:
+    """A surface simplified to the number of triangles that a browser renders smoothly."""
+    if surface.faces is None or len(surface.faces) <= MAX_FACES:
+        return surface
+    color = None if surface.color is None else display_colors(surface.color)
+    return mesh_of(replace(surface, color=color)).clustered(MAX_FACES).record()
 
 
 def _check_fields(content: ViewContent) -> None:
@@ -287,29 +218,21 @@ def _check_fields(content: ViewContent) -> None:
 COLORINGS = ("colour", "height", "accuracy", "view count")
 
 
-def colorings(layers: Sequence[Layer]) -> list[str]:
+def colorings(layers: Sequence[GeometryRecord]) -> list[str]:
     """Return the colourings that at least one of the layers has values for."""
     values: dict[str, list[NDArray[Any] | None]] = {
         "colour": [la.color for la in layers],
         "height": [la.points for la in layers],
-        "accuracy": [la.sigma for la in layers],
-        "view count": [la.views for la in layers],
+        "accuracy": [la.scalars.get("sigma") for la in layers],
+        "view count": [la.scalars.get("views") for la in layers],
     }
     return [name for name in COLORINGS if any(value is not None for value in values[name])]
 
 
-@dataclass(frozen=True)
-class ColorBar:
-    """A colour bar: its label, and the ticks at its ends and in its middle."""
-
-    label: str
-    ticks: tuple[str, str, str]
-
-
 def layer_colors(
-    layer: Layer, coloring: str, up: Float64, scale_of: Layer | None = None
-) -> tuple[UInt8, ColorBar | None]:
-    """Return colours (N, 3) of a layer, and their colour bar; grey if it has no such values.
+    layer: GeometryRecord, coloring: str, up: Float64, scale_of: GeometryRecord | None = None
+) -> tuple[UInt8, Field | None]:
+    """Return colours (N, 3) of a layer, and the field of the bar; grey if it has no such values.
 
     Colours of values are exactly those of the bar. The layer's original colours are shaded by a
     fixed light from above and from one side, since the page is unlit.
@@ -328,45 +251,31 @@ def layer_colors(
     if coloring == "colour" and layer.color is not None:
         return _shaded(display_colors(layer.color), layer, up), None
     values = _values(layer, coloring, up)
-    if values is not None:
-        scale_values = None if scale_of is None else _values(scale_of, coloring, up)
-        return _map_colors(values, values if scale_values is None else scale_values, coloring)
-    return np.full((len(layer.points), 3), 170, np.uint8), None
+    if values is None:
+        return np.full((len(layer.points), 3), 170, np.uint8), None
+    scale_values = None if scale_of is None else _values(scale_of, coloring, up)
+    field = _FIELDS[coloring](values if scale_values is None else scale_values)
+    return viridis(field.on_bar(values)), field
 
 
-def _values(layer: Layer, coloring: str, up: Float64) -> Float64 | None:
+def _values(layer: GeometryRecord, coloring: str, up: Float64) -> Float64 | None:
     """The values of a layer for a colouring; None if it has none."""
     if coloring == "height":
         return np.asarray(layer.points @ up, np.float64)
-    if coloring == "accuracy" and layer.sigma is not None:
-        return np.asarray(OF_95_PERCENT * layer.sigma, np.float64)
-    return layer.views if coloring == "view count" else None
+    column = layer.scalars.get({"accuracy": "sigma", "view count": "views"}.get(coloring, ""))
+    if column is None:
+        return None
+    return (OF_95_PERCENT if coloring == "accuracy" else 1.0) * column.astype(float)
 
 
-_LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "height": ("Height", length),
-    "accuracy": ("Accuracy (95 %)", lambda m: f"±{length(m)}"),
-    "view count": ("Number of views", lambda n: f"{n:.0f}"),
+_FIELDS: dict[str, Callable[[Float64], Field]] = {
+    "height": fields.height,
+    "accuracy": fields.accuracy,
+    "view count": fields.view_count,
 }
 
 
-def _map_colors(values: Float64, scale: Float64, coloring: str) -> tuple[UInt8, ColorBar]:
-    """Colours of values on the scale of others, and the bar; accuracies on a logarithmic scale."""
-    label, text = _LABELS[coloring]
-    logarithmic = coloring == "accuracy"
-    mapped, mapped_scale = (
-        np.log(np.maximum(v, 1e-6)) if logarithmic else v for v in (values, scale)
-    )
-    finite = mapped_scale[np.isfinite(mapped_scale)]
-    low, high = np.percentile(finite, [2, 98]).tolist() if len(finite) else (0.0, 1.0)
-    inverse: Callable[[float], float] = (lambda v: float(np.exp(v))) if logarithmic else float
-    origin = low if coloring == "height" else 0.0
-    ticks = tuple(text(inverse(v) - origin) for v in (low, (low + high) / 2, high))
-    colors = viridis((np.nan_to_num(mapped, nan=high) - low) / max(high - low, 1e-9))
-    return colors, ColorBar(label, (ticks[0], ticks[1], ticks[2]))
-
-
-def _shaded(color: UInt8, layer: Layer, up: Float64) -> UInt8:
+def _shaded(color: UInt8, layer: GeometryRecord, up: Float64) -> UInt8:
     if layer.normals is None or layer.faces is None:
         return color
     side = np.cross(up, [0.6, 0.0, 0.8])

@@ -16,7 +16,7 @@ from tofuse.report.thumbnails import data_uri, depth_image, depth_limits, subsam
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
 from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz
-from tofuse.viewer.content import ColorBar, read_content
+from tofuse.viewer.content import read_content
 from tofuse.viewer.coverage import Coverage
 
 if TYPE_CHECKING:
@@ -192,11 +192,8 @@ class LiveView:
             ratio = OF_95_PERCENT * coverage.sigma(self._cloud_data[handle.name][0]) / median
             level = 0.5 + 0.5 * np.log(np.minimum(ratio, _COLOR_RATIO)) / np.log(_COLOR_RATIO)
             handle.colors = viridis(level)
-        ticks = tuple(
-            f"±{length(median * factor)}" for factor in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)
-        )
-        bar = ColorBar("Accuracy so far (95 %), noise only", (ticks[0], ticks[1], ticks[2]))
-        self._legend.content = color_bar(bar) + (
+        labels = [f"±{length(median * ratio)}" for ratio in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)]
+        self._legend.content = color_bar("Accuracy so far (95 %), noise only", labels) + (
             '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
             "were seen from too far away or too rarely.</div>"
         )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64
-from tofuse.viewer.content import Layer
+from tofuse.files.geometry_record import GeometryRecord
 
 _ON_RAY_ANGLE, _MAX_ANGLE = 0.006, 0.02  # rad, between a point's direction and the ray
 
@@ -22,7 +22,9 @@ class PickedPoint:
     sigma: float
 
 
-def pick(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> PickedPoint | None:
+def pick(
+    layers: Sequence[GeometryRecord], origin: ArrayLike, direction: ArrayLike
+) -> PickedPoint | None:
     """Return the point of the layers on a ray, or None.
 
     The closest of the points that are practically on the ray; without any, that with the smallest
@@ -54,6 +56,7 @@ def pick(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Pi
         rank = (0.0, float(depth[rows[k]])) if len(on_ray) else (float(angle[k]), 0.0)
         if angle[k] < _MAX_ANGLE and (best is None or rank < best):
             row = rows[k]
-            sigma = float("nan") if layer.sigma is None else float(layer.sigma[row])
-            best, picked = rank, PickedPoint(layer.points[row].astype(float), sigma)
+            sigma = layer.scalars.get("sigma")
+            row_sigma = float("nan") if sigma is None else float(sigma[row])
+            best, picked = rank, PickedPoint(layer.points[row].astype(float), row_sigma)
     return picked

@@ -15,6 +15,7 @@ from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from tofuse.errors import InputError
+from tofuse.files.reading import required_package
 from tofuse.report.policy import script_hashes
 
 if TYPE_CHECKING:
@@ -44,14 +45,7 @@ def serve(port: int | None = None) -> ViserServer:
     InputError
         If viser is not installed, or the port is in use.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError(
-            "needs viser, which is not installed",
-            where="the viewer",
-            remedy="pip install 'tofuse[viewer]'",
-        ) from error
+    viser = required_package("viser", "viewer", "the viewer")
     chosen = _free_port() if port is None else port
     if port is not None and not _is_free(port):
         raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import to_matrix
-from tofuse.viewer.content import Layer, TiledLayer, merge_layers
+from tofuse.viewer.content import TiledLayer, merged
 from tofuse.viewer.frame_budget import MAX_SHOWN_FACES, FrameBudget
 from tofuse.viewer.level_of_detail import Eye, select_tiles
 from tofuse.viewer.tone_mapping import inverse_tone_mapping
@@ -49,7 +50,7 @@ class TiledSurface:
         self,
         server: ViserServer,
         layer: TiledLayer,
-        paint: Callable[[Layer], UInt8],
+        paint: Callable[[GeometryRecord], UInt8],
     ) -> None:
         self._server, self._layer, self._paint = server, layer, paint
         self._visible = True
@@ -84,15 +85,14 @@ class TiledSurface:
         """The tiles that each client shows."""
         return [client.tiles() for client in self._current_clients()]
 
-    def layer_along(self, origin: ArrayLike, direction: ArrayLike) -> Layer:
+    def layer_along(self, origin: ArrayLike, direction: ArrayLike) -> GeometryRecord:
         """Return the shown tiles that a ray hits, in the world frame."""
         R = self._layer.R_up_world
         o, d = R @ np.asarray(origin, float), R @ np.asarray(direction, float)
         hit = {t.content: t for tiles in self.shown() for t in tiles if _hits(t, o, d)}
         if not hit:
-            no_points = np.zeros((0, 3), np.float32)
-            return Layer(no_points, None, np.zeros((0, 3), np.int32), None, None, None)
-        return merge_layers([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
+            return GeometryRecord(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+        return merged([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
 
     def _current_clients(self) -> list[_Client]:
         with self._lock:
@@ -124,7 +124,7 @@ class _Client:
         self,
         client: ClientHandle,
         layer: TiledLayer,
-        paint: Callable[[Layer], UInt8],
+        paint: Callable[[GeometryRecord], UInt8],
         visible: bool,
     ) -> None:
         self._client, self._layer, self._paint = client, layer, paint

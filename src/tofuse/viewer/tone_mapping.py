@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float32, UInt8
+from tofuse.files.glb import linear_of_srgb
 
 _INPUT_MATRIX = np.array(
     [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
@@ -25,9 +26,7 @@ def inverse_tone_mapping(color: UInt8) -> Float32:
 
     Components can be negative for saturated colours, and above 1 for bright ones.
     """
-    s = np.arange(256) / 255
-    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    y = np.clip(light[color] @ np.linalg.inv(_OUTPUT_MATRIX).T, 0, _MAX_OUTPUT)
+    y = np.clip(linear_of_srgb()[color] @ np.linalg.inv(_OUTPUT_MATRIX).T, 0, _MAX_OUTPUT)
     # y = (v^2 + 0.0245786 v - 0.000090537) / (0.983729 v^2 + 0.432951 v + 0.238081)
     a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -0.000090537 - 0.238081 * y
     v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)

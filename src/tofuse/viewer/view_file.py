@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.memory import give_back
 from tofuse.files.npz import read_npz
 from tofuse.report.extras import ReportExtras
@@ -30,17 +31,16 @@ class ViewFile:
     ----------
     before
         T_world_camera (4, 4) before loop closure, by frame index.
-    points, color
-        (K, 3) m and (K, 3) RGB of the model before loop closure, subsampled; empty where
-        optimisation changed nothing.
+    model_before
+        Points of the model before loop closure, subsampled; None where optimisation changed
+        nothing.
     pictures
         Images of some frames.
     """
 
-    before: dict[int, Float64]
-    points: Float32
-    color: UInt8
-    pictures: tuple[Pictures, ...]
+    before: dict[int, Float64] = field(default_factory=dict)
+    model_before: GeometryRecord | None = None
+    pictures: tuple[Pictures, ...] = ()
 
 
 def write_report_and_view(result: Reconstruction, folder: Path, extras: ReportExtras) -> None:
@@ -113,8 +113,8 @@ def _model_before(result: Reconstruction) -> tuple[Float32, UInt8]:
     return points[finite], (grey if cloud.color is None else cloud.color[::step])[finite]
 
 
-def read_view_file(folder: Path) -> ViewFile | None:
-    """Read `view.npz` of a result; None where there is none.
+def read_view_file(folder: Path) -> ViewFile:
+    """Read `view.npz` of a result; empty where there is none.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def read_view_file(folder: Path) -> ViewFile | None:
     """
     path = folder / NAME
     if not path.is_file():
-        return None
+        return ViewFile()
     data = read_npz(path)
     try:
         index, before = data["index"].tolist(), data["before"].astype(float)
@@ -147,4 +147,5 @@ def read_view_file(folder: Path) -> ViewFile | None:
     pictures = tuple(
         Pictures(k, frame_images) for k, frame_images in zip(frames, images, strict=True)
     )
-    return ViewFile(dict(zip(index, before, strict=True)), points, color, pictures)
+    model_before = GeometryRecord(points, color=color) if len(points) else None
+    return ViewFile(dict(zip(index, before, strict=True)), model_before, pictures)
