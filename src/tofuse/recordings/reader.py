@@ -60,7 +60,7 @@ class Reader(Protocol):
     """
 
     part_kind: ClassVar[str] = "reader"
-    joinable: ClassVar[bool]
+    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """Detect the format from names and first bytes; None if it is another one. Never raises."""

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 
 HEADER_BYTES = 128
@@ -100,10 +100,8 @@ class _Images:
 
 @part("reader", "aditof", label="experimental")
 @dataclass(frozen=True)
-class AdiTof:
+class AdiTof(Reader):
     """A .bin file of frames of Analog Devices' ToF SDK, or a folder of them."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tofuse.files.reading import files_named, is_file, read_bytes
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
 
 # Width and height in pixels, and the time at which the file was written in ms.
@@ -25,10 +24,8 @@ CONFIDENCE_MAX = 255.0
 
 @part("reader", "arducam", label="experimental")
 @dataclass(frozen=True)
-class Arducam:
+class Arducam(Reader):
     """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
@@ -25,10 +24,8 @@ CONFIDENCE_MAX = 7.0
 
 @part("reader", "depth16", label="experimental")
 @dataclass(frozen=True)
-class Depth16:
+class Depth16(Reader):
     """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -6,7 +6,6 @@ import re
 import tarfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from tofuse.parts import part
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import POSES_BY
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource, read_matrix_pose
 
 # The streams by preference, with their ambiguity range in m.
@@ -35,10 +34,8 @@ _REMEDY = "copy the recording again"
 
 @part("reader", "hololens2", label="experimental")
 @dataclass(frozen=True)
-class HoloLens2:
+class HoloLens2(Reader):
     """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

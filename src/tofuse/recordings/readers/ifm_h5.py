@@ -6,7 +6,7 @@ import threading
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from tofuse.files.reading import required_package
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_camera
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.readers.ifm_o3r import INVALID
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource
@@ -36,10 +36,8 @@ _LENS_PARAMETERS = 10
 
 @part("reader", "ifm-h5", label="experimental")
 @dataclass(frozen=True)
-class IfmH5:
+class IfmH5(Reader):
     """A .h5 file with streams o3r_tof_0, ...: range, noise, amplitude, intrinsics."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

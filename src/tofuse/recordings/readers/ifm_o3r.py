@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from tofuse.files.reading import read_bytes, read_head
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource
 
@@ -28,10 +28,8 @@ _MAX_BYTES = 2 << 30
 
 @part("reader", "ifm-o3r", label="validated")
 @dataclass(frozen=True)
-class IfmO3r:
+class IfmO3r(Reader):
     """A .data or .pcic file of the O3R's frames: range, noise, amplitude, intrinsics."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from tofuse.recordings.frames import (
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
-from tofuse.recordings.reader import CERTAIN, UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, combined
@@ -346,10 +345,10 @@ class NativeSource(FileSource):
 
 @part("reader", "native", label="validated")
 @dataclass(frozen=True)
-class Native:
+class Native(Reader):
     """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
 
-    joinable: ClassVar[bool] = True
+    joinable = True
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

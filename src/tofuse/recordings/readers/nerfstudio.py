@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from tofuse.recordings.camera_file import checked_lens, image_size, number_in, r
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_matrix_pose
 
 NAME = "transforms.json"
@@ -39,10 +39,8 @@ _REMEDY = "correct it there"
 
 @part("reader", "nerfstudio", label="experimental")
 @dataclass(frozen=True)
-class Nerfstudio:
+class Nerfstudio(Reader):
     """A transforms.json whose frames have depth, or the folder of one."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from tofuse.recordings.camera_file import (
     load_camera,
 )
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import (
     MAX_COORDINATE_M,
@@ -44,10 +44,8 @@ _NAMES = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 
 @part("reader", "npz", label="validated")
 @dataclass(frozen=True)
-class Npz:
+class Npz(Reader):
     """A .npz file with depth (N, H, W), a camera (K or rays), and optional channels."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tofuse.recordings.bags import Track, open_container
 from tofuse.recordings.camera_file import ColorCamera
 from tofuse.recordings.lenses import simplest_lens
 from tofuse.recordings.maker_bags import BagSource, topics
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import GREY
 
 # The order in which Orbbec writes them.
@@ -28,10 +28,8 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 @part("reader", "orbbec-bag")
 @dataclass(frozen=True)
-class OrbbecBag:
+class OrbbecBag(Reader):
     """A .bag of Orbbec's viewer or SDK: depth, pixel-aligned infrared, and colour."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,16 +18,14 @@ from tofuse.recordings.bags import first_message
 from tofuse.recordings.camera_file import ColorCamera, checked_lens
 from tofuse.recordings.lenses import forward_brown, inverse_brown
 from tofuse.recordings.maker_bags import BagSource, topics
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import Info, camera_info
 
 
 @part("reader", "realsense-bag")
 @dataclass(frozen=True)
-class RealSenseBag:
+class RealSenseBag(Reader):
     """A .bag (or .db3) of RealSense's viewer or SDK: depth, colour, and infrared of the L515."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from tofuse.recordings.phones import (
     lens,
     resized,
 )
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of
 from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
 
@@ -42,10 +42,8 @@ _EXR = re.compile(r"([0-9]{1,9})\.exr", re.IGNORECASE)
 
 @part("reader", "record3d", label="validated")
 @dataclass(frozen=True)
-class Record3D:
+class Record3D(Reader):
     """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

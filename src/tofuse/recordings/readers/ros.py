@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_frames import Transforms, frame_name
 from tofuse.recordings.ros_messages import (
     COLORS,
@@ -54,10 +54,8 @@ _ODOMETRY = "odom"
 
 @part("reader", "ros")
 @dataclass(frozen=True)
-class Ros:
+class Ros(Reader):
     """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

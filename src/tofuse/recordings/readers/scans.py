@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from tofuse.recordings.cloud_files import (
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
@@ -37,10 +37,8 @@ _COPY = "copy the file again, or export it again"
 
 @part("reader", "las")
 @dataclass(frozen=True)
-class LasScans:
+class LasScans(Reader):
     """A .las or .laz file, or a folder of them; metres."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -183,10 +181,8 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 
 @part("reader", "e57")
 @dataclass(frozen=True)
-class E57Scans:
+class E57Scans(Reader):
     """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
 
@@ -39,10 +39,8 @@ _RATE_HZ = 30.0
 
 @part("reader", "sens")
 @dataclass(frozen=True)
-class Sens:
+class Sens(Reader):
     """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
@@ -31,10 +30,8 @@ _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
 @part("reader", "7scenes", label="validated")
 @dataclass(frozen=True)
-class SevenScenes:
+class SevenScenes(Reader):
     """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

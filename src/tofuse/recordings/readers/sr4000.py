@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tofuse.files.reading import files_with, is_file, is_folder, read_head, read
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource
 
 FRAME_RATE_HZ = 32.0
@@ -38,10 +37,10 @@ _TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNO
 
 @part("reader", "sr4000", label="validated")
 @dataclass(frozen=True)
-class Sr4000:
+class Sr4000(Reader):
     """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
 
-    joinable: ClassVar[bool] = True
+    joinable = True
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_timestamps, tum_poses
 
 _SUFFIXES = (".tif", ".tiff")
@@ -26,10 +25,8 @@ _NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 @part("reader", "tiff")
 @dataclass(frozen=True)
-class Tiff:
+class Tiff(Reader):
     """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
