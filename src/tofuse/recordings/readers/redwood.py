@@ -15,7 +15,13 @@ from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens, read_json
+from tofuse.recordings.camera_file import (
+    checked_lens,
+    image_size,
+    number_in,
+    numbers_in,
+    read_json,
+)
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 
@@ -102,15 +108,10 @@ def _camera_file(path: Path) -> Path | None:
 
 def _read_intrinsics(path: Path) -> Pinhole:
     data = read_json(path)
-    try:
-        K = np.array(data["intrinsic_matrix"], float).reshape(3, 3).T
-        size = (int(data["width"]), int(data["height"]))
-    except (KeyError, ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            "lacks width, height or a 3x3 intrinsic_matrix",
-            where=path,
-            remedy="write it as Open3D does, column by column",
-        ) from error
+    remedy = "write it as Open3D does, column by column"
+    K = numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
+    width, height = (number_in(data, name, path, remedy=remedy) for name in ("width", "height"))
+    size = image_size(width, height, path)
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
 

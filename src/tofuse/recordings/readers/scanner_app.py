@@ -15,7 +15,7 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import numbers_in, read_json
 from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
@@ -25,6 +25,7 @@ from tofuse.recordings.phones import (
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
+_REMEDY = "export the recording again"
 
 
 @part("reader", "3dscannerapp", label="validated")
@@ -86,14 +87,14 @@ class _FrameMetadata:
     @classmethod
     def read(cls, path: Path) -> _FrameMetadata:
         data = read_json(path)
-        return cls(path, data, float(_numbers(path, data, "time", 1)[0]))
+        return cls(path, data, float(numbers_in(data, "time", path, (1,), _REMEDY)[0]))
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = _numbers(self.path, self.data, "intrinsics", 9).reshape(3, 3)
+        K = numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
         image = IMAGE_SIZE
         if "projectionMatrix" in self.data:
             # Its diagonal is 2 * focal length / image size.
-            P = _numbers(self.path, self.data, "projectionMatrix", 16).reshape(4, 4)
+            P = numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
             with np.errstate(all="ignore"):
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
             if 100 < width < 16384 and 100 < height < 16384:
@@ -103,25 +104,8 @@ class _FrameMetadata:
     def pose(self) -> Float64:
         if "cameraPoseARFrame" not in self.data:
             return np.full((4, 4), np.nan)
-        table = _numbers(self.path, self.data, "cameraPoseARFrame", 16, finite=False).reshape(4, 4)
+        table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
         return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
-
-
-def _numbers(
-    path: Path, data: dict[str, Any], field: str, count: int, *, finite: bool = True
-) -> Float64:
-    where = f"{path}: {field}"
-    if field not in data:
-        raise InputError("is missing", where=where, remedy="export the recording again")
-    try:
-        values = np.atleast_1d(np.array(data[field], float)).ravel()
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError("isn't made of numbers", where=where, remedy="export it again") from error
-    if len(values) != count or (finite and not np.isfinite(values).all()):
-        raise InputError(
-            f"isn't {count} finite numbers", where=where, remedy="export the recording again"
-        )
-    return values
 
 
 def _fill_times(source: PhoneSource) -> None:
