@@ -515,6 +515,27 @@ def checked_lens(
         ) from error
 
 
+def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
+    """Return the camera of a matrix from a file.
+
+    Parameters
+    ----------
+    K
+        (3, 3) of focal lengths and principal point.
+    size
+        (width, height) in pixels.
+    where
+        The file, for errors.
+
+    Raises
+    ------
+    InputError
+        See `checked_lens`.
+    """
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, size, {name: float(v) for name, v in values.items()}, where)
+
+
 def _color(get: _Fields) -> ColorCamera | None:
     data = get.data.get("color")
     if data is None:

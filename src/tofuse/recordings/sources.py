@@ -18,10 +18,9 @@ from tofuse.files.reading import is_file
 from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry.se3 import check_pose, orthonormalise
+from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
-
-MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
 
 
 class FileSource(ABC):
@@ -141,6 +140,12 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     elif (steps == 0).any():
         k = int(np.argmax(steps == 0)) + 1
         warnings.append(f"{path}: frames {k - 1} and {k} have the same timestamp")
+
+
+def interpolated(times: Float64) -> Float64:
+    """Return timestamps (N,) of frames, some of them finite, with the others interpolated."""
+    known, index = np.isfinite(times), np.arange(len(times))
+    return np.where(known, times, np.interp(index, index[known], times[known]))
 
 
 def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:

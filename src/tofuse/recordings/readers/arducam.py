@@ -13,9 +13,10 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_named, is_file, read_bytes
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
+from tofuse.recordings.sources import FileSource
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -75,14 +76,11 @@ class ArducamSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        values = self._floats(self.depth[index])
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = values * np.float32(self.description.depth_unit_m)
         return RangeFrame(
             index,
             float(self.timestamps[index]),
             self.camera,
-            np.where((depth > 0) & (depth < MAX_COORDINATE_M), depth, np.float32(0)),
+            depth_from_numbers(self._floats(self.depth[index]), self.description.depth_unit_m),
             self.description.depth_kind,
             confidence_image=self._confidence(self.confidence[index]),
         )

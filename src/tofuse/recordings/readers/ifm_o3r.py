@@ -18,7 +18,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, interpolated
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 INVALID = 1  # bit of the confidence
@@ -132,8 +132,6 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
     for k, chunks in enumerate(frames):
         if not isinstance(chunks, InputError) and chunks:
             times[k] = next(iter(chunks.values())).time
-    valid, index = np.isfinite(times), np.arange(len(times))
-    if not valid.any():
-        return index.astype(float)
-    times[~valid] = np.interp(index[~valid], index[valid], times[valid])
-    return times
+    if not np.isfinite(times).any():
+        return np.arange(len(times), dtype=float)
+    return interpolated(times)

@@ -14,7 +14,7 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, is_file, is_folder, list_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_pinhole
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 
@@ -102,9 +102,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     numbers = _numbers(match[1]) if match else np.zeros(0)
     if numbers.shape != (9,):
         raise InputError("has no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
-    K = scale * numbers.reshape(3, 3)
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
+    return checked_pinhole(scale * numbers.reshape(3, 3), size, path)
 
 
 def _numbers(text: str) -> Float64:

@@ -17,11 +17,11 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in, read_json
-from tofuse.recordings.depth_counts import depth_from_counts
+from tofuse.recordings.depth_counts import depth_from_counts, depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_matrix_pose
+from tofuse.recordings.sources import FileSource, read_matrix_pose
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -136,8 +136,7 @@ class NerfstudioSource(FileSource):
 
     def _depth(self, path: Path) -> Float32:
         if path.suffix.lower() == ".npy":
-            table = _array(path) * np.float32(self.unit_m)
-            return np.where(np.abs(table) < MAX_COORDINATE_M, table, np.float32(0))
+            return depth_from_numbers(_array(path), self.unit_m)
         return depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
 
 

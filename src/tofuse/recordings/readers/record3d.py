@@ -22,6 +22,7 @@ from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import image_size, number_in, numbers_in, read_json
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
@@ -33,7 +34,7 @@ from tofuse.recordings.phones import (
 )
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
+from tofuse.recordings.sources import FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -294,4 +295,4 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
             where=where,
             remedy="export the recording again",
         )
-    return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
+    return depth_from_numbers(depth, 1.0)

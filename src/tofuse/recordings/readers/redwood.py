@@ -16,7 +16,7 @@ from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import (
-    checked_lens,
+    checked_pinhole,
     image_size,
     number_in,
     numbers_in,
@@ -111,9 +111,7 @@ def _read_intrinsics(path: Path) -> Pinhole:
     remedy = "write it as Open3D does, column by column"
     K = numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
     width, height = (number_in(data, name, path, remedy=remedy) for name in ("width", "height"))
-    size = image_size(width, height, path)
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
+    return checked_pinhole(K, image_size(width, height, path), path)
 
 
 def _timestamps(files: list[Path]) -> Float64:

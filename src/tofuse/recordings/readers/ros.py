@@ -24,6 +24,7 @@ from tofuse.recordings.bags import (
 )
 from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
 from tofuse.recordings.color import sampled_color
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
@@ -40,7 +41,7 @@ from tofuse.recordings.ros_messages import (
     image,
     lens,
 )
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, cloud_frame
+from tofuse.recordings.sources import FileSource, cloud_frame
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -333,11 +334,7 @@ class RosSource(FileSource):
         counts = decode(message, where)
         assert self.camera is not None
         check_size(counts, self.camera, where)
-        with np.errstate(all="ignore"):
-            depth = counts.astype(np.float32) * np.float32(self._unit(counts.dtype.kind))
-        if counts.dtype.kind == "u":
-            depth[counts == 65535] = 0
-        return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
+        return depth_from_numbers(counts, self._unit(counts.dtype.kind))
 
     def _unit(self, kind: str) -> float:
         """Metres per count; floats are always in metres."""

@@ -23,6 +23,7 @@ from tofuse.recordings.phones import (
     lens,
 )
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import interpolated
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -70,7 +71,9 @@ class ScannerApp(Reader):
                 errors.append(error)
         if errors:
             source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        _fill_times(source)
+        if not np.isfinite(source.timestamps).any():
+            raise next(c for c in source.cameras if isinstance(c, InputError))
+        source.timestamps = interpolated(source.timestamps)
         if np.isfinite(poses).any():
             source.reference = poses
         return source
@@ -106,14 +109,6 @@ class _FrameMetadata:
             return np.full((4, 4), np.nan)
         table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
         return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
-
-
-def _fill_times(source: PhoneSource) -> None:
-    valid = np.isfinite(source.timestamps)
-    index = np.arange(len(valid))
-    if not valid.any():
-        raise next(c for c in source.cameras if isinstance(c, InputError))
-    source.timestamps[~valid] = np.interp(index[~valid], index[valid], source.timestamps[valid])
 
 
 def _file_of_frame(file: Path, name: str, suffix: str) -> Path:

@@ -15,10 +15,10 @@ from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import input_error
-from tofuse.geometry.cameras import Camera, Pinhole
+from tofuse.geometry.cameras import Camera
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
-from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
+from tofuse.recordings.camera_file import ColorCamera, checked_pinhole, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
@@ -138,10 +138,10 @@ class SensSource(FileSource):
             raise self._error(f"has {counts_per_metre} counts to a metre", "export it again")
         self.unit = 1.0 / counts_per_metre
         color_lens, T_device_color, depth_lens, T_device_depth = matrices
-        self.camera = self._lens(depth_lens, self.depth_size, "depth")
+        self.camera = checked_pinhole(depth_lens, self.depth_size, f"{self.path}: depth lens")
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
             self.color = ColorCamera(
-                self._lens(color_lens, color_size, "color"),
+                checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
                 self._T_color_depth(T_device_color, T_device_depth),
             )
         return count
@@ -159,11 +159,6 @@ class SensSource(FileSource):
         if not np.isfinite(poses).all():
             return np.eye(4)
         return inverse(poses[0]) @ poses[1]
-
-    def _lens(self, matrix: Float64, size: tuple[int, int], name: str) -> Pinhole:
-        values = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-        numbers = {key: float(value) for key, value in values.items()}
-        return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
 
     def _locate_frames(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
         """Locate frames until the end of the file; a truncated one is skipped."""

@@ -16,7 +16,7 @@ from tofuse.files.reading import is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_pinhole
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import poses_from_files, read_matrix_pose
@@ -102,5 +102,4 @@ def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
     K = read_numbers(path)
     if K.shape != (3, 3):
         raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, first_size(files), {k: float(v) for k, v in values.items()}, path)
+    return checked_pinhole(K, first_size(files), path)

@@ -15,7 +15,7 @@ from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
@@ -90,15 +90,14 @@ class Sr4000Source(FileSource):
 
     def _read_timestamps(self) -> None:
         times = np.array([_time_stamp(path) for path in self.files])
-        valid = np.isfinite(times)
-        index = np.arange(len(times))
-        if not valid.any():
+        missing = int((~np.isfinite(times)).sum())
+        if missing == len(times):
             self.warnings.append(f"no timestamps: a frame rate of {FRAME_RATE_HZ} Hz is assumed")
-            self.timestamps = index / FRAME_RATE_HZ
+            self.timestamps = np.arange(len(times)) / FRAME_RATE_HZ
             return
-        if not valid.all():
-            self.warnings.append(f"{int((~valid).sum())} frames have no timestamp: interpolated")
-        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
+        if missing:
+            self.warnings.append(f"{missing} frames have no timestamp: interpolated")
+        times = interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():

@@ -22,6 +22,7 @@ from tofuse.recordings.phones import (
     lens,
 )
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import interpolated
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -142,9 +143,7 @@ class StraySource(PhoneSource):
             )
         if not valid.all():
             self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
-        index = np.arange(len(times))
-        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
-        self.timestamps = times
+        self.timestamps = interpolated(times)
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)

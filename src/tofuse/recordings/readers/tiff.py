@@ -13,9 +13,10 @@ from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_timestamps, tum_poses
+from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -100,12 +101,6 @@ class TiffSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         size = (self.camera.width, self.camera.height)
-        values = read_tiff(self.depth[index], size)
-        with np.errstate(all="ignore"):
-            depth = values.astype(np.float32) * np.float32(self.unit)
-            if values.dtype == np.uint16:
-                depth[values == 65535] = 0
-            depth = np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
         amplitude = None
         if self.amplitude:
             with np.errstate(all="ignore"):
@@ -115,7 +110,7 @@ class TiffSource(FileSource):
             index,
             float(self.timestamps[index]),
             self.camera,
-            depth,
+            depth_from_numbers(read_tiff(self.depth[index], size), self.unit),
             self.kind,
             amplitude,
             amplitude_kind=self.amplitude_kind,
