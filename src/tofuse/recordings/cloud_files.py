@@ -14,7 +14,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
-from tofuse.geometry.quaternion import length, to_matrix
+from tofuse.geometry.quaternion import length, to_pose
 from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
@@ -148,9 +148,7 @@ class CloudFileSource(FileSource):
             digits = re.findall(r"[0-9]+", file.stem)
             row = by_number.get(int(digits[-1])) if digits else None
             if row is not None:
-                out[k] = np.eye(4)
-                out[k, :3, :3] = to_matrix(row[[5, 6, 7, 4]])
-                out[k, :3, 3] = row[1:4]
+                out[k] = to_pose(row[[5, 6, 7, 4]], row[1:4])
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, used only as reference")
         return out
 

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import to_pose
 from tofuse.geometry.se3 import check_pose, inverse, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.bags import first_message
@@ -109,8 +109,7 @@ class RealSenseSource(BagSource):
                     T[:3, 3] = _numbers(text["translation"])
                 elif message is not None:
                     q, t = message.rotation, message.translation
-                    T[:3, :3] = to_matrix([q.x, q.y, q.z, q.w])
-                    T[:3, 3] = (t.x, t.y, t.z)
+                    T = to_pose([q.x, q.y, q.z, q.w], [t.x, t.y, t.z])
             except (AttributeError, KeyError, ValueError) as error:
                 raise InputError(f"can't be read ({error})", where=where) from error
             out[connection.topic.rsplit("/", 1)[1]] = orthonormalise(check_pose(T, where=where))

@@ -268,9 +268,7 @@ class _Metadata:
         norms = quaternion.length(table[:, :4])
         valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
-        poses[valid] = np.eye(4)
-        poses[valid, :3, :3] = quaternion.to_matrix(table[valid, :4])
-        poses[valid, :3, 3] = table[valid, 4:]
+        poses[valid] = quaternion.to_pose(table[valid, :4], table[valid, 4:])
         return poses @ ARKIT_AXES
 
     def _number(self, field: str, default: float | None = None) -> float:

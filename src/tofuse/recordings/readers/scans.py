@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_head, required_package
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import to_pose
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import (
     CloudFileSource,
@@ -266,12 +266,10 @@ class E57Source(FileSource):
         )
 
     def _pose(self, header: Any) -> Float64:
-        pose = np.eye(4)
-        if header.has_pose():
-            w, x, y, z = (float(value) for value in header.rotation)
-            pose[:3, :3] = to_matrix(np.array([x, y, z, w]))
-            pose[:3, 3] = header.translation
-        return pose
+        if not header.has_pose():
+            return np.eye(4)
+        w, x, y, z = (float(value) for value in header.rotation)
+        return to_pose([x, y, z, w], header.translation)
 
 
 def _damaged(error: Exception, where: str | Path) -> InputError:

@@ -148,9 +148,7 @@ class StraySource(PhoneSource):
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
         posed &= np.abs(quaternion.length(np.where(posed[:, None], table, 0)[:, 3:]) - 1) < 0.01
-        poses[posed] = np.eye(4)
-        poses[posed, :3, :3] = quaternion.to_matrix(table[posed, 3:])
-        poses[posed, :3, 3] = table[posed, :3]
+        poses[posed] = quaternion.to_pose(table[posed, 3:], table[posed, :3])
         self.reference = poses if posed.any() else None
         self._read_lenses(folder, columns, row)
 
