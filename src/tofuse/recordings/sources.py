@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
+
+T = TypeVar("T")
 
 
 class FileSource(ABC):
@@ -79,21 +81,38 @@ def tum_poses(source: FileSource, path: Path) -> Float64:
     return out
 
 
-def poses_from_files(
-    source: FileSource, files: Sequence[Path], read: Callable[[Path], Float64]
-) -> Float64:
-    """Return (N, 4, 4) poses from one file per frame; NaN, and a warning, if one can't be read."""
-    poses = np.full((len(files), 4, 4), np.nan)
-    errors = []
-    for k, path in enumerate(files):
-        if is_file(path):
-            try:
-                poses[k] = read(path)
-            except InputError as error:
-                errors.append(error)
+def poses_of(
+    source: FileSource, items: Iterable[T], read: Callable[[T], Float64 | None]
+) -> Float64 | None:
+    """Return the poses (N, 4, 4) of all frames; None if none is known.
+
+    Parameters
+    ----------
+    source
+        Receives a warning if poses can't be read.
+    items
+        One for each frame: what its pose is read from.
+    read
+        Returns the pose (4, 4), NaN or None if unknown; raises InputError if it can't be read.
+    """
+    poses, errors = [], []
+    for item in items:
+        pose = None
+        try:
+            pose = read(item)
+        except InputError as error:
+            errors.append(error)
+        poses.append(np.full((4, 4), np.nan) if pose is None else pose)
     if errors:
         source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-    return poses
+    return np.stack(poses) if np.isfinite(poses).any() else None
+
+
+def poses_from_files(
+    source: FileSource, files: Iterable[Path], read: Callable[[Path], Float64]
+) -> Float64 | None:
+    """Return the poses of one file per frame, which may be missing; see `poses_of`."""
+    return poses_of(source, files, lambda path: read(path) if is_file(path) else None)
 
 
 def read_matrix_pose(table: Float64, where: str) -> Float64:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.pgm import parse_pgm
 from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
@@ -22,7 +22,7 @@ from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, read_matrix_pose
+from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -117,24 +117,17 @@ class HoloLens2Source(FileSource):
         row_ticks = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
         order = np.argsort(row_ticks, kind="stable")
         nearest = np.searchsorted(row_ticks[order], np.array(self.ticks, float) - 64)
-        poses = np.full((len(self.ticks), 4, 4), np.nan)
-        errors: list[InputError] = []
-        for k, (tick, position) in enumerate(zip(self.ticks, nearest.tolist(), strict=True)):
+
+        def pose(item: tuple[int, int]) -> Float64 | None:
+            tick, position = item
             if position == len(row_ticks) or abs(row_ticks[order[position]] - tick) > 64:
-                continue
+                return None
             row = order[position]
-            try:
-                T_world_rig = read_matrix_pose(
-                    table[row, 1:].reshape(4, 4), f"{trajectory}, row {row}"
-                )
-            except InputError as error:
-                errors.append(error)
-                continue
-            poses[k] = T_world_rig @ se3.inverse(T_camera_rig)
-        if errors:
-            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        if np.isfinite(poses).any():
-            self.reference = poses
+            table_of_row = table[row, 1:].reshape(4, 4)
+            T_world_rig = read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            return T_world_rig @ se3.inverse(T_camera_rig)
+
+        self.reference = poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

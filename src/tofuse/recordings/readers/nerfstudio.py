@@ -21,7 +21,7 @@ from tofuse.recordings.depth_counts import depth_from_counts, depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, read_matrix_pose
+from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -90,20 +90,7 @@ class NerfstudioSource(FileSource):
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
-        self._read_poses()
-
-    def _read_poses(self) -> None:
-        poses = np.full((len(self.frames), 4, 4), np.nan)
-        errors: list[InputError] = []
-        for k, frame in enumerate(self.frames):
-            try:
-                poses[k] = frame.pose()
-            except InputError as error:
-                errors.append(error)
-        if errors:
-            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        if np.isfinite(poses).any():
-            self.reference = poses
+        self.reference = poses_of(self, self.frames, _Frame.pose)
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """See `FileSource.full_resolution_color`."""

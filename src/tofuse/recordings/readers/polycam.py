@@ -78,9 +78,7 @@ class PolycamSource(PhoneSource):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        poses = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
-        if np.isfinite(poses).any():
-            self.reference = poses
+        self.reference = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
         """See `PhoneSource.read_confidence`."""

@@ -23,7 +23,7 @@ from tofuse.recordings.phones import (
     lens,
 )
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import interpolated
+from tofuse.recordings.sources import interpolated, poses_of
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -54,28 +54,24 @@ class ScannerApp(Reader):
             confidence=[if_file(_file_of_frame(file, "conf", ".png")) for file in files],
             color=[if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
         )
-        poses = np.full((len(files), 4, 4), np.nan)
-        errors: list[InputError] = []
+        entries: list[_FrameMetadata | None] = []
         for k, file in enumerate(files):
+            entry = None
             try:
                 metadata = _FrameMetadata.read(_file_of_frame(file, "frame", ".json"))
                 source.timestamps[k] = metadata.time
                 source.cameras.append(metadata.lens(size))
+                entry = metadata
             except InputError as error:
                 # Only this frame is unusable without its camera.
                 source.cameras.append(error)
-                continue
-            try:
-                poses[k] = metadata.pose()
-            except InputError as error:
-                errors.append(error)
-        if errors:
-            source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
+            entries.append(entry)
         if not np.isfinite(source.timestamps).any():
             raise next(c for c in source.cameras if isinstance(c, InputError))
         source.timestamps = interpolated(source.timestamps)
-        if np.isfinite(poses).any():
-            source.reference = poses
+        source.reference = poses_of(
+            source, entries, lambda entry: None if entry is None else entry.pose()
+        )
         return source
 
 
@@ -104,9 +100,9 @@ class _FrameMetadata:
                 image = (round(float(width)), round(float(height)))
         return lens(K, image, size, f"{self.path}: intrinsics")
 
-    def pose(self) -> Float64:
+    def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:
-            return np.full((4, 4), np.nan)
+            return None
         table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
         return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
 

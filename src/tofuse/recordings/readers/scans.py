@@ -27,7 +27,7 @@ from tofuse.recordings.cloud_files import (
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
+from tofuse.recordings.sources import FileSource, cloud_frame, poses_of, read_matrix_pose
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
@@ -217,12 +217,9 @@ class E57Source(FileSource):
                 "contains no scan", where=path, remedy="export scans, not only pictures"
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
-        self.reference = np.full((len(poses), 4, 4), np.nan)
-        for k, pose in enumerate(poses):
-            try:
-                self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
-            except InputError as error:
-                self.warnings.append(f"{error}; ignored")
+        self.reference = poses_of(
+            self, range(len(poses)), lambda k: read_matrix_pose(poses[k], f"{path}: scan {k}")
+        )
         read_unshifted = partial(self._read, shift=np.zeros(3))
         self._shift, self._cached = find_shift(read_unshifted, len(self.counts))
         note_shift(self, path, self._shift)

@@ -24,7 +24,7 @@ from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
+from tofuse.recordings.sources import FileSource, check_timestamps, poses_of, read_matrix_pose
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
@@ -88,7 +88,12 @@ class SensSource(FileSource):
         check_timestamps(self.timestamps, path, self.warnings)
         if len(frames) < count:
             self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
-        self.reference = self._poses([pose for _, _, pose in frames])
+        # The format stores minus infinity where tracking was lost.
+        self.reference = poses_of(
+            self,
+            range(len(frames)),
+            lambda k: read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
+        )
         if options.camera is not None:
             description, self.camera = load_camera(options.camera, self.depth_size)
             self.unit, self.kind = description.depth_unit_m, description.depth_kind
@@ -174,19 +179,6 @@ class SensSource(FileSource):
             if offset > self._size:
                 return
             yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
-
-    def _poses(self, tables: list[Float64]) -> Float64 | None:
-        """T_world_camera (N, 4, 4); the format stores minus infinity where tracking was lost."""
-        poses = np.full((len(tables), 4, 4), np.nan)
-        invalid = 0
-        for k, table in enumerate(tables):
-            try:
-                poses[k] = read_matrix_pose(table, f"{self.path}: pose of frame {k}")
-            except InputError:
-                invalid += 1
-        if invalid:
-            self.warnings.append(f"{self.path}: {invalid} poses are not rigid motions, and ignored")
-        return poses if np.isfinite(poses[:, 0, 0]).any() else None
 
     def _depth(self, data: bytes, where: str) -> UInt16:
         width, height = self.depth_size

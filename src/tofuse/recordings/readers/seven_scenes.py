@@ -65,9 +65,9 @@ class SevenScenes(Reader):
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: used unchanged")
         stems = [file.name[: -len(".depth.png")] for file in files]
-        poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
-        if np.isfinite(poses).any():
-            source.reference = poses
+        source.reference = poses_from_files(
+            source, [path / f"{stem}.pose.txt" for stem in stems], read_pose
+        )
         source.metadata["frame_rate_hz"] = FRAME_RATE_HZ
         return source
 

@@ -37,7 +37,7 @@ class Slam6d(Reader):
         files = required_files(path, ".3d")
         source = CloudFileSource(path, files, scan_frame)
         poses = poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
-        if np.isfinite(poses).any():
+        if poses is not None:
             source.odometry = poses
             if source.reference is None:
                 source.reference = poses
