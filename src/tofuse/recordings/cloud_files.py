@@ -207,10 +207,7 @@ def cloud_files(path: Path, *suffixes: str) -> list[Path]:
 
 def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     """Detect a file or a folder of files with one of the suffixes."""
-    try:
-        files = cloud_files(path, *suffixes)
-    except InputError:
-        return None
+    files = cloud_files(path, *suffixes)
     if not files:
         return None
     if is_folder(path) and is_file(path / "run.json"):

@@ -105,11 +105,8 @@ class AdiTof(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = _files(path)
-            frames, complete = _frames_in(files[0]) if files else ([], False)
-        except InputError:
-            return None
+        files = _files(path)
+        frames, complete = _frames_in(files[0]) if files else ([], False)
         if len(frames) > 1 or (frames and complete):
             return Sniff(1.0, "frames of Analog Devices' ToF SDK")
         return None

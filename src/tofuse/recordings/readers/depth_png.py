@@ -22,12 +22,9 @@ class DepthPng(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            if not (is_file(path) and path.suffix.lower() == ".png"):
-                return None
-            header = read_header(path)
-        except InputError:
+        if not (is_file(path) and path.suffix.lower() == ".png"):
             return None
+        header = read_header(path)
         if header.bits != 16 or header.channels != 1:
             return None
         return Sniff(CERTAIN, "a 16-bit PNG")

@@ -34,12 +34,8 @@ class IfmO3r(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         file = file_of(path, ".data", ".pcic", ".bin")
-        try:
-            if file is not None and BEGIN in read_head(file, 64):
-                return Sniff(1.0, "a PCIC stream")
-        except InputError:
-            pass
-        return None
+        matches = file is not None and BEGIN in read_head(file, 64)
+        return Sniff(1.0, "a PCIC stream") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmO3rSource:
         """See `Reader.open`."""

@@ -45,10 +45,7 @@ class Nerfstudio(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         file = _file(path)
-        try:
-            head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
-        except InputError:
-            return None
+        head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
         if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
             return Sniff(1.0, f"{NAME} with depth")
         return None

@@ -45,12 +45,9 @@ class Redwood(Reader):
         color = next((n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
         if color is None:
             return None
-        try:
-            camera = _camera_file(path)
-            if camera is not None:
-                return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
-        except InputError:
-            return None
+        camera = _camera_file(path)
+        if camera is not None:
+            return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
         if is_file(path / "trajectory.log"):
             return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
         if is_file(path / "camera.json"):

@@ -60,14 +60,11 @@ class Ros(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            if is_folder(path):
-                if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
-                    return Sniff(0.95, "metadata.yaml and a bag")
-                return None
-            head = read_head(path, 16)
-        except InputError:
+        if is_folder(path):
+            if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
+                return Sniff(0.95, "metadata.yaml and a bag")
             return None
+        head = read_head(path, 16)
         if any(head.startswith(magic) for magic in MAGIC):
             return Sniff(0.95, "a bag")
         if path.suffix.lower() == ".db3" and head.startswith(b"SQLite format 3"):

@@ -44,12 +44,9 @@ class Sr4000(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = _files(path)
-            if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
-                return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
-        except InputError:
-            pass
+        files = _files(path)
+        if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
+            return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:

@@ -31,10 +31,7 @@ class Tiff(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = files_with(path, *_SUFFIXES) if is_folder(path) else []
-        except InputError:
-            return None
+        files = files_with(path, *_SUFFIXES) if is_folder(path) else []
         if any(_is_range(file) for file in files):
             return Sniff(1.0, f"{len(files)} .tif files, *.range.tif among them")
         if not files:

@@ -28,12 +28,9 @@ class Zense(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            settings = _settings(path)
-            if settings is not None and (files := _depth_files(path)):
-                return Sniff(1.0, f"{len(files)} depth*.png and {settings.name}")
-        except InputError:
-            pass
+        settings = _settings(path)
+        if settings is not None and (files := _depth_files(path)):
+            return Sniff(1.0, f"{len(files)} depth*.png and {settings.name}")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
