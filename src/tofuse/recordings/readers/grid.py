@@ -18,6 +18,7 @@ from tofuse.files.tables import parse_numbers
 from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, required_files
+from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.organised import (
     SAMPLES,
@@ -28,7 +29,7 @@ from tofuse.recordings.organised import (
     ray_origin_offset,
 )
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import MAX_COORDINATE_M, to_float32
+from tofuse.recordings.sources import to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")

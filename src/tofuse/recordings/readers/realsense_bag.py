@@ -17,7 +17,7 @@ from tofuse.parts import part
 from tofuse.recordings.bags import first_message
 from tofuse.recordings.camera_file import ColorCamera, checked_lens
 from tofuse.recordings.lenses import forward_brown, inverse_brown
-from tofuse.recordings.maker_bags import BagSource, topics
+from tofuse.recordings.maker_bags import MakerBagSource, topics
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import Info, camera_info
 
@@ -41,11 +41,11 @@ class RealSenseBag(Reader):
 _REALSENSE_DEPTH = r"/device_\d+/sensor_\d+/Depth_\d+/image/data"
 
 
-class RealSenseSource(BagSource):
+class RealSenseSource(MakerBagSource):
     """See `RealSenseBag`."""
 
-    def find_streams(self) -> None:
-        """See `BagSource.find_streams`."""
+    def find_tracks(self) -> None:
+        """See `MakerBagSource.find_tracks`."""
         matches = sorted(
             c.topic for c in self.bag.connections if re.fullmatch(_REALSENSE_DEPTH, c.topic)
         )
@@ -73,11 +73,11 @@ class RealSenseSource(BagSource):
             self.color = self.track(sorted(matches)[0])
 
     def lens(self) -> Camera:
-        """See `BagSource.lens`."""
+        """See `MakerBagSource.lens`."""
         return self._lens(self.stream)
 
     def color_lens(self) -> ColorCamera:
-        """See `BagSource.color_lens`."""
+        """See `MakerBagSource.color_lens`."""
         assert self.color is not None
         stream = self.color.connection.topic.removesuffix("/image/data")
         lens = self._lens(stream)
