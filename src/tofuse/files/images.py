@@ -1,4 +1,4 @@
-"""PNG and JPEG images, checked before they are decoded.
+"""PNG, JPEG and raw images, checked before they are decoded.
 
 OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
 and allocates any size that a header declares. So the structure of a file is checked first.
@@ -232,6 +232,36 @@ def as_color(image: NDArray[Any]) -> UInt8:
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return image.astype(np.uint8, copy=False)
+
+
+def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -> NDArray[Any]:
+    """Read a file that consists of the pixels of one image, (H, W, ...).
+
+    Parameters
+    ----------
+    path
+        The file.
+    dtype
+        NumPy's name of the type of a pixel; "3<f4" are three channels of float32.
+    size
+        (width, height).
+    remedy
+        The remedy if the file has another size.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or has another size.
+    """
+    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    pixel, (width, height) = np.dtype(dtype), size
+    if len(data) != pixel.itemsize * width * height:
+        raise InputError(
+            f"has {len(data)} bytes, not {pixel.itemsize} for each of {width} x {height} pixels",
+            where=path,
+            remedy=remedy,
+        )
+    return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
 
 
 def png_bytes(image: NDArray[np.generic]) -> bytes:

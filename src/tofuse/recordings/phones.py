@@ -77,9 +77,7 @@ class PhoneSource(FileSource):
             "depth_unit_m": 0.001,
             "confidence_max": CONFIDENCE_MAX,
         }
-        colored = sum(path is not None for path in self.color)
-        if 0 < colored < len(self.color):
-            self.warnings.append(f"only {colored} of {len(self.color)} frames have colour")
+        self.note_missing_color(self.color)
         present = sum(path is not None for path in self.confidence)
         if present < len(self.confidence):
             self.warnings.append(

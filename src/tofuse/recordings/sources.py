@@ -55,6 +55,12 @@ class FileSource(ABC):
         """
         return None
 
+    def note_missing_color(self, color: Sequence[object]) -> None:
+        """Warn if some of the frames have no colour: None in `color`."""
+        colored = sum(item is not None for item in color)
+        if 0 < colored < len(color):
+            self.warnings.append(f"only {colored} of {len(color)} frames have colour")
+
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         try:

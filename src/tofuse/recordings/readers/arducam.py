@@ -10,9 +10,10 @@ import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
-from tofuse.files.reading import files_named, is_file, read_bytes
+from tofuse.files.images import read_raw
+from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
+from tofuse.recordings.camera_file import CameraFile, camera_file_of, check_size, load_camera
 from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
@@ -93,21 +94,9 @@ class ArducamSource(FileSource):
 
     def _floats(self, image: _Image) -> Float32:
         """(H, W) values of a file."""
-        size = (self.camera.width, self.camera.height)
-        if image.size != size:
-            raise InputError(
-                f"is of {image.size[0]} x {image.size[1]} pixels, its camera {size[0]} x {size[1]}",
-                where=image.path,
-                remedy="pass the camera of these images with --camera",
-            )
-        data = read_bytes(image.path, limit=1 << 26)
-        if len(data) != 4 * size[0] * size[1]:
-            raise InputError(
-                f"has {len(data)} bytes, not 4 for each of {size[0]} x {size[1]} pixels",
-                where=image.path,
-                remedy="save it again",
-            )
-        return np.frombuffer(data, "<f4").reshape(size[1], size[0]).astype(np.float32)
+        values = read_raw(image.path, "<f4", image.size, "save it again")
+        check_size(values, self.camera, image.path)
+        return values.astype(np.float32)
 
 
 def _images(path: Path, kind: str) -> list[_Image]:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
+from tofuse.files.images import read_raw
 from tofuse.files.pgm import parse_pgm
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
@@ -222,15 +223,7 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
     """Rays (H, W, 2) from a table of unit vectors; NaN where undefined."""
-    data = read_bytes(path, limit=_MAX_BYTES)
-    height, width = shape
-    if len(data) != 12 * height * width:
-        raise InputError(
-            f"has {len(data)} bytes, not 12 for each of {width} x {height} pixels",
-            where=path,
-            remedy=_REMEDY,
-        )
-    table = np.frombuffer(data, "<f4").reshape(height, width, 3).astype(float)
+    table = read_raw(path, "3<f4", (shape[1], shape[0]), _REMEDY).astype(float)
     with np.errstate(all="ignore"):
         rays = table[..., :2] / table[..., 2:]
         valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)

@@ -15,14 +15,13 @@ from tofuse.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
 from tofuse.files.reading import read_bytes, read_head
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
+from tofuse.recordings.ifm_lens import HeadInfo, head_frame, read_info
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, interpolated
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
-INVALID = 1  # bit of the confidence
-
+_IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}
 _MAX_BYTES = 2 << 30
 
 
@@ -84,28 +83,13 @@ class IfmO3rSource(FileSource):
                 )
         info = _info(self.data, chunks[INFO], where)
         counts = chunk_image(self.data, chunks[DISTANCE], where)
-        distance = info.metres(counts)
-        if CONFIDENCE in chunks:
-            flags = self._image(chunks[CONFIDENCE], counts.shape, where)
-            if flags.dtype.kind not in "ui":
-                raise InputError("has flags that are not integers", where=where)
-            distance = np.where(flags & INVALID, np.float32(0), distance)
-        noise = amplitude = None
-        if NOISE in chunks:
-            noise_counts = self._image(chunks[NOISE], counts.shape, where)
-            noise = np.nan_to_num(info.metres(noise_counts), posinf=0, neginf=0)
-        if AMPLITUDE in chunks:
-            amplitude = self._image(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
-            amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            head_camera(info, counts.shape[1], counts.shape[0], str(self.path)),
-            distance,
-            "range",
-            amplitude,
-            sigma_image=noise,
-        )
+        images = {
+            name: self._image(chunks[kind], counts.shape, where)
+            for name, kind in _IMAGES.items()
+            if kind in chunks
+        }
+        time = float(self.timestamps[index])
+        return head_frame(index, time, info, str(self.path), counts, **images)
 
     def _image(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:
         image: NDArray[Any] = chunk_image(self.data, chunk, where)
