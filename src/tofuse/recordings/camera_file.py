@@ -98,8 +98,12 @@ class CameraFile:
     @property
     def metadata(self) -> dict[str, Any]:
         """Metadata of a recording's depth and sensor."""
-        sensor = {} if self.sensor is None else {"sensor": self.sensor}
-        return {"depth_kind": self.depth_kind, **sensor}
+        return {"depth_kind": self.depth_kind, **self.stated("sensor")}
+
+    def stated(self, *names: str) -> dict[str, Any]:
+        """Return those of the named attributes that are given."""
+        values = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

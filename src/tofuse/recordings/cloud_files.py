@@ -19,7 +19,7 @@ from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
 from tofuse.recordings.reader import CERTAIN, Sniff
-from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
+from tofuse.recordings.sources import FileSource
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 MAP_COORDINATES_M = 8192.0
@@ -62,13 +62,9 @@ class CloudFileSource(FileSource):
         self._cached: dict[int, Frame] = {}  # read to determine shift and camera
         self._deprojection: Deprojection | None = None
         if is_folder(path):
-            self._read_timestamps(path / "timestamps.txt")
-            if is_file(path / "groundtruth.txt"):
-                self.reference = tum_poses(self, path / "groundtruth.txt")
-            elif is_file(path / "poses.txt"):
+            self.read_sidecars(path)
+            if self.reference is None and is_file(path / "poses.txt"):
                 self.reference = self._numbered_poses(path / "poses.txt")
-            if is_file(path / "odometry.txt"):
-                self.odometry = tum_poses(self, path / "odometry.txt")
         self._shift = np.zeros(3)
         if load_shifted is not None:
             self._shift, self._cached = find_shift(self._read, len(files))
@@ -120,11 +116,6 @@ class CloudFileSource(FileSource):
                 if candidate is None:  # as for most clouds: one is sufficient to tell
                     return None
         return find_deprojection(clouds) if len(clouds) > 1 else candidate
-
-    def _read_timestamps(self, path: Path) -> None:
-        if not is_file(path):
-            return
-        self.timestamps = read_timestamps(path, len(self.files), "cloud", self.warnings)
 
     def _numbered_poses(self, path: Path) -> Float64 | None:
         """Read lines 'index x y z qw qx qy qz' with the number in the file name as index."""

@@ -55,6 +55,16 @@ class FileSource(ABC):
         """
         return None
 
+    def read_sidecars(self, folder: Path) -> None:
+        """Read timestamps.txt, groundtruth.txt and odometry.txt, as far as the folder has them."""
+        path = folder / "timestamps.txt"
+        if is_file(path):
+            self.timestamps = _read_timestamps(path, len(self.timestamps), self.warnings)
+        if is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+
     def note_missing_color(self, color: Sequence[object]) -> None:
         """Warn if some of the frames have no colour: None in `color`."""
         colored = sum(item is not None for item in color)
@@ -137,14 +147,14 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     return orthonormalise(check_pose(table, where=where))
 
 
-def read_timestamps(path: Path, count: int, noun: str, warnings: list[str]) -> Float64:
-    """Read a timestamps.txt: (N,) seconds for `count` images or clouds (`noun`, for errors)."""
+def _read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
+    """Read a timestamps.txt: (N,) seconds for `count` frames."""
     table = read_numbers(path)
     if table.shape != (count, 1):
         raise InputError(
-            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {noun}s",
+            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} frames",
             where=path,
-            remedy=f"use one time in seconds for each {noun}",
+            remedy="use one time in seconds for each frame, or remove it",
         )
     times = table[:, 0]
     check_timestamps(times, path, warnings)

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import files_with, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
+from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -80,20 +80,9 @@ class TiffSource(FileSource):
                 "left out"
             )
             self.amplitude = []
-        times = folder / "timestamps.txt"
-        if is_file(times):
-            self.timestamps = read_timestamps(times, len(self.depth), "image", self.warnings)
-        if is_file(folder / "groundtruth.txt"):
-            self.reference = tum_poses(self, folder / "groundtruth.txt")
-        if is_file(folder / "odometry.txt"):
-            self.odometry = tum_poses(self, folder / "odometry.txt")
+        self.read_sidecars(folder)
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
-        declared = {
-            "sensor": description.sensor,
-            "frame_rate_hz": rate,
-            "ambiguity_m": self.ambiguity_m,
-        }
-        self.metadata |= {key: value for key, value in declared.items() if value is not None}
+        self.metadata |= description.stated("sensor", "frame_rate_hz", "ambiguity_m")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
