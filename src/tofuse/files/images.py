@@ -63,13 +63,30 @@ def _header(data: bytes, path: str | Path) -> ImageHeader:
     else:
         problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
         raise InputError(problem, where=path, remedy="check the file")
-    if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
+    check_pixels(header.width, header.height, path)
+    return header
+
+
+def check_pixels(width: int, height: int, path: str | Path) -> None:
+    """Raise InputError, naming `path`, unless an image may have this size."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(
-            f"declares {header.width} x {header.height} pixels",
+            f"declares {width} x {height} pixels",
             where=path,
             remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
-    return header
+
+
+def check_camera_size(
+    width: int, height: int, size: tuple[int, int] | None, path: str | Path
+) -> None:
+    """Raise InputError, naming `path`, unless an image has the size of its camera, if known."""
+    if size is not None and (width, height) != size:
+        raise InputError(
+            f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
+            where=path,
+            remedy="use the camera description of these images",
+        )
 
 
 def _png_header(data: bytes, path: str | Path) -> ImageHeader:
@@ -182,12 +199,7 @@ def parse_image(
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
     header = _header(data, path)
-    if size is not None and (header.width, header.height) != size:
-        raise InputError(
-            f"is {header.width} x {header.height} pixels, the camera {size[0]} x {size[1]}",
-            where=path,
-            remedy="use the camera description of these images",
-        )
+    check_camera_size(header.width, header.height, size, path)
     if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
         raise InputError(
             f"has {header.channels} channels of {header.bits} bits",
@@ -211,13 +223,27 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
         if grey
         else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     )
+    image = decoded(data, flags, (header.height, header.width), path)
+    return image if grey else np.ascontiguousarray(image[..., ::-1])
+
+
+def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -> NDArray[Any]:
+    """Decode an image by OpenCV with its `flags`.
+
+    Raises
+    ------
+    InputError
+        Naming `path`, if that fails, or the image has another (height, width).
+    """
+    import cv2
+
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise InputError("can't be decoded", where=path, remedy="copy the file again") from error
-    if image is None or image.shape[:2] != (header.height, header.width):
+    except cv2.error:
+        image = None
+    if image is None or image.shape[:2] != shape:
         raise InputError("can't be decoded", where=path, remedy="copy the file again")
-    return image if grey else np.ascontiguousarray(image[..., ::-1])
+    return image
 
 
 def read_color(path: str | Path) -> UInt8:
